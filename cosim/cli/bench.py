@@ -10,6 +10,7 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import out, say
+from cosim.cli.exploit import bench_cheats, bench_exploit
 from cosim.cli.options import MEASURE
 from cosim.cli.progress import doing
 from cosim.core.errors import unknown
@@ -276,7 +277,8 @@ NO_FIGURE = ("none: see below", "")
     rich_help_panel=MEASURE,
     epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench --only driving --compare "
     "../cosim-before`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n`cosim bench "
-    "crossings --crossings 40 --jobs 2 --policy orca`",
+    "crossings --crossings 40 --jobs 2 --policy orca`  \n`cosim bench exploit --kinds lateral "
+    "--evaluations 400 --jobs 2`  \n`cosim bench exploit --cheats --suite reactive`",
 )
 def bench(
     what: Annotated[
@@ -285,7 +287,8 @@ def bench(
             metavar="WHAT",
             help="environment (one process, part by part), camera (all of them), "
             "crowd (behaviour of people and vehicles), people (the crowd compared with measured "
-            "people) or crossings (a policy, people and vehicles at signals).",
+            "people), crossings (a policy, people and vehicles at signals) or exploit (blind "
+            "schedules that solve a suite).",
         ),
     ] = "environment",
     only: Annotated[
@@ -316,13 +319,57 @@ def bench(
     residents: Annotated[int, typer.Option(min=0, help="For `crowd`: number of residents.")] = 0,
     crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: their number.")] = 200,
     policy: Annotated[str, typer.Option(help="For `crossings`: the policy.")] = "orca",
-    jobs: Annotated[int, typer.Option(min=1, help="For `crossings` and `people`: processes.")] = 1,
+    jobs: Annotated[
+        int, typer.Option(min=1, help="For `crossings`, `people` and `exploit`: processes.")
+    ] = 1,
     groups: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('groups')}")] = 0.0,
     elderly: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('elderly')}")] = 0.0,
     children: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('children')}")] = 0.0,
+    suite: Annotated[str, typer.Option(help="For `exploit`: a suite, or its .json.")] = "reactive",
+    kinds: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND,...",
+            help="For `exploit`: kinds of scenarios, `all` for a schedule for all of them; "
+            "default: each, and `all`.",
+        ),
+    ] = "",
+    evaluations: Annotated[
+        int, typer.Option(min=20, help="For `exploit`: episodes of the search for each kind.")
+    ] = 4000,
+    objective: Annotated[
+        str,
+        typer.Option(
+            metavar="sr|d", help="For `exploit`: maximize success, or pairs of event and decoy."
+        ),
+    ] = "sr",
+    seed: Annotated[int, typer.Option(min=0, help="For `exploit`: seed of the search.")] = 0,
+    goal: Annotated[
+        str | None,
+        typer.Option(
+            help="For `exploit`: goal protocol; default: final_point, and for cheats their own."
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FOLDER",
+            help="For `exploit`: where evaluations are stored, and continued; default: "
+            "runs/exploit-SUITE.",
+        ),
+    ] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="For `exploit`: store the result beside the suite.")
+    ] = False,
+    cheats: Annotated[
+        bool,
+        typer.Option("--cheats", help="For `exploit`: drive the table of cheating schedules."),
+    ] = False,
 ) -> None:
-    """Measure the speed of an environment process or of cameras, or behaviour in traffic."""
-    choices = ("environment", "camera", "crowd", "people", "crossings")
+    """Measure the speed of an environment process or of cameras, behaviour in traffic, or how far
+    a suite can be solved blind."""
+    choices = ("environment", "camera", "crowd", "people", "crossings", "exploit")
     if what not in choices:
         raise unknown("bench", what, choices)
     if what == "crowd":
@@ -333,6 +380,13 @@ def bench(
         return
     if what == "people":
         bench_people(jobs)
+        return
+    if what == "exploit":
+        named = [kind for kind in kinds.split(",") if kind]
+        if cheats:
+            bench_cheats(suite, named, jobs, folder, goal)
+        else:
+            bench_exploit(suite, named, evaluations, jobs, folder, objective, seed, goal, write)
         return
     only = only or []
     if compare is not None:

@@ -57,6 +57,7 @@ def compare(
     """
     from cosim.report.compared import FORMATS
     from cosim.results.compare import compare_runs
+    from scenarios.suites.exploits import exploit_of
 
     for path in outputs or ():
         if path.suffix not in (".csv", *FORMATS):
@@ -73,6 +74,9 @@ def compare(
         else:
             _write(path, FORMATS[path.suffix](comparison))
     print_comparison(out, comparison)
+    hashes = dict.fromkeys(comparison.before.table["suite_hash"])
+    for exploit in filter(None, map(exploit_of, hashes)):
+        out.print(exploit.in_words, soft_wrap=not out.is_terminal, highlight=False)
     for path, remark in instead.items():
         say(f"Written: {path}{remark}")
 

@@ -39,6 +39,7 @@ def print_names(out: Console) -> None:
     from cosim.policies.follow.networks import weights_in_words
     from cosim.policies.follow.policy import Follow
     from cosim.policies.load import bundle_in_words, shipped_bundles
+    from cosim.policies.schedule.cheats import CHEATS
     from cosim.results.table import policy_in_words
     from cosim.spec.goal import GOALS
     from cosim.spec.robot import ROBOTS
@@ -65,6 +66,10 @@ def print_names(out: Console) -> None:
         out.print(f"policy  {name}  {bundle_in_words(folder)}", soft_wrap=True)
     about = (Follow.__doc__ or "").splitlines()[0]
     out.print(f"policy  {Follow.manifest.name}  {about} {weights_in_words()}", soft_wrap=True)
+    out.print(
+        f"policy  schedule:NAME  Drives an open-loop schedule, blind: {', '.join(CHEATS)}",
+        soft_wrap=True,
+    )
     for goal in GOALS.values():
         out.print(f"goal    {goal.name}  {goal.summary}", soft_wrap=True)
 
@@ -185,10 +190,12 @@ def check_suites(
 def _false_claims(name: str, sample: int | None, drive: int | None, jobs: int) -> int:
     """Print a suite's table and false claims, and return the number of false claims."""
     from scenarios.suites.catalog import SUITES, load_suite
+    from scenarios.suites.exploits import read_exploit
     from scenarios.suites.proofs import read_proofs
     from scenarios.suites.recipes import RECIPES
     from scenarios.tools.build.claims import CLAIMS, Read
     from scenarios.tools.build.place_claims import PLACE_CLAIMS, faults_in_places, sample_of
+    from scenarios.tools.exploit.check import CLAIM, faults_of_exploit, sample_of_exploit
 
     suite = load_suite(name)
     path = SUITES.get(name, Path(name))
@@ -199,7 +206,8 @@ def _false_claims(name: str, sample: int | None, drive: int | None, jobs: int) -
     except SpecError as error:
         proofs = None
         notice(str(error))
-    read = Read(suite, proofs, path)
+    exploit = read_exploit(path)
+    read = Read(suite, proofs, path, exploit)
     faults = {claim: list(of(read)) for claim, of in CLAIMS.items()}
     checked = {claim: len(suite.scenarios) for claim in CLAIMS}
     every = list(suite.scenarios)
@@ -212,6 +220,12 @@ def _false_claims(name: str, sample: int | None, drive: int | None, jobs: int) -
     checked |= {claim: len(picked) + len(extra) for claim in PLACE_CLAIMS} | {
         PLACE_CLAIMS[-1]: len(driven)
     }
+    if exploit is not None and not faults["exploitability"]:
+        again = sample_of_exploit(exploit, drive)
+        checked[CLAIM] = len(again)
+        with doing(f"driving {len(again)} episodes of blind schedules"):
+            for fault in faults_of_exploit(suite, again, jobs):
+                faults.setdefault(fault.claim, []).append(fault.words)
     columns = [*tables.names(f"{suite.name} {suite.version}, {suite.content_hash}")]
     columns += tables.figures("looked at", "faults")
     rows = [

@@ -1,6 +1,7 @@
 """Load a policy by name.
 
-A name is bundled, `path/to/file.py:Class`, `package.module:Class` or `onnx:FOLDER`.
+A name is bundled, `path/to/file.py:Class`, `package.module:Class`, `onnx:FOLDER`,
+`schedule:NAME` or `schedule:FILE.json`.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer
 from cosim.policies import POLICIES
 from cosim.policies.onnx.manifest import MANIFEST_FILE, read_bundle_manifest
 from cosim.policies.onnx.weights import weights_file
+from cosim.policies.schedule.policy import schedule_policy
 from cosim.policies.user_module import (
     importable_name,
     policy_class,
@@ -66,7 +68,15 @@ ONNX_SCHEME = "onnx:"
 REMOTE_SCHEME = "zenoh:"
 """Prefix of a policy served by `cosim serve` or `bridge/policy_server.py`."""
 
-OTHER_NAMES = ("path/to/file.py:Class", "package.module:Class", f"{ONNX_SCHEME}FOLDER")
+SCHEDULE_SCHEME = "schedule:"
+"""Prefix of an open-loop schedule, bundled or in a file (`cosim.policies.schedule`)."""
+
+OTHER_NAMES = (
+    "path/to/file.py:Class",
+    "package.module:Class",
+    f"{ONNX_SCHEME}FOLDER",
+    f"{SCHEDULE_SCHEME}FILE.json",
+)
 """Forms of policy names that are not listed."""
 
 
@@ -85,9 +95,11 @@ def load_policy(
     name = importable_name(name)
     within_s = start_s if timer is None else None
     if name.startswith(ONNX_SCHEME):
-        return _by_networks(
+        return _by_digest(
             name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser(), within_s), timer
         )
+    if name.startswith(SCHEDULE_SCHEME):
+        return _by_digest(name, lambda: schedule_policy(name.removeprefix(SCHEDULE_SCHEME)), timer)
     if name.startswith(REMOTE_SCHEME):
         raise UsageError(
             f"policy '{name}' is served elsewhere; here it must be one that this process can load"
@@ -98,9 +110,9 @@ def load_policy(
             return PolicyCaller(policy, source_hash=source_hash(policy), timer=timer)
         bundles = shipped_bundles()
         if name in bundles:
-            return _by_networks(name, _bundle(bundles[name], within_s), timer)
+            return _by_digest(name, _bundle(bundles[name], within_s), timer)
         if name == FOLLOW:
-            return _by_networks(name, _follow, timer)
+            return _by_digest(name, _follow, timer)
         raise unknown("policy", name, [*POLICIES, *bundles, FOLLOW, *OTHER_NAMES])
     home = Path.cwd()
     with policy_call("loading", timer=timer, passes=(BaseException,)):
@@ -112,19 +124,19 @@ def load_policy(
     return PolicyCaller(policy, manifest, source_hash(policy), timer)
 
 
-class _Networked(Policy, Protocol):
-    """Policy that loads networks.
+class _Digested(Policy, Protocol):
+    """Policy that reads files.
 
-    digest: Hash of the networks and everything else that determines its commands.
+    digest: Hash of the files and everything else that determines its commands.
     """
 
     digest: str
 
 
-def _bundle(folder: Path, within_s: float | None) -> Callable[[], _Networked]:
+def _bundle(folder: Path, within_s: float | None) -> Callable[[], _Digested]:
     """Return a function that loads the policy of an ONNX bundle. within_s: see `OnnxPolicy`."""
 
-    def make() -> _Networked:
+    def make() -> _Digested:
         from cosim.policies.onnx.policy import onnx_policy  # onnxruntime takes a moment to import
 
         return onnx_policy(folder, within_s)
@@ -132,14 +144,14 @@ def _bundle(folder: Path, within_s: float | None) -> Callable[[], _Networked]:
     return make
 
 
-def _follow() -> _Networked:
+def _follow() -> _Digested:
     from cosim.policies.follow.policy import Follow
 
     return Follow()
 
 
-def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None) -> PolicyCaller:
-    """Load a policy with networks. Raises UsageError if a network is missing or invalid."""
+def _by_digest(name: str, make: Callable[[], _Digested], timer: Timer | None) -> PolicyCaller:
+    """Load a policy that reads files. Raises UsageError if one is missing or invalid."""
     try:
         with policy_call("loading", timer=timer, passes=(BaseException,)):
             policy = make()

@@ -96,8 +96,8 @@ class RunConfig:
     policy: Annotated[
         str,
         Option(
-            "One of `cosim list`, your own as my.py:Class, a network as onnx:FOLDER, or a "
-            "served one as zenoh:NAME.",
+            "One of `cosim list`, your own as my.py:Class, a network as onnx:FOLDER, an open-loop "
+            "schedule as schedule:FILE.json, or a served one as zenoh:NAME.",
             panel=_POLICY,
         ),
     ] = "route"

@@ -21,9 +21,11 @@ from cosim.report.page.plots import exposure_of, people_nearby, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_table, tables_of, warnings_of
+from cosim.results.intervals import Estimate
 from cosim.results.run_folder import RunFolder, read_spec
 from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
+from cosim.spec.schedule import BEST_BLIND
 from tests.conftest import ROOT, Cosim
 from tests.support.driven_runs import HIT, episode_of, failure_at, run_of, short_way
 
@@ -99,6 +101,23 @@ def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Pat
     text = render_page([own], [plot], [], Maps([], {}, {}), "").decode()
     assert '<td title="n = 4">3/4</td>' in text and "nan" not in text.split("<script")[0]
     assert "1 crashed" in text and "<td>10</td><td>1</td><td>0</td>" in text
+
+
+def test_blind_schedules_are_a_row_of_the_tables_of_success(tmp_path: Path) -> None:
+    """With the share of each kind that was searched, below the runs of that suite alone."""
+    (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT], "mine")])
+    told = ReportedRun(
+        "mine", own.whole._replace(spec=msgspec.structs.replace(own.spec, suite="unit"))
+    )
+    share = Estimate(0.95, 0.76, 0.99, 20, 19.0)
+    blind = {"unit": {"straight": share}}
+    ours = next(table for table in tables_of([told], blind) if table.title == "Unit tests")
+    mine, row = ours.rows
+    assert row.name == BEST_BLIND and row.cells[0] == share and len(row.cells) == len(mine.cells)
+    assert sum(cell.n > 0 for cell in row.cells) == 1
+    text = render_page([told], [], [], Maps([], {}, {}), "", blind).decode()
+    assert text.index(BEST_BLIND) < text.index("models, in another engine")
+    assert BEST_BLIND not in render_page([own], [], [], Maps([], {}, {}), "", blind).decode()
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")

@@ -26,12 +26,14 @@ from cosim.spec.scenario import (
     content_hash,
     read_suite,
 )
+from cosim.spec.schedule import Schedule
 from cosim.spec.selection import select_scenarios
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.catalog import SUITES, load_suite, with_crowd
 from scenarios.suites.daylight import drawn_daylight
 from scenarios.suites.decoys import DECOY, decoy_of, limited
+from scenarios.suites.exploits import ALL, Exploit, Found, Share
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
 from scenarios.suites.reactive import Wanted, event_range_m
@@ -281,6 +283,16 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             "has 2 nets",
         ),
         "another-was-proved": ("hashes", Read(unit.suite, reactive.proofs), "was proved"),
+        "another-was-searched": (
+            "exploitability",
+            Read(unit.suite, unit.proofs, exploit=exploit_for("f" * 16)),
+            "was searched",
+        ),
+        "not-driven-on-test": (
+            "exploitability",
+            Read(unit.suite, unit.proofs, exploit=exploit_for(unit.suite.content_hash)),
+            "was not driven on each test scenario",
+        ),
         "no-proofs": ("proofs", Read(unit.suite, None), "has no proofs"),
         "a-scenario-changed-since": (
             "proofs",
@@ -458,6 +470,23 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             "is on the spot of straight-001",
         ),
     }
+
+
+def exploit_for(suite_hash: str) -> Exploit:
+    """An exploitability with a schedule that was driven nowhere."""
+    schedule = Schedule(name="blind-all")
+    shares = {"val_sr": Share(0, 0), "val_d": None, "sr": Share(0, 0), "d": None}
+    found = Found(
+        kind=ALL, objective="sr", evaluations=1, schedule=schedule, kinds={}, episodes=(), **shares
+    )
+    return Exploit(
+        suite="unit",
+        suite_hash=suite_hash,
+        goal="final_point",
+        seed=0,
+        evaluations=1,
+        found=(found,),
+    )
 
 
 def test_a_broken_claim_is_found_out() -> None:

@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from types import MappingProxyType
 from typing import Any, Final
 
 import jinja2
@@ -18,7 +19,7 @@ from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
-from cosim.report.page.three_tables import summary_table, tables_of, warnings_of
+from cosim.report.page.three_tables import BlindRows, summary_table, tables_of, warnings_of
 from cosim.results.discerned import is_decoy
 from cosim.results.log import holds_waypoints
 from cosim.results.table import injections_in_words, policy_in_words
@@ -61,8 +62,13 @@ def render_page(
     entries: Sequence[Entry],
     maps: Maps,
     note: str,
+    blind: BlindRows = MappingProxyType({}),
 ) -> bytes:
-    """Render the HTML file. note: what the gallery could not show, "" if nothing."""
+    """Render the HTML file.
+
+    note: what the gallery could not show, "" if nothing.
+    blind: results of blind schedules.
+    """
     from plotly.offline import get_plotlyjs
 
     causes = _causes_of(runs)
@@ -88,7 +94,7 @@ def render_page(
         episodes=sum(len(run.records) for run in runs),
         warnings=warnings_of(runs),
         overview=summary_table(runs, colours_of(runs)),
-        tables=tables_of(runs),
+        tables=tables_of(runs, blind),
         plots=plots,
         gallery=bool(entries or note),
         entries=entries,

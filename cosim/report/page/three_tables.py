@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby, pairwise
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import pandas as pd
@@ -26,6 +27,7 @@ from cosim.results.discerned import (
 )
 from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
 from cosim.results.table import ORACLE, crashed_in, estimate_of, why_inconclusive
+from cosim.spec.schedule import BEST_BLIND
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
 _SHARES: Final = {"success": "SR", "spl": "SPL", "route_completion": "RC"}
@@ -47,6 +49,10 @@ _DISCERNED_TITLE: Final = (
     "Share of pairs of an event and its decoy in which both were solved. The paper has no decoys.",
 )
 _PLACES: Final = ((False, "Generated places"), (True, "Real places"))
+
+
+BlindRows = Mapping[str, Mapping[str, Estimate]]
+"""Success of the best blind schedules found, by suite and kind."""
 
 
 class TableRow(NamedTuple):
@@ -108,9 +114,14 @@ class _Column(NamedTuple):
     metric: str
 
 
-def tables_of(runs: Sequence[ReportedRun]) -> list[ReportTable]:
-    """Return all tables for which the runs have rows."""
-    tables = [_unit(runs), *_reactive(runs), _long(runs), _other(runs)]
+def tables_of(
+    runs: Sequence[ReportedRun], blind: BlindRows = MappingProxyType({})
+) -> list[ReportTable]:
+    """Return all tables for which the runs have rows.
+
+    blind: results of blind schedules, shown as a row of the tables of success.
+    """
+    tables = [_unit(runs, blind), *_reactive(runs, blind), _long(runs), _other(runs)]
     return [table for table in tables if table is not None]
 
 
@@ -163,7 +174,19 @@ def kind_in_words(kind: str) -> str:
     return kind.replace("ped_", "ped. ")
 
 
-def _unit(runs: Sequence[ReportedRun]) -> ReportTable | None:
+def _with_blind(
+    table: ReportTable | None, columns: Sequence[_Column], blind: Mapping[str, Estimate]
+) -> ReportTable | None:
+    """Add the row of blind schedules, if any; other metrics than success are empty in it."""
+    if table is None or not blind:
+        return table
+    kinds = [str(column.of["kind"]) if column.metric == "success" else "" for column in columns]
+    cells = tuple(blind.get(kind, NO_ESTIMATE) for kind in kinds)
+    row = TableRow(BEST_BLIND, cells, "no camera, one schedule per kind, test")
+    return table._replace(rows=(*table.rows, row))
+
+
+def _unit(runs: Sequence[ReportedRun], blind: BlindRows) -> ReportTable | None:
     columns = [
         _Column(words, kind, head, {"real": real, "kind": kind}, metric)
         for real, words in _PLACES
@@ -171,10 +194,14 @@ def _unit(runs: Sequence[ReportedRun]) -> ReportTable | None:
         for metric, head in _SHARES.items()
     ]
     note = "SR success, SPL success weighted by path length, RC share of the route done."
-    return _table("Unit tests", note, runs, "unit", columns, UNIT_OF_PAPER)
+    table = _table("Unit tests", note, runs, "unit", columns, UNIT_OF_PAPER)
+    # A schedule is searched over generated and real places together.
+    generated = [column for column in columns if not column.of["real"]]
+    padded = [column if column in generated else column._replace(metric="") for column in columns]
+    return _with_blind(table, padded, blind.get("unit", {}))
 
 
-def _reactive(runs: Sequence[ReportedRun]) -> Iterable[ReportTable | None]:
+def _reactive(runs: Sequence[ReportedRun], blind: BlindRows) -> Iterable[ReportTable | None]:
     titles = {
         "success": (
             "People in the way: success",
@@ -195,7 +222,8 @@ def _reactive(runs: Sequence[ReportedRun]) -> Iterable[ReportTable | None]:
         columns = [
             _Column("", "", kind_in_words(kind), {"kind": kind}, metric) for kind in EVENT_COLUMNS
         ]
-        yield _table(title, note, runs, "reactive", columns, REACTIVE_OF_PAPER.get(metric, {}))
+        table = _table(title, note, runs, "reactive", columns, REACTIVE_OF_PAPER.get(metric, {}))
+        yield _with_blind(table, columns, blind.get("reactive", {}) if metric == "success" else {})
 
 
 def _long(runs: Sequence[ReportedRun]) -> ReportTable | None:

@@ -21,6 +21,7 @@ from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.daylight import FOG_M, LOWEST_SUN_RAD, sun_rises_rad
 from scenarios.suites.decoys import differing_fields, has_decoy, least_pace_mps, time_limit_s
+from scenarios.suites.exploits import ALL, Exploit, Share, kind_of
 from scenarios.suites.lanes import THINGS
 from scenarios.suites.proofs import Proofs, proofs_path
 from scenarios.suites.reactive import WAY_M as REACTIVE_WAY_M
@@ -58,11 +59,13 @@ class Read:
 
     proofs: None if they are missing or unreadable.
     path: None for a suite made in Python.
+    exploit: its exploitability, None if it was not measured.
     """
 
     suite: Suite
     proofs: Proofs | None
     path: Path | None = None
+    exploit: Exploit | None = None
 
 
 def _counts(read: Read) -> Iterator[str]:
@@ -437,6 +440,35 @@ def _by(scenarios: Sequence[Scenario], key: Callable[[Scenario], str]) -> dict[s
     return groups
 
 
+def _exploitability(read: Read) -> Iterator[str]:
+    """Check that a stored exploitability is of this suite, and that its shares are those of its
+    episodes on test.
+    """
+    exploit, suite = read.exploit, read.suite
+    if exploit is None:
+        return
+    if exploit.suite_hash != suite.content_hash:
+        yield f"{suite.name}: is {suite.content_hash}, but {exploit.suite_hash} was searched"
+        return
+    scenarios = {one.id: one for one in suite.scenarios}
+    test = [one for one in _test(read) if not one.decoy_of]
+    for one in exploit.found:
+        events = {s.id for s in test if one.kind in (ALL, kind_of(s))}
+        decoys = {s.id for s in suite.scenarios if s.decoy_of in events}
+        driven = {episode.scenario: episode for episode in one.episodes}
+        if driven.keys() != events | decoys or len(driven) != len(one.episodes):
+            yield f"{one.kind}: its schedule was not driven on each test scenario once"
+            continue
+        solved = {name for name, episode in driven.items() if episode.solved}
+        valid = {name for name, episode in driven.items() if episode.status != "invalid"}
+        sr = Share(len(solved & events), len(valid & events))
+        pairs = [(scenarios[name].decoy_of, name) for name in decoys]
+        pairs = [pair for pair in pairs if valid.issuperset(pair)]
+        d = Share(sum(solved.issuperset(pair) for pair in pairs), len(pairs)) if decoys else None
+        if (sr, d) != (one.sr, one.d):
+            yield f"{one.kind}: its shares are not those of its episodes on test"
+
+
 CLAIMS: Final[Mapping[str, Callable[[Read], Iterator[str]]]] = MappingProxyType(
     {
         "counts": _counts,
@@ -455,6 +487,7 @@ CLAIMS: Final[Mapping[str, Callable[[Read], Iterator[str]]]] = MappingProxyType(
         "spread": _spread,
         "duplicates": _duplicates,
         "size": _size,
+        "exploitability": _exploitability,
     }
 )
 """Checks by name. Each yields one line for each fault, beginning with the scenario's name if it

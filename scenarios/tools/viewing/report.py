@@ -39,9 +39,11 @@ from cosim.report.page.runs import (
     scenario_kind,
 )
 from cosim.report.page.scene import Entry, PlacePicture, Spot
+from cosim.results.intervals import Estimate
 from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import CityMap, Place, Scenario
 from scenarios.places.nets import place
+from scenarios.suites.exploits import exploit_of
 from scenarios.tools.viewing.scenes import ShownAgain, show_again, ticks_to_show
 from sumo_nets.maps.map_store import credit_of
 
@@ -119,7 +121,7 @@ def make_report(
     sizes = np.array([len(msgspec.json.encode(entry)) for entry in entries], dtype=int)
     count = int((fixed + np.cumsum(sizes) <= _MOST_BYTES).sum())
     maps = Maps(pictures, _spots(runs, picks[:count]), dict(episode_counts(runs)))
-    data = render_page(runs, plots, entries[:count], maps, _note(entries[:count]))
+    data = render_page(runs, plots, entries[:count], maps, _note(entries[:count]), blind_rows(runs))
     try:
         write_atomic(output, data)
     except OSError as error:
@@ -127,6 +129,19 @@ def make_report(
     if count < len(picks):
         limit = f"the file would be larger than {_MOST_BYTES / 1e6:g} MB"
     return ReportFacts(len(data), count, len(candidates), limit)
+
+
+def blind_rows(runs: Sequence[ReportedRun]) -> dict[str, dict[str, Estimate]]:
+    """Return the success of the best blind schedules found, by suite of the runs and kind."""
+    found = {}
+    for run in runs:
+        exploit = exploit_of(run.spec.setup.suite_hash)
+        if exploit is not None:
+            found[run.spec.suite] = {
+                kind: Estimate(share.mean, *share.interval, share.n, share.solved)
+                for kind, share in exploit.row().items()
+            }
+    return found
 
 
 class _Episode(NamedTuple):

@@ -1,0 +1,1 @@
+"""Policies that follow a schedule and see nothing."""
