@@ -3,9 +3,9 @@
     import cosim.gym
     import gymnasium
 
-    env = gymnasium.make("cosim/Reactive-v1")
+    env = gymnasium.make("cosim/Reactive-v2")
 
-The ids are cosim/Unit-v1, cosim/Reactive-v1 and cosim/LongHorizon-v1. `gymnasium.make` passes
+The ids are cosim/Unit-v2, cosim/Reactive-v2 and cosim/LongHorizon-v2. `gymnasium.make` passes
 further arguments to `cosim.make_env`.
 """
 
@@ -14,9 +14,9 @@ from __future__ import annotations
 import gymnasium
 
 ENV_IDS = {
-    "cosim/Unit-v1": "unit",
-    "cosim/Reactive-v1": "reactive",
-    "cosim/LongHorizon-v1": "long-horizon",
+    "cosim/Unit-v2": "unit",
+    "cosim/Reactive-v2": "reactive",
+    "cosim/LongHorizon-v2": "long-horizon",
 }
 """Suite name by environment id."""
 

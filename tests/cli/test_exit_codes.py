@@ -113,8 +113,8 @@ def test_a_run_with_fewer_records_than_scenarios_is_no_success(
     words = ("run", "reactive", "--policy", "orca", "--episodes", "2", "--out", "run")
     assert ended(monkeypatch, *words) == 1
     assert (
-        "No record of obstructing-001, conversing-001: run it again with --resume"
-        in capsys.readouterr().err
+        "No record of obstructing-001, obstructing-001-decoy, conversing-001, "
+        "conversing-001-decoy: run it again with --resume" in capsys.readouterr().err
     )
 
 

@@ -154,7 +154,7 @@ def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:
     assert {*ENV_IDS.values()} == {*SUITES}
     for env_id, name in ENV_IDS.items():
         assert env_id.endswith(f"-v{load_suite(name).version.split('.')[0]}")
-    with gymnasium.make("cosim/Unit-v1", manifest=BLIND, split="test", actions="waypoints") as env:
+    with gymnasium.make("cosim/Unit-v2", manifest=BLIND, split="test", actions="waypoints") as env:
         assert env.action_space.shape == (3, 2) and {
             one.split for one in env.unwrapped.scenarios
         } == {"test"}
@@ -211,7 +211,7 @@ def test_without_gymnasium_one_is_told_what_to_install(monkeypatch: pytest.Monke
 def test_an_environment_without_a_render_mode_says_how_to_get_pictures() -> None:
     """`render()` raises; the message names the mode and the call that sets it."""
     with (
-        gymnasium.make("cosim/Unit-v1", manifest=BLIND) as env,
+        gymnasium.make("cosim/Unit-v2", manifest=BLIND) as env,
         pytest.raises(
             UsageError, match=r"no render_mode.*gymnasium\.make\(.*render_mode=\"rgb_array\"\)"
         ),
@@ -229,7 +229,7 @@ def test_the_checker_of_gymnasium_is_content() -> None:
         "scenarios": ["way-1"],
         "render_mode": "rgb_array",
     }
-    env = gymnasium.make("cosim/Unit-v1", **asked).unwrapped
+    env = gymnasium.make("cosim/Unit-v2", **asked).unwrapped
     with env, warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         check_env(env)

@@ -64,14 +64,17 @@ def test_the_long_horizon_suite_is_what_it_promises() -> None:
 
 
 def test_the_reactive_suite_is_what_it_promises() -> None:
-    """Each event in a hundred cities, and nobody in each once; 10 to 20 m; nothing triggers where
-    the robot starts."""
+    """Each event in a hundred cities with its decoy, and an empty way in each; 12 to 30 m; nothing
+    triggers where the robot starts."""
     whole = load_suite("reactive")
+    events = [scenario for scenario in whole.scenarios if not scenario.decoy_of]
+    decoys = {scenario.decoy_of for scenario in whole.scenarios if scenario.decoy_of}
+    assert decoys == {scenario.id for scenario in events if scenario.events}
     cities = {scenario.place.name for scenario in whole.scenarios}
     assert len(cities) == 100
     structures = (*EVENT_KINDS, "static")
     places = {
-        one: [s.place.name for s in whole.scenarios if s.structure == one] for one in structures
+        one: [s.place.name for s in events if s.structure == one] for one in structures
     }
     assert all(len(there) == 100 and set(there) == cities for there in places.values())
     assert [s.place.name for s in whole.scenarios] == sorted(
@@ -87,10 +90,9 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
             0,
             0,
         )
-        assert 10.0 <= scenario.route_line.length_m <= 20.5
-        assert scenario.ends_on_failure and (scenario.ends_at == "stop") == (
-            event.kind == "gesturing"
-        )
+        assert 11.9 <= scenario.route_line.length_m <= 30.1
+        stops = event.kind == "gesturing" and not scenario.decoy_of
+        assert scenario.ends_on_failure and (scenario.ends_at == "stop") == stops
         assert 1.1 <= event.speed_mps <= 1.65
         states = react(first_query(scenario)).states
         assert states[0].phase == "waiting"
@@ -121,9 +123,11 @@ def test_scenarios_are_chosen_by_event() -> None:
         "frontal",
         "lateral",
     }
-    assert [s.events[0].kind for s in select_scenarios(whole, kinds=["frontal"], episodes=2)] == [
-        "frontal"
-    ] * 2
+    first = select_scenarios(whole, kinds=["frontal"], episodes=1)
+    assert [(one.structure, bool(one.decoy_of)) for one in first] == [
+        ("frontal", False),
+        ("frontal", True),
+    ]
     with pytest.raises(UsageError, match=r"event 'ambush'.*frontal"):
         select_scenarios(whole, kinds=["ambush"])
 

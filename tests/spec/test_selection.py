@@ -23,10 +23,10 @@ def reactive() -> Suite:
 
 
 def test_static_is_chosen_like_an_event(reactive: Suite) -> None:
-    """The hundred scenarios without an event are found by their name, alone and beside an event."""
+    """The hundred scenarios without an event are found by name, alone and with an event."""
     assert {s.structure for s in select_scenarios(reactive, kinds=["static"])} == {"static"}
     assert len(select_scenarios(reactive, kinds=["static"])) == 100
-    assert len(select_scenarios(reactive, kinds=["frontal", "static"])) == 200
+    assert len(select_scenarios(reactive, kinds=["frontal", "static"])) == 300
     with pytest.raises(
         UsageError, match=r"unknown event 'statik'. Valid choices: .*, static. Did you mean static"
     ):
@@ -36,17 +36,17 @@ def test_static_is_chosen_like_an_event(reactive: Suite) -> None:
 
 
 CHOICES: dict[str, dict[str, object]] = {
-    "900 of 900 (all)": {},
-    "30 of 900 (--event frontal --episodes 30)": {"kinds": ["frontal"], "episodes": 30},
-    "200 of 900 (--event frontal --event static)": {"kinds": ["static", "frontal"]},
-    "180 of 900 (--split test)": {"split": "test"},
-    "7 of 900 (--event static --split test --episodes 7)": {
+    "1700 of 1700 (all)": {},
+    "60 of 1700 (--event frontal --episodes 30)": {"kinds": ["frontal"], "episodes": 30},
+    "300 of 1700 (--event frontal --event static)": {"kinds": ["static", "frontal"]},
+    "340 of 1700 (--split test)": {"split": "test"},
+    "7 of 1700 (--event static --split test --episodes 7)": {
         "kinds": ["static"],
         "split": "test",
         "episodes": 7,
     },
-    "250 of 900 (--episodes 250)": {"episodes": 250},
-    "2 of 900 (--scenario frontal-003 --scenario static-005)": {
+    "473 of 1700 (--episodes 250)": {"episodes": 250},
+    "2 of 1700 (--scenario frontal-003 --scenario static-005)": {
         "ids": ["frontal-003", "static-005"]
     },
 }
@@ -75,12 +75,12 @@ def test_a_run_resumed_with_another_selection_names_the_options(
     with pytest.raises(RunError) as caught:
         RunFolder.resume(tmp_path / "run", spec(every), reactive)
     assert str(caught.value) == (
-        f"{tmp_path / 'run'} is of another run: its choice of scenarios is 30 of 900 "
+        f"{tmp_path / 'run'} is of another run: its choice of scenarios is 60 of 1700 "
         f"(--event frontal --episodes 30), "
-        "now asked for is 900 of 900 (all). Resume with the same command, or choose another --out."
+        "now asked for is 1700 of 1700 (all). Resume with the same command, or choose another --out."
     )
     apart = spec(some).apart(spec(every))
-    assert apart is not None and (apart.mine, apart.theirs) == ("30", f"900, with {every[0]}")
+    assert apart is not None and (apart.mine, apart.theirs) == ("60", f"1700, with {every[0]}")
 
 
 def with_decoys_of(reactive: Suite) -> Suite:

@@ -139,7 +139,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
             raise UsageError(
                 "render() was called, but the environment has no render_mode. Choose one "
                 "when it is made: "
-                'gymnasium.make("cosim/Reactive-v1", render_mode="rgb_array") or '
+                'gymnasium.make("cosim/Reactive-v2", render_mode="rgb_array") or '
                 'cosim.make_env("reactive", render_mode="rgb_array")'
             )
         if self._episode is None:

@@ -92,11 +92,11 @@ def test_success_names_the_events_that_end_otherwise() -> None:
 
 
 def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
-    """Nine hundred scenarios are no answer to a slip of the pen: five are, and how many there
+    """Seventeen hundred scenarios are no answer to a slip of the pen: five are, and how many there
     are."""
     names = [scenario.id for scenario in load_suite("reactive").scenarios]
     assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))
-    assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 900" in str(
+    assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 1700" in str(
         unknown("scenario", "x", names)
     )
 
