@@ -58,7 +58,8 @@ class Right:
     def yellow(self, frame: np.ndarray) -> float:
         wide = frame.shape[1]
         middle = frame[:, wide // 3 : 2 * wide // 3]
-        return float((middle[..., 0] - middle[..., 2] > 0.3).mean())
+        red_and_green = middle[..., :2].min(axis=2)
+        return float((red_and_green > np.maximum(2.0 * middle[..., 2], 0.15)).mean())
 
     def goal_rad(self, goal: PointGoal) -> float:
         return max(min(goal.bearing_rad, 1.0), -1.0)
