@@ -59,9 +59,9 @@ def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
         "--policy",
         "tests.support.blind_policy:Blind",
         "--scenario",
-        "lateral-001",
+        "lateral-011",
         "--scenario",
-        "obstructing-001",
+        "obstructing-009",
     )
     done = cosim("run", "reactive", *words, "--out", "run", cwd=folder)
     assert done.returncode == 0, done.stderr
