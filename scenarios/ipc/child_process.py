@@ -260,7 +260,8 @@ class Watchdog:
             self._looks_at_s = now_s + _LOOKS_S
             self.process.wake()
         if question is None:
-            if now_s - self.heard_s <= self._allowed_s():
+            allowed_s = self._allowed_s()
+            if now_s - self.heard_s <= allowed_s:
                 return None
             self.process.kill()
             words = f"the {self.process.called} process showed no sign of life"
@@ -273,7 +274,8 @@ class Watchdog:
         return self._ended(words, question, allowed_s=self._patience.of(question.doing))
 
     def _allowed_s(self) -> float:
-        """Return the timeout of its next heartbeat. A simulated tick is a heartbeat, too."""
+        """Return the timeout of its next heartbeat, after a look at the ticks, each of which is a
+        heartbeat."""
         progress = self.process.progress
         if progress != self._progress:
             self._progress = progress

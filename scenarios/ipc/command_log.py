@@ -37,7 +37,7 @@ class Driven(NamedTuple):
     """What was driven of an episode.
 
     ticks: number of simulated ticks.
-    over: whether the referee had ended the episode.
+    over: whether nothing more was simulated.
     commands: bytes of the log.
     """
 
@@ -71,9 +71,13 @@ class CommandLog:
     def simulated(self, ticks: int, *, over: bool) -> None:
         """Note the number of simulated ticks, and whether the episode is over."""
         self._ticks = ticks
-        self._note(over)
+        self._note(over=over)
 
-    def _note(self, over: bool = False) -> None:
+    def ends(self) -> None:
+        """Note that nothing more is simulated."""
+        self._note(over=True)
+
+    def _note(self, *, over: bool = False) -> None:
         _PROGRESS.pack_into(self._map, _PROGRESS_AT, self._ticks, self._count, over)
 
 

@@ -38,6 +38,7 @@ from cosim.spec.manifest import Manifest
 from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.shared_memory import SharedMemory, room_for
+from scenarios.ipc.surroundings import Surroundings
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 
 _SERVES: Final = "scenarios.runs.isolated_policy:serve_alone"
@@ -148,7 +149,11 @@ def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor:
     desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
     info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
     wire.send(encode_message(info))
+    surroundings = Surroundings.now()
     with suppress(EOFError):
         while True:
-            (reply,) = desk.replies([read_request(wire.receive())], [memory.map])
+            request = read_request(wire.receive())
+            (reply,) = desk.replies([request], [memory.map])
+            if isinstance(request, EndRequest) and Surroundings.now() != surroundings:
+                return  # without a reply, so that the next episode has a new process
             wire.send(encode_message(reply))

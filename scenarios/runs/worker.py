@@ -7,7 +7,6 @@ An environment process receives jobs over a socket; its supervisor writes its lo
 from __future__ import annotations
 
 import os
-import resource
 import signal
 import sys
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from socket import socket
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -53,6 +52,7 @@ from scenarios.ipc.messages import (
     encode_message,
 )
 from scenarios.ipc.render_link import link_to
+from scenarios.ipc.surroundings import Surroundings
 from scenarios.runs.policy_host import policy_driver, shared_driver
 
 if TYPE_CHECKING:
@@ -60,16 +60,6 @@ if TYPE_CHECKING:
 
 REPORT_EVERY_TICKS = 20
 """Ticks between two progress messages."""
-_LIMITS: Final = (
-    resource.RLIMIT_AS,
-    resource.RLIMIT_CPU,
-    resource.RLIMIT_DATA,
-    resource.RLIMIT_FSIZE,
-    resource.RLIMIT_NOFILE,
-    resource.RLIMIT_NPROC,
-    resource.RLIMIT_STACK,
-)
-"""Limits whose change by a policy would affect later episodes."""
 CANNOT_START = "an environment process cannot start:"
 """Beginning of the message that engines cannot be loaded."""
 
@@ -89,7 +79,7 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
             say(repeat_job(hello, commands, say))
     home = _working_folder()
     drivers: WorkerDrivers | None = load_drivers(hello, timer, say)
-    surroundings = _surroundings()
+    surroundings = Surroundings.now()
     say(Ready())
     while True:
         try:
@@ -108,7 +98,7 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
             drivers = None  # loaded again for the next job
         say(done)
         engine_failed = failed and isinstance(done, Done) and done.status == "invalid"
-        if engine_failed or _surroundings() != surroundings:
+        if engine_failed or Surroundings.now() != surroundings:
             break  # a policy has changed the process; the run starts another one
     wire.close()  # before functions that the policy has left for the end of the process
 
@@ -130,20 +120,6 @@ def _run(
 
 def ignore_message(message: Message) -> None:
     """Do nothing with a message."""
-
-
-def _surroundings() -> tuple[object, ...]:
-    """Return what a policy may change of its process for later episodes: limits, outputs, umask.
-
-    A file that was opened since may have the descriptor of a closed output.
-    """
-    found: list[object] = [[resource.getrlimit(limit) for limit in _LIMITS]]
-    for descriptor in (1, 2):
-        with suppress(OSError):
-            status = os.fstat(descriptor)
-            found.append((status.st_dev, status.st_ino))
-    os.umask(mask := os.umask(0o077))
-    return (*found, mask)
 
 
 def _working_folder() -> Path:
@@ -193,6 +169,7 @@ def repeat_job(hello: Hello, commands: CommandLog, say: MessageHandler) -> Repea
         watches=[_noted(commands)],
         waiting=lambda reason, _=None: say(Waits(name, reason)),
     )
+    commands.ends()
     return Repeated(name, replayed.record.encoded(), replayed.error)
 
 
@@ -323,6 +300,8 @@ def run_job(
             comparing=watcher.compared,
             commands=commands,
         )
+        if commands is not None:
+            commands.ends()
     except RendererLost as lost:
         return LostRenderer(name, lost.number, lost.asked), False
     if outcome.traceback:
