@@ -380,13 +380,8 @@ class RunFolder:
                 (folder / f"{name}.part").unlink(missing_ok=True)
 
     def finish(self) -> pd.DataFrame:
-        """Write results.csv and return its table.
-
-        Records and rows that a policy has changed or deleted are written again.
-        """
-        self.mend()
-        records = self._written_again()
-        table = table_of(records)
+        """Write results.csv and return its table."""
+        table = table_of(self.restore())
         path = self.path / "results.csv"
         with _write_errors(path, "all episodes are kept; make room and add --resume"):
             write_atomic(path, table.to_csv(index=False).encode())
@@ -431,8 +426,10 @@ class RunFolder:
         for record in read_records(self.path):
             self._rows.setdefault(record.scenario.id, RECORD_FILE.encode(record))
 
-    def _written_again(self) -> list[Record]:
-        """Return all records, after those on disk that differ were written again."""
+    def restore(self) -> list[Record]:
+        """Return all records. Records and rows that a policy has changed or deleted are written
+        again. Raises MachineError if that is impossible."""
+        self.mend()
         mine = {name: RECORD_FILE.decode(row) for name, row in self._rows.items()}
         try:
             same = {one.scenario.id: one for one in read_records(self.path)} == mine

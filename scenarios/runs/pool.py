@@ -76,6 +76,7 @@ def run_all(
             pool.take_unsolicited()
     finally:
         pool.close()
+        folder.restore()
 
 
 class _Pool:

@@ -282,7 +282,7 @@ def run_job(
 
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
     watcher = _Watcher(job, say)
-    watches = [watcher.watch]
+    watches: list[Watch] = [watcher.watch]
     if commands is not None:
         commands.begins()
         watches.append(_noted(commands))

@@ -18,7 +18,7 @@ import msgspec
 import pandas as pd
 import pytest
 
-from cosim.core.errors import UsageError
+from cosim.core.errors import ALL_SCORED, SOME_CRASHED, UsageError
 from cosim.results.record import Record
 from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.episode_id import episode_id_of
@@ -109,8 +109,9 @@ def war(desk: Path, names: tuple[str, ...], *options: str) -> War:
         timeout=PATIENCE_S,
         check=False,
     )
-    records = {one.scenario.id: one for one in read_records(desk / "run")}
     said = Said(done.returncode, done.stdout, done.stderr)
+    assert said.returncode in (ALL_SCORED, SOME_CRASHED), said
+    records = {one.scenario.id: one for one in read_records(desk / "run")}
     return War(desk / "run", names, said, records, mark)
 
 

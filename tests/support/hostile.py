@@ -71,7 +71,7 @@ class Hostile(Honest):
         self.name = json.loads((_desk() / "names.json").read_text())[episode_id]
         self.deed = DEEDS[self.name]
         self.count = 0
-        self.undo: Callable[[], None] = lambda: None
+        self.undo: Callable[[], object] = lambda: None
         with (_desk() / "began.txt").open("a") as began:
             began.write(f"{self.name}\n")
         if self.deed.call == "reset":
@@ -184,15 +184,23 @@ def _patches_the_referee(self: Hostile, seen: Any) -> None:
 
 
 def _patches_numpy(self: Hostile, seen: Any) -> None:
-    np.hypot = np.column_stack = np.asarray = None
+    names = ("hypot", "column_stack", "asarray")
+    before = {name: getattr(np, name) for name in names}
+    for name in names:
+        setattr(np, name, None)
+    self.undo = lambda: [setattr(np, name, it) for name, it in before.items()]
 
 
 def _patches_time(self: Hostile, seen: Any) -> None:
+    before = time.perf_counter
     time.perf_counter = None
+    self.undo = lambda: setattr(time, "perf_counter", before)
 
 
 def _empties_sys_modules(self: Hostile, seen: Any) -> None:
-    for name in [*sys.modules]:
+    before = dict(sys.modules)
+    self.undo = lambda: sys.modules.update(before)
+    for name in before:
         if name.startswith(("cosim", "scenarios", "physics", "numpy")):
             sys.modules[name] = None
 
@@ -389,6 +397,7 @@ def _traces_calls(self: Hostile, seen: Any) -> None:
             raise OverflowError("traced")
 
     sys.settrace(trace)
+    self.undo = lambda: sys.settrace(None)
 
 
 def _outlives_its_process(self: Hostile, seen: Any) -> None:
@@ -447,7 +456,8 @@ BLAMED = "the policy is at fault, because the simulator survives its commands wi
 class Deed(NamedTuple):
     """A behaviour.
 
-    does: what it does; an answer that is None is that of `honest`
+    does: what it does; an answer that is None is that of `honest`. What it patches is restored by
+        `undo` when the episode has ended, because a policy may harm its own later episodes.
     here: DONE, FORGED or a part of the crash's reason in the simulator's process
     isolated: the same with --isolated
     call: the call of the policy in which it happens
