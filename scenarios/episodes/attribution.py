@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from cosim.core.errors import MachineError
+from cosim.core.errors import MachineError, PolicyError
 from cosim.core.progress import Progress, ignore
 from cosim.results.record import Record
 from cosim.results.run_setup import RunSetup
@@ -73,6 +73,8 @@ def repeat_commands(
             tracker.compared(episode.scenario, entrances, waiting)
     except MachineError:
         raise
+    except PolicyError:  # no number: a policy has written to the log
+        return Replayed(driven_so_far(episode))
     except Exception as error:  # noqa: BLE001  reported, to be compared with the failure
         return Replayed(driven_so_far(episode), error_message(error))
     return Replayed(record)

@@ -38,7 +38,7 @@ from cosim.spec.manifest import Manifest
 from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.shared_memory import SharedMemory, room_for
-from scenarios.ipc.surroundings import Surroundings
+from scenarios.ipc.surroundings import Surroundings, end_at_once
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 
 _SERVES: Final = "scenarios.runs.isolated_policy:serve_alone"
@@ -155,5 +155,5 @@ def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor:
             request = read_request(wire.receive())
             (reply,) = desk.replies([request], [memory.map])
             if isinstance(request, EndRequest) and Surroundings.now() != surroundings:
-                return  # without a reply, so that the next episode has a new process
+                end_at_once()  # without a reply, so that the next episode has a new process
             wire.send(encode_message(reply))

@@ -52,7 +52,7 @@ from scenarios.ipc.messages import (
     encode_message,
 )
 from scenarios.ipc.render_link import link_to
-from scenarios.ipc.surroundings import Surroundings
+from scenarios.ipc.surroundings import Surroundings, end_at_once
 from scenarios.runs.policy_host import policy_driver, shared_driver
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
         engine_failed = failed and isinstance(done, Done) and done.status == "invalid"
         if engine_failed or Surroundings.now() != surroundings:
             break  # a policy has changed the process; the run starts another one
-    wire.close()  # before functions that the policy has left for the end of the process
+    end_at_once()
 
 
 def _run(

@@ -23,7 +23,7 @@ from cosim.results.record import Record
 from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.episode_id import episode_id_of
 from cosim.spec.options import EpisodeOptions, PolicyHost
-from cosim.spec.scenario import Scenario, Suite, write_suite
+from cosim.spec.scenario import CrowdSpec, Scenario, Suite, write_suite
 from scenarios.runs import run as suite_run
 from scenarios.runs.isolated_policy import isolated_driver
 from scenarios.tools.verify.doctor import small_scenario
@@ -82,7 +82,9 @@ class Wars(NamedTuple):
 
 
 def named(name: str) -> Scenario:
-    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, id=name)
+    """A second in a small city without a crowd, so that its engines start fast."""
+    nobody = CrowdSpec(persons=0, vehicles=0)
+    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, id=name, crowd=nobody)
 
 
 def prepare(desk: Path, names: Sequence[str], mark: str) -> dict[str, str]:
@@ -116,8 +118,8 @@ def war(desk: Path, names: tuple[str, ...], *options: str) -> War:
 
 
 HOSTINGS = {
-    "in-process": ("--log-json", "log.jsonl", "--frames", "0.25"),
-    "isolated": ("--isolated",),
+    "in-process": ("--camera", "bullet", "--log-json", "log.jsonl", "--frames", "0.25"),
+    "isolated": ("--camera", "bullet", "--isolated"),
 }
 HARMFUL = tuple(name for name, deed in DEEDS.items() if deed.harms_folder)
 OTHERS = tuple(name for name, deed in DEEDS.items() if not deed.harms_folder)
@@ -245,7 +247,7 @@ def test_isolated_or_not_an_episode_is_the_same_to_the_bit(
     if hosting == "in-process":
         return
     suite = Suite(name="hostile", version="1", scenarios=(named("honest"),))
-    table = suite_run.run(suite, Honest(), out=tmp_path / "run", options=EpisodeOptions(seed=SEED))
+    table = suite_run.run(suite, Honest(), out=tmp_path / "run", options=EpisodeOptions(seed=SEED, camera="bullet"))
     honest = wars.others.records["honest"]
     assert table["policy_runs"].tolist() == ["in-process"]
     assert table["state_hash"].tolist() == [honest.state_hash]
