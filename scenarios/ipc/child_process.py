@@ -157,6 +157,7 @@ class ChildProcess:
     def end(self) -> str:
         """Wait for its end, by force if that takes too long. Returns the reason in words."""
         self.wire.close()
+        self.wake()
         code = self._code(ENDING_S)
         if code is None:
             self._terminate()

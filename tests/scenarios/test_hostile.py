@@ -97,11 +97,11 @@ def prepare(desk: Path, names: Sequence[str], mark: str) -> dict[str, str]:
     return {DESK: str(desk), MARK: mark, "PYTHONPATH": path}
 
 
-def war(desk: Path, names: tuple[str, ...], *options: str) -> War:
-    """Run behaviours by two processes at a time."""
+def war(desk: Path, names: tuple[str, ...], *options: str, jobs: int = 2) -> War:
+    """Run behaviours by some processes at a time."""
     mark = f"hostile-{uuid.uuid4()}"
     timeout = ("--answer-timeout", f"{ANSWER_S:g}", "--start-timeout", f"{ANSWER_S:g}")
-    words = ("--policy", f"{OF}:Hostile", "--jobs", "2", "--seed", str(SEED), "--out", "run")
+    words = ("--policy", f"{OF}:Hostile", "--jobs", str(jobs), "--seed", str(SEED), "--out", "run")
     done = subprocess.run(
         [sys.executable, "-c", _SHORT, "run", "hostile.json", *words, *timeout, *options],
         cwd=desk,
@@ -134,7 +134,8 @@ def hosting(request: pytest.FixtureRequest) -> str:
 def wars(hosting: str, tmp_path_factory: pytest.TempPathFactory) -> Wars:
     options = HOSTINGS[hosting]
     others = war(tmp_path_factory.mktemp(hosting), OTHERS, *options)
-    return Wars(others, war(tmp_path_factory.mktemp("harmful"), ("honest", *HARMFUL), *options))
+    folder = tmp_path_factory.mktemp("harmful")
+    return Wars(others, war(folder, ("honest", *HARMFUL), *options, jobs=1))
 
 
 def with_mark(mark: str) -> list[int]:
