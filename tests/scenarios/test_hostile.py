@@ -248,7 +248,9 @@ def test_isolated_or_not_an_episode_is_the_same_to_the_bit(
     if hosting == "in-process":
         return
     suite = Suite(name="hostile", version="1", scenarios=(named("honest"),))
-    table = suite_run.run(suite, Honest(), out=tmp_path / "run", options=EpisodeOptions(seed=SEED, camera="bullet"))
+    table = suite_run.run(
+        suite, Honest(), out=tmp_path / "run", options=EpisodeOptions(seed=SEED, camera="bullet")
+    )
     honest = wars.others.records["honest"]
     assert table["policy_runs"].tolist() == ["in-process"]
     assert table["state_hash"].tolist() == [honest.state_hash]
