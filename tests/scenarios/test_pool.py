@@ -4,6 +4,7 @@ once."""
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import time
 from pathlib import Path
@@ -19,6 +20,7 @@ from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
 from cosim.spec.options import RendererAddress
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
+from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.command_log import Driven
 from scenarios.ipc.deadlines import Patience, PendingCall, PendingCallMemory
 from scenarios.ipc.messages import (
@@ -39,8 +41,9 @@ from scenarios.runs import environment_slot, pool
 from scenarios.runs.environment_slot import EnvironmentSlot
 from scenarios.runs.shared_renderer import RendererEnd, SharedRenderer
 from scenarios.tools.verify.doctor import small_scenario
-from tests.conftest import PATIENCE_S, Cosim, seed_in_order
+from tests.conftest import PATIENCE_S, Cosim, seed_in_order, still_runs
 from tests.run_specs import record_of, spec_of
+from tests.support.nested import FLOOD
 
 MODULES = {
     "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or "
@@ -155,6 +158,23 @@ def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> 
     assert text.startswith(first or kept) and text.endswith(last) and len(kept) < 300
     assert not gap or (len(first), len(first) + int(left_out) + len(last)) == (100, printed)
     assert not gap or 100 <= len(last) < 130
+
+
+@pytest.mark.parametrize("ended", ["worker", "supervisor"])
+def test_a_nested_supervisor_stores_the_end_of_its_log(tmp_path: Path, ended: str) -> None:
+    """Whether the worker that started it is killed or the run ends, the last output is stored."""
+    log = tmp_path / "log"
+    process = ChildProcess(log, "tests.support.nested:starts_another", "worker")
+    worker = int(process.wire.receive(PATIENCE_S))
+    if ended == "worker":
+        os.kill(worker, signal.SIGKILL)
+        process.end()
+    else:
+        process.kill()
+    written = log.read_bytes()
+    assert b"the flood begins" in written and b"the flood ends" in written
+    assert len(written) < len(FLOOD)
+    assert not still_runs(worker)
 
 
 @pytest.mark.parametrize(

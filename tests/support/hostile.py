@@ -16,6 +16,7 @@ import resource
 import shutil
 import signal
 import sqlite3
+import stat
 import subprocess
 import sys
 import threading
@@ -336,7 +337,8 @@ def _forks_many(self: Hostile, seen: Any) -> None:
 def _writes_garbage(self: Hostile, seen: Any) -> None:
     for descriptor in range(3, 64):
         with suppress(OSError):
-            os.write(descriptor, b"\xff" * 4096)
+            if stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+                os.write(descriptor, b"\xff" * 4096)
 
 
 def _overwrites_shared_memory(self: Hostile, seen: Any) -> None:
