@@ -8,7 +8,7 @@ supervisor, also those in a session of their own. It does the same on SIGTERM fr
 the run dies. Supervisors that the worker has started for isolated policies end by SIGTERM, and have
 a moment for the end of their logs.
 
-A worker that a signal has stopped is continued at once.
+A worker that a signal has stopped is continued after a moment.
 
 It imports little but the standard library, and forks before it starts a thread.
 """
@@ -40,6 +40,8 @@ KILLING_S = 10.0
 """Timeout in seconds for the end of killed processes, which the kernel may delay."""
 PARTING_S = 3.0
 """Seconds that a nested supervisor has to end its processes before it is killed."""
+STOPPED_S = 2.0
+"""Seconds after which a worker that a signal has stopped is continued."""
 PR_SET_NAME = 15
 """Option of `prctl` that sets the name of this process in /proc."""
 _NAME = "cosim-keeper"
@@ -182,12 +184,14 @@ def _run_worker(serves: str, descriptors: tuple[int, ...], prints: int, supervis
 def _status_of(pid: int) -> int:
     """Wait for the worker, and reap other children; return its wait status.
 
-    The worker is continued if a signal has stopped it.
+    The worker is continued STOPPED_S after a signal has stopped it.
     """
     while True:
         ended, status = os.waitpid(-1, os.WUNTRACED)
         if os.WIFSTOPPED(status):
-            _send(ended, signal.SIGCONT)
+            waits = threading.Timer(STOPPED_S, _send, (ended, signal.SIGCONT))
+            waits.daemon = True
+            waits.start()
         elif ended == pid:
             return status
 
