@@ -77,6 +77,8 @@ class _PolicyProcess:
         return self._memory.lay(arrays)
 
     def ask(self, question: ResetRequest | ActRequest | EndRequest) -> bytes:
+        if isinstance(question, ResetRequest):
+            self._process.wake()  # the policy may have stopped its supervisor
         try:
             self._process.wire.send(encode_message(question))
             return self._process.wire.receive()
