@@ -202,7 +202,9 @@ def test_a_run_of_hostile_policies_ends_in_order(hosting: str, wars: Wars) -> No
     logs = [path.read_bytes() for path in (wars.others.folder / "logs").iterdir()]
     assert max(map(len, logs)) < FLOOD_BYTES / 2
     left_out = b"bytes were printed here and left out"
-    for words in (b"the other flood begins", left_out, b"the other flood ends"):
+    ends = (b"the other flood begins", b"the other flood ends")
+    # Two floods of isolated policies may share a log, whose middle is left out.
+    for words in (left_out, *(ends if hosting == "in-process" else ())):
         assert any(words in log for log in logs), words
 
 
