@@ -178,7 +178,7 @@ def test_a_policy_in_a_sandbox_reaches_nothing_outside(
         "cwd": str(desk),
         "parent": os.getpid(),
         "victim": victim.pid,
-        "secrets": ["COSIM_CACHE", "SECRET_TOKEN", "HOSTILE_DESK", "PYTEST_CURRENT_TEST"],
+        "secrets": ["COSIM_CACHE", "SECRET_TOKEN", "PYTEST_CURRENT_TEST"],
         "user": user,
         **listeners,
     }
