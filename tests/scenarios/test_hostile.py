@@ -12,6 +12,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -87,10 +88,15 @@ class Wars(NamedTuple):
         return self.harmful if DEEDS[name].harms_folder else self.others
 
 
-def named(name: str) -> Scenario:
+@cache
+def short_scenario() -> Scenario:
     """A second in a small city without a crowd, so that its engines start fast."""
     nobody = CrowdSpec(persons=0, vehicles=0)
-    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, id=name, crowd=nobody)
+    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, crowd=nobody)
+
+
+def named(name: str) -> Scenario:
+    return msgspec.structs.replace(short_scenario(), id=name)
 
 
 def prepare(desk: Path, names: Sequence[str], mark: str) -> dict[str, str]:
