@@ -79,7 +79,8 @@ class War(NamedTuple):
 
 
 class Wars(NamedTuple):
-    """The runs of a hosting: of those that harm the run folder, and of the others."""
+    """The runs of a hosting: of behaviours that harm the run folder, and of the others. In a
+    sandbox, where none can, they are one run."""
 
     others: War
     harmful: War
@@ -90,9 +91,9 @@ class Wars(NamedTuple):
 
 @cache
 def short_scenario() -> Scenario:
-    """A second in a small city without a crowd, so that its engines start fast."""
+    """A second in a small city without crowd and obstacles, so that its engines start fast."""
     nobody = CrowdSpec(persons=0, vehicles=0)
-    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, crowd=nobody)
+    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, crowd=nobody, obstacles=())
 
 
 def named(name: str) -> Scenario:
@@ -150,6 +151,9 @@ def hosting(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="module")
 def wars(hosting: str, tmp_path_factory: pytest.TempPathFactory) -> Wars:
     options = HOSTINGS[hosting]
+    if hosting == "isolated":
+        run = war(tmp_path_factory.mktemp(hosting), tuple(DEEDS), *options)
+        return Wars(run, run)
     others = war(tmp_path_factory.mktemp(hosting), OTHERS, *options)
     folder = tmp_path_factory.mktemp("harmful")
     return Wars(others, war(folder, ("honest", *HARMFUL), *options, jobs=1))

@@ -273,11 +273,18 @@ def _exceeds_the_size_of_files(self: Hostile, seen: Any) -> None:
         large.write(bytes(1 << 16))
 
 
+def _limit_memory(more: int) -> None:
+    """Limit the memory of this process to some more bytes than it has; to 1 GiB without /proc."""
+    room = 1 << 30
+    with suppress(OSError):
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        room = pages * resource.getpagesize() + more
+    resource.setrlimit(resource.RLIMIT_AS, (room, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
 def _takes_all_memory(self: Hostile, seen: Any) -> None:
     """Leave no memory to this process, and answer."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    room = pages * resource.getpagesize() + (32 << 20)
-    resource.setrlimit(resource.RLIMIT_AS, (room, room))
+    _limit_memory(32 << 20)
     for size in (1 << 20, 1 << 16, 1 << 10, 64):
         with suppress(MemoryError):
             while True:
@@ -296,10 +303,7 @@ def _limits(*which: tuple[int, int]) -> Callable[[Hostile, Any], None]:
 
 
 def _exhausts_memory(self: Hostile, seen: Any) -> None:
-    held = resource.getrlimit(resource.RLIMIT_AS)
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    room = pages * resource.getpagesize() + (64 << 20)
-    resource.setrlimit(resource.RLIMIT_AS, (room, held[1]))
+    _limit_memory(64 << 20)
     bytearray(1 << 40)
 
 
@@ -545,7 +549,7 @@ DEEDS = {
     # It takes what the simulator needs.
     "limits-descriptors": Deed(_limits((resource.RLIMIT_NOFILE, 4)), DONE, DONE),
     "fills-its-descriptors": Deed(_fills_its_descriptors, DONE, DONE),
-    "takes-all-memory": Deed(_takes_all_memory, BLAMED, "policy 'honest' ", attempts=2),
+    "takes-all-memory": Deed(_takes_all_memory, BLAMED, _ENDED, attempts=2),
     "exhausts-memory": Deed(_exhausts_memory, *_both("raised MemoryError")),
     # It harms outputs and connections.
     "floods": Deed(_floods, DONE, DONE),
