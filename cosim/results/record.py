@@ -114,7 +114,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         fault: no failure, but the event did not happen or could not be seen; or an engine failed
         twice
     reason: why the episode crashed or is invalid
-    ended: None if the episode did not end; then there is no trajectory
+    ended: None if the episode did not end; then there is neither trajectory nor measure, and ticks,
+        state hash, failures and events are those before the crash
     walked_into: contacts with people who walked into the resting robot; not failures
     injections: pedestrians injected from outside; needed for a replay
     clock: wall times, not reproducible, and answer times of a policy in another process
@@ -251,10 +252,12 @@ class Recorder:
         self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in COLUMNS}
         self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
+        self.ticks = 0
 
     def add(self, step: Step, verdict: Verdict, road: RoadState = RoadState()) -> None:  # noqa: B008  a frozen value
         """Record one tick; people only every PEOPLE_EVERY_TICKS within PEOPLE_WITHIN_M."""
         self.hash.add(step)
+        self.ticks += 1
         tick = Tick(step, verdict, self._footprint_m, road)
         for name, column in COLUMNS.items():
             self._values[name].append(column.read(tick))

@@ -32,6 +32,7 @@ from filelock import FileLock
 from cosim.core.errors import MachineError, RunError, UsageError, listed, unknown, unwritable
 from cosim.core.files import is_locked, lock, read_limited, write_atomic
 from cosim.core.npz import read_npz
+from cosim.results.folder_guard import FolderGuard
 from cosim.results.log import Log
 from cosim.results.record import RECORD_FILE, Record
 from cosim.results.run_spec import RUN_FILE, RunSpec, decode_spec
@@ -215,6 +216,9 @@ class RunFolder:
         self._suite = suite
         self._lock = lock(path / "lock", wait=False)
         self._add_connection: sqlite3.Connection | None = None
+        self._guard: FolderGuard | None = None
+        self._rows: dict[str, bytes] = {}
+        self._begun: dict[str, bytes] = {}
 
     @classmethod
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
@@ -257,6 +261,7 @@ class RunFolder:
                 refuse_used(self.path)
                 self._begin(self._suite)
             self._open_database()
+            self._remember()
         except BaseException:
             self._lock.release()
             raise
@@ -271,6 +276,9 @@ class RunFolder:
         if self._add_connection is not None:
             self._add_connection.close()
             self._add_connection = None
+        if self._guard is not None:
+            self._guard.close()
+            self._guard = None
         self._lock.release()
 
     def episode_folder(self, scenario_id: str) -> Path:
@@ -283,15 +291,24 @@ class RunFolder:
             return {scenario for (scenario,) in database.execute("select scenario from episodes")}
 
     def add(self, record: Record) -> None:
-        """Append the row of a finished episode; a second one of the same scenario is ignored."""
-        values = record.scenario.id, RECORD_FILE.encode(record).decode()
-        with _database_errors(self.path):
+        """Append the row of a finished episode; a second one of the same scenario is ignored.
+
+        A database that was damaged during the run is written again.
+        """
+        row = RECORD_FILE.encode(record)
+        self._rows.setdefault(record.scenario.id, row)
+        values = record.scenario.id, row.decode()
+        try:
             if self._add_connection is None:  # reused: opening takes longer than adding
                 self._add_connection = connect_database(self.path)
             with self._add_connection as database:
                 database.execute(
                     "insert or ignore into episodes (scenario, record) values (?, ?)", values
                 )
+        except sqlite3.Error as error:
+            if not is_damaged(error):
+                raise database_error(self.path, error) from error
+            self._replace_database(self.path / DATABASE)
 
     def _remove(self, scenarios: Sequence[str]) -> None:
         """Delete the rows of episodes that will run again."""
@@ -310,6 +327,7 @@ class RunFolder:
         log: bytes of the `Log`
         """
         target = self.episode_folder(record.scenario.id)
+        self.mend()
         with _write_errors(target, _ROOM_REMEDY):
             target.mkdir(parents=True, exist_ok=True)
             for name, data in ((TRAJECTORY, log), (DEMONSTRATION, demonstration)):
@@ -342,6 +360,7 @@ class RunFolder:
     def add_failed_attempt(self, attempt: FailedAttempt) -> None:
         """Append a failed attempt to the run's file."""
         path = self.path / _ATTEMPTS
+        self.mend()
         with _write_errors(path, _ROOM_REMEDY), path.open("ab") as file:
             file.write(msgspec.json.encode(attempt) + b"\n")
 
@@ -362,11 +381,70 @@ class RunFolder:
 
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""
-        table = table_of(read_records(self.path))
+        table = table_of(self.restore())
         path = self.path / "results.csv"
         with _write_errors(path, "all episodes are kept; make room and add --resume"):
             write_atomic(path, table.to_csv(index=False).encode())
         return table
+
+    def mend(self) -> None:
+        """Restore the folder, its spec, its scenarios and its rows if a policy has moved or deleted
+        them. Raises MachineError if that is impossible."""
+        if self._guard is None:
+            return
+        database = self.path / DATABASE
+        with _write_errors(self.path):
+            lost = self._guard.mend()
+            if not lost and database.exists():
+                return
+            for folder in (self.path / "episodes", self.path / "logs"):
+                folder.mkdir(exist_ok=True)
+            for name, data in self._begun.items():
+                write_atomic(self.path / name, data)
+            self._replace_database(database)
+
+    def _replace_database(self, database: Path) -> None:
+        """Write the database again from the rows of this process."""
+        if self._add_connection is not None:
+            self._add_connection.close()
+            self._add_connection = None
+        for end in ("", "-wal", "-shm"):
+            database.with_name(DATABASE + end).unlink(missing_ok=True)
+        with _database_errors(self.path):
+            check_database(self.path)
+            with closing(connect_database(self.path)) as connection, connection:
+                connection.executemany(
+                    "insert into episodes (scenario, record) values (?, ?)",
+                    [(name, row.decode()) for name, row in self._rows.items()],
+                )
+
+    def _remember(self) -> None:
+        """Note what `mend` restores."""
+        self._guard = FolderGuard(self.path)
+        for name in ("scenarios.json", "run.json"):
+            self._begun[name] = (self.path / name).read_bytes()
+        for record in read_records(self.path):
+            self._rows.setdefault(record.scenario.id, RECORD_FILE.encode(record))
+
+    def restore(self) -> list[Record]:
+        """Return all records. Records and rows that a policy has changed or deleted are written
+        again. Raises MachineError if that is impossible."""
+        self.mend()
+        mine = {name: RECORD_FILE.decode(row) for name, row in self._rows.items()}
+        try:
+            same = {one.scenario.id: one for one in read_records(self.path)} == mine
+        except RunError:
+            same = False
+        with _write_errors(self.path, _ROOM_REMEDY):
+            if not same:
+                self._replace_database(self.path / DATABASE)
+            for name, record in mine.items():
+                file = self.episode_folder(name) / "record.json"
+                data = record.encoded()
+                if not file.exists() or file.read_bytes() != data:
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    write_atomic(file, data)
+        return list(mine.values())
 
     def _begin(self, suite: Suite) -> None:
         """Write the spec and scenarios; run.json last, since it marks the folder as resumable."""

@@ -46,6 +46,7 @@ from cosim.spec.scenario import Scenario
 from scenarios.episodes.live_episode import LiveEpisode
 from scenarios.episodes.wiring import StagedScenario, staged
 from scenarios.events import EVENT_KINDS
+from scenarios.ipc.command_log import CommandLog, TimedCommand
 from sumo_nets.crowd.demand_log import Entrances
 
 Watch = Callable[[Step, Verdict], None]
@@ -69,6 +70,7 @@ class Episode:
     kinds: table of valid event kinds.
     setup: of the run, with seed and latency; by default derived from the options.
     renderer: shared renderer of the run, used in place of an own camera.
+    commands: log of each command before it is simulated.
 
     Raises UsageError for a camera that the robot lacks, for a goal that the policy does not
     support, and for calls in the wrong order. Raises PolicyError for an invalid command,
@@ -97,6 +99,7 @@ class Episode:
         kinds: EventKinds = EVENT_KINDS,
         setup: RunSetup | None = None,
         renderer: RendererAddress | None = None,
+        commands: CommandLog | None = None,
     ) -> None:
         self.scenario = scenario = scenario.driven_by(options.robot)
         manifest = with_goal(manifest, options.goal)
@@ -108,6 +111,7 @@ class Episode:
         self.clock = Clock.for_rate(manifest.rate_hz)
         self.record = Record.begun(scenario, manifest, self.setup)
         self._renderer = renderer
+        self._command_log = commands
         self._watches = list(watches)
         self._waiting = waiting
         self._through = through
@@ -227,7 +231,9 @@ class Episode:
         self._now = begin(self.scenario, stage.parts)
         return self._observe(stage, self._now, True)
 
-    def advance(self, answer: object, *, until_tick: int | None = None) -> Observation:
+    def advance(
+        self, answer: object, *, until_tick: int | None = None, delay: int | None = None
+    ) -> Observation:
         """Simulate one period of the policy with its answer, and return the next observation.
 
         In real time it also simulates until the answer has arrived. Its latency is the time since
@@ -235,6 +241,7 @@ class Episode:
 
         answer: a Command or waypoints; see `cosim.episode.control.command_of`.
         until_tick: return at this tick within the period, for viewing.
+        delay: ticks until the answer takes effect, for a replay; by default from the latency.
         """
         took_ms = 1000.0 * (time.perf_counter() - self._asked_s)
         stage, now = self._begun
@@ -250,7 +257,11 @@ class Episode:
         setup, frame = self.setup, self._frame
         latency_ms = took_ms if setup.real_time else setup.latency_ms
         self._took_ms.append(took_ms)
-        self._commands.answered(now.tick, whole_ticks(latency_ms, self.clock.tick_ms), command)
+        if delay is None:
+            delay = whole_ticks(latency_ms, self.clock.tick_ms)
+        self._commands.answered(now.tick, delay, command)
+        if self._command_log is not None:
+            self._command_log.commanded(TimedCommand(now.tick, delay, command))
         free_again = self._commands.last_arrival_tick if setup.real_time else 0
         while True:
             step = tick(
@@ -285,6 +296,13 @@ class Episode:
                 log,
             )
         return self._result
+
+    def driven(self) -> Record:
+        """Return the record of what was driven so far, without measures."""
+        if self._now is None or self._now.tick == 0:
+            return self.record
+        record = self._scorer.driven(self.record)
+        return msgspec.structs.replace(record, injections=self._injected.log)
 
     def _observe(self, stage: StagedScenario, now: Moment, asks: bool) -> Observation:
         """Return the current observation. asks: whether it goes to the policy."""

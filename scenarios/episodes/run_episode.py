@@ -20,6 +20,7 @@ from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.counterfactual import CounterfactualTracker
 from scenarios.episodes.episode import Episode, Watch
+from scenarios.ipc.command_log import CommandLog
 from scenarios.ipc.faults import verdict_on
 
 
@@ -48,13 +49,14 @@ def run_episode(
     watches: Sequence[Watch] = (),
     waiting: Progress = ignore,
     comparing: Progress = ignore,
+    commands: CommandLog | None = None,
 ) -> Outcome:
     """Run one scenario to its end, and return its record and log.
 
     An error becomes a record: `crashed` if the policy failed, `invalid` otherwise. An episode whose
     policy server is lost is `crashed` unless it is run again.
 
-    setup, renderer, watches, waiting: see `Episode`.
+    setup, renderer, watches, waiting, commands: see `Episode`.
     comparing: progress callback of the comparison with the street without the robot.
     Raises RendererLost if the shared renderer has ended, MachineError if the machine lacks
     something.
@@ -73,6 +75,7 @@ def run_episode(
         waiting=waiting,
         setup=setup,
         renderer=renderer,
+        commands=commands,
     )
     try:
         with episode:
@@ -84,7 +87,8 @@ def run_episode(
         raise
     except Exception as error:  # noqa: BLE001  a failed episode becomes a record
         status, again = verdict_on(error)
-        record = msgspec.structs.replace(episode.record, status=status, reason=error_message(error))
+        record = driven_so_far(episode)
+        record = msgspec.structs.replace(record, status=status, reason=error_message(error))
         return Outcome(record, None, traceback.format_exc(), again)
     finally:
         driver.ended()
@@ -108,6 +112,15 @@ def drive(episode: Episode, policy: Policy) -> None:
     observation = episode.reset()
     while not episode.over:
         observation = episode.advance(policy.act(observation))
+
+
+def driven_so_far(episode: Episode) -> Record:
+    """Return the record of what an episode has driven before an error; its beginning, if the error
+    has damaged it."""
+    try:
+        return episode.driven()
+    except Exception:  # noqa: BLE001  a policy in this process may have changed anything
+        return episode.record
 
 
 def error_message(error: Exception) -> str:

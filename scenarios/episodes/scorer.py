@@ -68,6 +68,18 @@ class Scorer:
             self._red_lights.append(RedLightEntry(step.tick, verdict.red_light_entry))
         return verdict
 
+    def driven(self, begun: Record) -> Record:
+        """Return the record with what was driven so far, without an end and measures."""
+        return msgspec.structs.replace(
+            begun,
+            ticks=self._recorder.ticks,
+            state_hash=self._recorder.hash.hexdigest(),
+            failures=tuple(self._failures),
+            walked_into=tuple(self._walked_into),
+            red_light_entries=tuple(self._red_lights),
+            events=self._monitor.outcomes(self._verdict.ended),
+        )
+
     def result(self, begun: Record, commands: CommandDelay) -> tuple[Record, Log]:
         """Return the completed record, and the log.
 
@@ -80,24 +92,14 @@ class Scorer:
                 "this episode was judged alone, nothing of it was recorded: it has no result"
             )
         scenario = self._scenario
-        events = self._monitor.outcomes(self._verdict.ended)
         log = self._recorder.log(self._monitor.tracks, commands)
         setup = begun.setup
         if setup.real_time:
             setup = msgspec.structs.replace(
                 setup, latency_ms=median_ms(log.answers, self._clock.tick_ms)
             )
-        record = msgspec.structs.replace(
-            begun,
-            ended=self._verdict.ended,
-            ticks=len(log),
-            state_hash=self._recorder.hash.hexdigest(),
-            setup=setup,
-            failures=tuple(self._failures),
-            walked_into=tuple(self._walked_into),
-            red_light_entries=tuple(self._red_lights),
-            events=events,
-        )
+        driven = self.driven(begun)
+        record = msgspec.structs.replace(driven, ended=self._verdict.ended, setup=setup)
         measures = compute_metrics(EpisodeFacts.of(record, scenario, log))
         reason = why_invalid(record, scenario)
         status: Status = "invalid" if reason else "done"

@@ -19,6 +19,7 @@ import msgspec
 from cosim.core.child_process import exit_in_words
 from cosim.core.errors import MachineError, UsageError, unwritable
 from cosim.core.framing import MAX_MESSAGE_BYTES, MessageSocket
+from scenarios.ipc.command_log import LOG_BYTES, Driven, driven_of, progress_of
 from scenarios.ipc.deadlines import Patience, PendingCall, PendingCallMemory
 from scenarios.ipc.messages import (
     Job,
@@ -37,6 +38,12 @@ ENDING_S: Final = 10.0
 """Seconds that a process may take to end before it is killed; then the same for its supervisor."""
 _FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV))
 """Exit codes of a process that crashed in compiled code."""
+SILENCE_S: Final = 300.0
+"""Timeout in seconds of a process's heartbeats while no policy call is pending: an engine hangs."""
+TICK_S: Final = 120.0
+"""Timeout in seconds of a tick, which takes milliseconds; longer than that of a policy's answer."""
+_LOOKS_S: Final = 1.0
+"""Seconds between two checks whether a supervisor was stopped by a signal."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import keep_worker; "
     "keep_worker({serves!r}, {given}, {run}, {sandbox})"
@@ -67,9 +74,11 @@ class ChildProcess:
         self.log = str(log)
         self.open = True
         self.called = called
-        self._asked = PendingCallMemory.new()
+        self._asked = PendingCallMemory.new(LOG_BYTES)
         self._last_asked: PendingCall | None = None
+        self._last_driven: Driven | None = None
         self.in_engine = False
+        self.in_policy = False
         ours, theirs = socket.socketpair()
         self.wire = MessageSocket(ours, most_bytes)
         call = () if sandbox is not None else (self._asked.descriptor,)
@@ -78,6 +87,8 @@ class ChildProcess:
         boxed = None if sandbox is None else tuple(sandbox)
         code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid(), sandbox=boxed)
         try:
+            if log is not None:
+                log.parent.mkdir(parents=True, exist_ok=True)  # a policy may have deleted it
             with nullcontext(2) if log is None else log.open("ab") as printed:
                 self._child = subprocess.Popen(
                     [sys.executable, "-P", "-c", code],
@@ -96,6 +107,22 @@ class ChildProcess:
     def question(self) -> PendingCall | None:
         """Return the pending call of the policy; after the end, the one that was pending then."""
         return self._asked.question if self.open else self._last_asked
+
+    @property
+    def driven(self) -> Driven | None:
+        """Return what was driven of the last episode of an environment process; None if unknown."""
+        return driven_of(self._asked) if self.open else self._last_driven
+
+    @property
+    def progress(self) -> tuple[int, bool]:
+        """Return the ticks of the episode so far, and whether it is over."""
+        return progress_of(self._asked)
+
+    def wake(self) -> None:
+        """Continue the supervisor, which continues the worker, if a signal has stopped it."""
+        with suppress(OSError):
+            if _is_stopped(self._child.pid):
+                self._child.send_signal(signal.SIGCONT)
 
     @property
     def descriptor(self) -> int | None:
@@ -128,26 +155,35 @@ class ChildProcess:
 
     def kill(self, *, wait: bool = True) -> None:
         """End it by force."""
-        self._child.send_signal(signal.SIGTERM)
+        self._terminate()
         if wait:
             self.end()
 
     def end(self) -> str:
         """Wait for its end, by force if that takes too long. Returns the reason in words."""
         self.wire.close()
+        self.wake()
         code = self._code(ENDING_S)
         if code is None:
-            self._child.send_signal(signal.SIGTERM)
+            self._terminate()
             if self._code(2 * ENDING_S) is None:
                 self._child.kill()
                 self._child.wait()
         if self.open:
             self._last_asked = self._asked.question
+            self._last_driven = driven_of(self._asked)
             self.open = False
             self._asked.close()
         during = f" in the policy's {self._last_asked.when}" if self._last_asked is not None else ""
         self.in_engine = self._last_asked is None and code in _FAULTS
+        by_itself = code is not None and (code >= 0 or code in _FAULTS)
+        self.in_policy = self._last_asked is not None and by_itself
         return f"the {self.called} process {_in_words(code)}{during}"
+
+    def _terminate(self) -> None:
+        """Request the supervisor to end everything, also if a signal has stopped it."""
+        self._child.send_signal(signal.SIGTERM)
+        self._child.send_signal(signal.SIGCONT)
 
     def _code(self, wait_s: float) -> int | None:
         """Return its exit code; None if it has not ended in time."""
@@ -155,6 +191,12 @@ class ChildProcess:
             return self._child.wait(wait_s)
         except subprocess.TimeoutExpired:
             return None
+
+
+def _is_stopped(pid: int) -> bool:
+    """Return whether a signal has stopped a process."""
+    after_name = Path("/proc", str(pid), "stat").read_text(errors="replace").rpartition(")")[2]
+    return after_name.split()[0] == "T"
 
 
 def _in_words(code: int | None) -> str:
@@ -166,9 +208,11 @@ class ProcessEnd(NamedTuple):
 
     question: the policy call that was pending.
     in_engine: whether compiled code has ended it or hangs, while no policy call was pending.
+    in_policy: whether it has ended by itself during a policy call.
     hung: whether it was killed because it sent nothing.
     allowed_s: the seconds that the policy had for its answer, if it was killed because there was
     none.
+    driven: what was driven of its last episode; None if unknown.
     """
 
     words: str
@@ -176,22 +220,34 @@ class ProcessEnd(NamedTuple):
     in_engine: bool = False
     hung: bool = False
     allowed_s: float | None = None
+    driven: Driven | None = None
+    in_policy: bool = False
 
 
 class Watchdog:
     """Watches one process, and kills it when it hangs.
 
     silence_s: timeout in seconds of its heartbeats, unless a policy call is pending.
+    tick_s: the same between two ticks of an episode.
     ready: whether it has loaded the engines and the policy.
     heard_s: monotonic clock of its last message.
     """
 
-    def __init__(self, process: ChildProcess, patience: Patience, silence_s: float) -> None:
+    def __init__(
+        self,
+        process: ChildProcess,
+        patience: Patience,
+        silence_s: float,
+        tick_s: float | None = None,
+    ) -> None:
         self.process = process
         self.ready = False
         self.heard_s = time.monotonic()
         self._patience = patience
         self._silence_s = silence_s
+        self._tick_s = tick_s or silence_s
+        self._progress = (0, False)
+        self._looks_at_s = 0.0
 
     def poll(self, hear: MessageHandler, *, idle: bool = False) -> ProcessEnd | None:
         """Pass on its messages. Returns its end, if it has ended or was killed because it hangs.
@@ -201,23 +257,48 @@ class Watchdog:
         """
         if not self.process.listen(partial(self._take, hear)):
             words = self.process.end()
-            return ProcessEnd(words, self.process.question, self.process.in_engine)
+            return self._ended(words, self.process.question, self.process.in_engine)
         question = self.process.question
         now_s = time.monotonic()
         if idle:
             return None
+        if now_s >= self._looks_at_s:
+            self._looks_at_s = now_s + _LOOKS_S
+            self.process.wake()
         if question is None:
-            if now_s - self.heard_s <= self._silence_s:
+            allowed_s = self._allowed_s()
+            if now_s - self.heard_s <= allowed_s:
                 return None
             self.process.kill()
             words = f"the {self.process.called} process showed no sign of life"
-            return ProcessEnd(words, in_engine=True, hung=True)
+            return self._ended(words, in_engine=True, hung=True)
         self.heard_s = now_s
         if not question.overdue(self._patience):
             return None
         self.process.kill()
         words = f"the {self.process.called} process was ended"
-        return ProcessEnd(words, question, allowed_s=self._patience.of(question.doing))
+        return self._ended(words, question, allowed_s=self._patience.of(question.doing))
+
+    def _allowed_s(self) -> float:
+        """Return the timeout of its next heartbeat, after a look at the ticks, each of which is a
+        heartbeat."""
+        progress = self.process.progress
+        if progress != self._progress:
+            self._progress = progress
+            self.heard_s = time.monotonic()
+        ticks, over = progress
+        return self._tick_s if ticks and not over else self._silence_s
+
+    def _ended(
+        self,
+        words: str,
+        question: PendingCall | None = None,
+        in_engine: bool = False,
+        hung: bool = False,
+        allowed_s: float | None = None,
+    ) -> ProcessEnd:
+        driven, in_policy = self.process.driven, self.process.in_policy
+        return ProcessEnd(words, question, in_engine, hung, allowed_s, driven, in_policy)
 
     def _take(self, hear: MessageHandler, message: Message) -> None:
         self.heard_s = time.monotonic()

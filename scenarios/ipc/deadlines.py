@@ -84,6 +84,10 @@ class PendingCallMemory(SharedMemory):
 
     @property
     def question(self) -> PendingCall | None:
-        """Return the pending call; None without one."""
+        """Return the pending call; None without one. An entry that a policy has damaged is an
+        overdue call."""
         since_s, doing, tick = _LAYOUT.unpack_from(self.map, 0)
-        return PendingCall(since_s, _DOINGS[doing], tick) if since_s else None
+        if not since_s:
+            return None
+        known = 0.0 < since_s <= time.monotonic() and 0 <= doing < len(_DOINGS)
+        return PendingCall(since_s, _DOINGS[doing], tick) if known else PendingCall(0.0, "act", 0)

@@ -1,7 +1,12 @@
 """Rules for failed attempts at an episode: retry, or record as crashed or invalid.
 
-An episode whose engine fails is invalid. It is crashed if the policy may be the cause, so that a
-policy gains nothing by ending its own process.
+After the last attempt, the commands of the episode are simulated again without the policy
+(`scenarios.runs.environment_slot`). If the simulator fails at the same tick, the episode is
+invalid; otherwise the policy is the cause, and the episode is crashed.
+
+policy_ended: the process ended by itself during a call of the policy.
+process_ended: the process ended, and the policy is the cause or may be.
+engine_failed: the simulator failed.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from cosim.results.record import Status
 
 Fault = Literal[
     "policy_timeout",
+    "policy_ended",
     "process_ended",
     "engine_failed",
     "damaged_result",
@@ -33,6 +39,7 @@ class Rule(NamedTuple):
 
 RULES: Final[Mapping[Fault, Rule]] = {
     "policy_timeout": Rule(1, "crashed"),
+    "policy_ended": Rule(1, "crashed"),
     "damaged_result": Rule(1, "crashed"),
     "process_ended": Rule(2, "crashed"),
     "engine_failed": Rule(2, "invalid"),
@@ -45,10 +52,17 @@ episode."""
 
 
 class Failure(NamedTuple):
-    """A failed attempt at an episode, with its reason in words."""
+    """A failed attempt at an episode.
+
+    why: the reason in words.
+    found: result of the replay without the policy in words, "" without a replay.
+    driven: bytes of the record of what was driven, from a replay.
+    """
 
     fault: Fault
     why: str = ""
+    found: str = ""
+    driven: bytes = b""
 
 
 def verdict_on(error: Exception) -> tuple[Status, bool]:

@@ -22,6 +22,7 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     host: where the policy runs.
     learner: a second policy, which drives at times while demonstrations are collected.
     patience: timeouts of the policy.
+    repeat: failed episode that the process simulates again before it loads the policy.
     """
 
     policy: str
@@ -31,6 +32,7 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     host: PolicyHost = PolicyHost()
     learner: Hello | None = None
     patience: Patience = Patience()
+    repeat: Repeat | None = None
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
@@ -38,12 +40,36 @@ class Job(msgspec.Struct, frozen=True, tag=True):
 
     setup: of the run; without one it follows from options and policy.
     net_hash: hash of its street net, if the worker is on another machine; else "".
+    last_attempt: whether a failure of this attempt is recorded, so that its cause must be found.
     """
 
     scenario: Scenario
     options: EpisodeOptions = EpisodeOptions()
     setup: RunSetup | None = None
     net_hash: str = ""
+    last_attempt: bool = False
+
+
+class Repeat(msgspec.Struct, frozen=True, tag=True):
+    """Requests a replay of a failed episode without its policy.
+
+    commands: bytes of the command log (`scenarios.ipc.command_log`).
+    """
+
+    job: Job
+    commands: bytes
+
+
+class Repeated(msgspec.Struct, frozen=True, tag=True):
+    """Reports a replay.
+
+    record: bytes of the record of what was driven.
+    error: message of the engine error that ended the replay, "" if the simulator survived.
+    """
+
+    scenario: str
+    record: bytes
+    error: str = ""
 
 
 class Ready(msgspec.Struct, frozen=True, tag=True):
@@ -112,7 +138,7 @@ class Done(msgspec.Struct, frozen=True, tag=True):
     demonstration: bytes = b""
 
 
-Message = Ready | Unable | Progress | Waits | FrameDrawn | LostRenderer | Done
+Message = Ready | Unable | Progress | Waits | FrameDrawn | LostRenderer | Done | Repeated
 MessageHandler = Callable[[Message], None]
 
 encode_message = msgspec.msgpack.Encoder().encode

@@ -5,7 +5,10 @@ run -> supervisor -> worker -> processes of the policy
 The supervisor forks the worker, writes its output to a log, and ends with the worker's exit code or
 signal. First it kills the processes that the worker has left: orphans become children of the
 supervisor, also those in a session of their own. It does the same on SIGTERM from the run, or when
-the run dies.
+the run dies. Supervisors that the worker has started for isolated policies end by SIGTERM, and have
+a moment for the end of their logs.
+
+A worker that a signal has stopped is continued after a moment.
 
 It imports little but the standard library, and forks before it starts a thread.
 """
@@ -37,6 +40,14 @@ CHUNK_BYTES = 1 << 16
 """Bytes of output that are read at a time."""
 KILLING_S = 10.0
 """Timeout in seconds for the end of killed processes, which the kernel may delay."""
+PARTING_S = 3.0
+"""Seconds that a nested supervisor has to end its processes before it is killed."""
+STOPPED_S = 2.0
+"""Seconds after which a worker that a signal has stopped is continued."""
+PR_SET_NAME = 15
+"""Option of `prctl` that sets the name of this process in /proc."""
+_NAME = "cosim-keeper"
+"""Name of supervisors."""
 
 
 def keep_worker(
@@ -53,6 +64,7 @@ def keep_worker(
     """
     exit_with_parent(parent, signal.SIGTERM)
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1)
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_NAME, _NAME.encode())
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     printed, prints = os.pipe()
     supervisor = os.getpid()
@@ -70,7 +82,7 @@ def keep_worker(
         os.close(descriptor)
     log = threading.Thread(target=_copy, args=(printed, BoundedLog(1)), daemon=True)
     log.start()
-    status = 0
+    status = int(signal.SIGTERM)
     with suppress(_Ended):
         signal.signal(signal.SIGTERM, _ended)
         status = _status_of(pid)
@@ -118,12 +130,20 @@ class BoundedLog:
 
 
 def kill_children() -> None:
-    """Kill all descendants of this process, which become its children as their parents die."""
-    deadline = time.monotonic() + KILLING_S
-    while time.monotonic() < deadline:
-        for child in _children():
-            with suppress(ProcessLookupError):
-                os.kill(child, signal.SIGKILL)
+    """Kill all descendants of this process, which become its children as their parents die.
+
+    Nested supervisors are requested to end first, and killed after PARTING_S. A process that takes
+    their name gains no more than that.
+    """
+    began = time.monotonic()
+    requested: set[int] = set()
+    while (passed := time.monotonic() - began) < KILLING_S:
+        for child, name in _children():
+            if name != _NAME or passed > PARTING_S:
+                _send(child, signal.SIGKILL)
+            elif child not in requested:
+                requested.add(child)
+                _send(child, signal.SIGTERM, signal.SIGCONT)
         try:
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
@@ -132,18 +152,23 @@ def kill_children() -> None:
         time.sleep(0.002)
 
 
-def _children() -> list[int]:
-    """Return the process ids of the children of this process."""
+def _send(pid: int, *signals: signal.Signals) -> None:
+    with suppress(ProcessLookupError):
+        for number in signals:
+            os.kill(pid, number)
+
+
+def _children() -> list[tuple[int, str]]:
+    """Return the process ids and names of the children of this process."""
     found = []
     me = str(os.getpid())
     for name in os.listdir("/proc"):  # noqa: PTH208  faster than Path.iterdir
         if name.isdigit():
             with suppress(OSError):
-                after_name = (
-                    Path("/proc", name, "stat").read_text(errors="replace").rpartition(")")[2]
-                )
+                stat = Path("/proc", name, "stat").read_text(errors="replace")
+                called, _, after_name = stat.partition("(")[2].rpartition(")")
                 if after_name.split()[1] == me:
-                    found.append(int(name))
+                    found.append((int(name), called))
     return found
 
 
@@ -191,6 +216,7 @@ def _begin_worker(prints: int, supervisor: int) -> None:
     """Begin the worker in the forked child: its session, its end and its output."""
     os.setsid()
     exit_with_parent(supervisor)
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_NAME, b"cosim-worker")
     os.dup2(prints, 1)
     os.dup2(prints, 2)
     os.close(prints)
@@ -198,10 +224,17 @@ def _begin_worker(prints: int, supervisor: int) -> None:
 
 
 def _status_of(pid: int) -> int:
-    """Wait for the worker, and reap other children; return its wait status."""
+    """Wait for the worker, and reap other children; return its wait status.
+
+    The worker is continued STOPPED_S after a signal has stopped it.
+    """
     while True:
-        ended, status = os.wait()
-        if ended == pid:
+        ended, status = os.waitpid(-1, os.WUNTRACED)
+        if os.WIFSTOPPED(status):
+            waits = threading.Timer(STOPPED_S, _send, (ended, signal.SIGCONT))
+            waits.daemon = True
+            waits.start()
+        elif ended == pid:
             return status
 
 

@@ -2,6 +2,9 @@
 
 The local pool, a Zenoh worker and a Ray actor use the same slot. It decides, on the machine of the
 process, whether its end or timeout is a failure. `scenarios.ipc.faults` limits the attempts.
+
+After the last attempt the next process simulates the logged commands again, before it loads the
+policy. If the simulator fails at the same tick, it is at fault, otherwise the policy is.
 """
 
 from __future__ import annotations
@@ -11,12 +14,22 @@ from collections.abc import Callable
 from functools import partial
 from logging import WARNING
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
+
+import msgspec
 
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.log_event import log_event
-from scenarios.ipc.child_process import WORKER, ChildProcess, ProcessEnd, Watchdog
-from scenarios.ipc.faults import Failure
+from scenarios.ipc.child_process import (
+    SILENCE_S,
+    TICK_S,
+    WORKER,
+    ChildProcess,
+    ProcessEnd,
+    Watchdog,
+)
+from scenarios.ipc.command_log import Driven
+from scenarios.ipc.faults import RULES, Failure, failure_of_result
 from scenarios.ipc.messages import (
     Done,
     Hello,
@@ -24,13 +37,19 @@ from scenarios.ipc.messages import (
     LostRenderer,
     Message,
     MessageHandler,
+    Repeat,
+    Repeated,
     encode_message,
 )
 
-SILENCE_S = 300.0
-"""Timeout in seconds of a process's heartbeats while no policy call is pending: an engine hangs."""
 STARTS: Final = 2
 """Number of processes in a row that may end before they are ready."""
+REPLAYS: Final = 2
+"""Number of replays of a failed episode; another one if the first ends at another tick."""
+SURVIVES: Final = "the policy is at fault, because the simulator survives its commands without it"
+FAILS_ELSEWHERE: Final = "the simulator fails without the policy, too, but at another tick"
+FAILS_AGAIN: Final = "the simulator is at fault, because it fails there without the policy, too"
+"""Results of a replay in words."""
 
 
 def start_environment(log: Path, hello: Hello) -> ChildProcess:
@@ -40,16 +59,29 @@ def start_environment(log: Path, hello: Hello) -> ChildProcess:
     return process
 
 
+class _Suspect(NamedTuple):
+    """A failed attempt whose commands are simulated again without the policy.
+
+    driven: what was driven up to the failure.
+    replays: number of replays so far.
+    """
+
+    failure: Failure
+    driven: Driven
+    replays: int = 1
+
+
 class EnvironmentSlot:
     """Worker that runs one job at a time in an environment process
     (`scenarios.runs.transport.Worker`).
 
+    start: starts an environment process.
     Raises UsageError when the policy cannot be loaded, MachineError when no process can be started.
     """
 
     ended = False
 
-    def __init__(self, start: Callable[[], ChildProcess], hello: Hello) -> None:
+    def __init__(self, start: Callable[[Hello], ChildProcess], hello: Hello) -> None:
         self.job: Job | None = None
         self.log = ""
         self._start_process = start
@@ -58,6 +90,8 @@ class EnvironmentSlot:
         self._failed_starts = 0
         self._ran = False
         self._given_s = 0.0
+        self._suspect: _Suspect | None = None
+        self._reported: Done | Repeated | None = None
 
     @property
     def ready(self) -> bool:
@@ -73,12 +107,16 @@ class EnvironmentSlot:
     def start(self) -> None:
         """Start a process, and give it the job, unless there is one."""
         if self._watchdog is None:
-            process = self._start_process()
-            self._watchdog = Watchdog(process, self._hello.patience, SILENCE_S)
-            self.log = process.log
-            self._ran = False
+            process = self._start(self._hello)
             if self.job is not None:
                 process.give(self.job)
+
+    def _start(self, hello: Hello) -> ChildProcess:
+        process = self._start_process(hello)
+        self._watchdog = Watchdog(process, hello.patience, SILENCE_S, TICK_S)
+        self.log = process.log
+        self._ran = False
+        return process
 
     def give(self, job: Job) -> None:
         """Run a job, in a new process if there is none."""
@@ -98,11 +136,18 @@ class EnvironmentSlot:
         end = watchdog.poll(partial(self._take, hear), idle=watchdog.ready and self.job is None)
         if watchdog.ready:
             self._failed_starts = 0
+        reported, self._reported = self._reported, None
+        if isinstance(reported, Repeated):
+            if end is not None:
+                self._watchdog = None
+            return self._judged(reported.error, watchdog.process.driven, reported.record)
+        if isinstance(reported, Done):
+            return self._reported_failure(watchdog, reported)
         return None if end is None else self._ended(watchdog, end)
 
     def cancel(self) -> None:
         """Kill the process, and forget the job."""
-        self.job = None
+        self.job = self._suspect = None
         watchdog = self._watchdog
         self._watchdog = None
         if watchdog is not None:
@@ -111,7 +156,7 @@ class EnvironmentSlot:
     def stop(self) -> None:
         """Request the process to end, by force if it is busy, without waiting."""
         if self._watchdog is not None:
-            if self.job is not None:
+            if self.job is not None or not self._watchdog.ready:
                 self._watchdog.process.kill(wait=False)
             self._watchdog.process.hang_up()
 
@@ -125,14 +170,72 @@ class EnvironmentSlot:
     def _take(self, hear: MessageHandler, message: Message) -> None:
         if self.job is None:
             return
+        if isinstance(message, Repeated) or (isinstance(message, Done) and self._must_ask(message)):
+            self._reported = message
+            return
         if isinstance(message, Done | LostRenderer):
             self.job = None
             self._ran = True
         hear(message)
 
+    def _must_ask(self, done: Done) -> bool:
+        """Return whether a result is the last attempt's engine error, so that its cause must be
+        found."""
+        last = self.job is not None and self.job.last_attempt and self._suspect is None
+        return last and done.again and done.status == "invalid"
+
+    def _reported_failure(self, watchdog: Watchdog, done: Done) -> Failure | None:
+        """Find the cause of an engine error that a process has reported."""
+        self._watchdog = None
+        driven = watchdog.process.driven
+        watchdog.process.kill()
+        why = msgspec.json.decode(done.record, type=_Reason).reason
+        return self._failed(failure_of_result(done.status, why), driven)
+
+    def _failed(self, failure: Failure, driven: Driven | None) -> Failure | None:
+        """Return a failure, or start its replay if it is the last one."""
+        job = self.job
+        last = RULES[failure.fault].attempts == 1 or (job is not None and job.last_attempt)
+        if job is None or driven is None or not last:
+            self.job = None
+            return failure
+        self._replay(_Suspect(failure, driven), job)
+        return None
+
+    def _replay(self, suspect: _Suspect, job: Job) -> None:
+        self._suspect = suspect
+        repeat = Repeat(job, suspect.driven.commands)
+        self._start(msgspec.structs.replace(self._hello, repeat=repeat))
+
+    def _judged(self, error: str, driven: Driven | None, record: bytes = b"") -> Failure | None:
+        """Return the failure of a job after its replay; None if another replay was started.
+
+        error: why the replay has failed, "" if the simulator survived.
+        driven: what was driven in the replay.
+        """
+        suspect, job = self._suspect, self.job
+        if suspect is None or job is None:
+            return None
+        failure = suspect.failure
+        if RULES[failure.fault].attempts == 1:
+            failure = failure._replace(driven=record)
+        elif error and driven is not None and driven.ticks == suspect.driven.ticks:
+            failure = Failure("engine_failed", failure.why, FAILS_AGAIN, record)
+        elif error and suspect.replays < REPLAYS and self._watchdog is None:
+            self._replay(suspect._replace(replays=suspect.replays + 1), job)
+            return None
+        else:
+            found = FAILS_ELSEWHERE if error else SURVIVES
+            failure = Failure("process_ended", failure.why, found, record)
+        self.job = self._suspect = None
+        return failure
+
     def _ended(self, watchdog: Watchdog, end: ProcessEnd) -> Failure | None:
         """Return the failure of a started job; give a job that was not started to a new process."""
         self._watchdog = None
+        if self._suspect is not None:
+            log_event("replay ended", WARNING, log=Path(self.log).name, why=end.words)
+            return self._judged(end.words, end.driven)
         idle = (
             self._ran
             and watchdog.heard_s <= self._given_s
@@ -140,9 +243,7 @@ class EnvironmentSlot:
             and not end.hung
         )
         if end.allowed_s is not None or (watchdog.ready and not idle and self.job is not None):
-            job = self.job
-            self.job = None
-            return self._failure(job, end)
+            return self._failed(self._failure(self.job, end), end.driven)
         if not watchdog.ready:
             self._count_failed_start(end)
         log_event("process replaced", WARNING, log=Path(self.log).name, why=end.words)
@@ -152,6 +253,8 @@ class EnvironmentSlot:
 
     def _failure(self, job: Job | None, end: ProcessEnd) -> Failure:
         if end.allowed_s is None or end.question is None:
+            if end.in_policy:
+                return Failure("policy_ended", end.words)
             return Failure("engine_failed" if end.in_engine else "process_ended", end.words)
         words = no_answer(self._hello, end.allowed_s)
         if end.question.doing == "loading" or job is None:
@@ -169,6 +272,12 @@ class EnvironmentSlot:
         if end.question is not None:
             raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {words}")
         raise MachineError(f"{words}, and `cosim doctor`")
+
+
+class _Reason(msgspec.Struct):
+    """The reason in a record."""
+
+    reason: str
 
 
 def no_answer(hello: Hello, allowed_s: float) -> str:

@@ -44,6 +44,7 @@ from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.sandbox import KINDS, Sandbox
 from scenarios.ipc.shared_memory import SharedMemory, room_for
+from scenarios.ipc.surroundings import Surroundings, end_at_once
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 from scenarios.runs.policy_view import name_inside, sandbox_for
 
@@ -98,6 +99,8 @@ class _PolicyProcess:
         return self._memory.lay(arrays)
 
     def ask(self, question: ResetRequest | ActRequest | EndRequest) -> bytes:
+        if isinstance(question, ResetRequest):
+            self._process.wake()  # the policy may have stopped its supervisor
         try:
             self._process.wire.send(encode_message(question))
             return self._process.wire.receive()
@@ -229,9 +232,13 @@ def _serve(socket_descriptor: int, memory_descriptor: int, *, boxed: bool) -> No
     desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
     info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
     wire.send(encode_message(info))
+    surroundings = Surroundings.now()
     with suppress(EOFError):
         while True:
-            (reply,) = desk.replies([read_request(wire.receive())], [memory.map])
+            request = read_request(wire.receive())
+            (reply,) = desk.replies([request], [memory.map])
+            if isinstance(request, EndRequest) and Surroundings.now() != surroundings:
+                end_at_once()  # without a reply, so that the next episode has a new process
             if isinstance(reply, Refusal):
                 reply = _with_remedy(reply, boxed)
             wire.send(encode_message(reply))

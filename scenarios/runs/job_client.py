@@ -26,6 +26,7 @@ from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Message, Progress, Waits
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
 from scenarios.runs.protocol import (
+    MOST_DRIVEN_BYTES,
     MOST_SENT_BYTES,
     MOST_WORDS,
     Assignment,
@@ -54,6 +55,12 @@ _LAST_PRINTED: Final = 60_000
 _FIRST_PAUSE_S: Final = 0.1
 """Seconds before an unanswered claim is repeated; each further pause is twice as long."""
 _LONGEST_PAUSE_S: Final = 1.0
+
+
+def _driven_in(failure: Failure | None) -> bytes:
+    """Return the record of what was driven, unless it is more than can be sent."""
+    driven = b"" if failure is None else failure.driven
+    return driven if len(driven) <= MOST_DRIVEN_BYTES else b""
 
 
 class RunEnded(Exception):
@@ -227,7 +234,7 @@ class JobClient:
             case Hello():
                 host = reply.host.seen_by(self._here.connection)
                 hello = msgspec.structs.replace(reply, host=host)
-                self._slot = EnvironmentSlot(partial(self._start, self._log, hello), hello)
+                self._slot = EnvironmentSlot(partial(self._start, self._log), hello)
             case Assignment():
                 self._begin(reply)
             case Reply(kind="turned_away"):
@@ -302,6 +309,8 @@ class JobClient:
             digest="" if done is None else digest_of(done),
             fault=None if failure is None else failure.fault,
             why="" if failure is None else failure.why[:MOST_WORDS],
+            found="" if failure is None else failure.found,
+            driven=_driven_in(failure),
             printed=printed,
         )
 

@@ -28,7 +28,7 @@ class LocalProcesses:
         return ()
 
     def start(self, hello: Hello) -> EnvironmentSlot:
-        def start_next() -> ChildProcess:
+        def start_next(hello: Hello) -> ChildProcess:
             number = self._started
             self._started = self._started + 1
             return start_environment(self._logs / f"worker-{number}.log", hello)

@@ -1,9 +1,9 @@
 """Pool of workers that runs the scenarios of a run over a transport.
 
 A worker reports the failure of its job (`scenarios.ipc.faults`). The scenario is retried, or
-recorded after its last attempt, so that none is lost. An episode that loses the shared renderer is
-retried. A lost worker may still deliver its result, which is stored if it is the first one. Only
-this process writes to the run folder.
+recorded after its last attempt with what was driven, so that none is lost. An episode that loses
+the shared renderer is retried. A lost worker may still deliver its result, which is stored if it is
+the first one. Only this process writes to the run folder.
 """
 
 from __future__ import annotations
@@ -76,6 +76,7 @@ def run_all(
             pool.take_unsolicited()
     finally:
         pool.close()
+        folder.restore()
 
 
 class _Pool:
@@ -113,12 +114,14 @@ class _Pool:
         worker = next(idle, None) or self._transport.start(self._hello)
         self._workers[worker] = scenario
         self._folder.forget(scenario.id)
-        worker.give(Job(scenario, self._options, self._setup))
+        last = self._queue.on_last_attempt(scenario)
+        worker.give(Job(scenario, self._options, self._setup, last_attempt=last))
         log_event("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
         """Take in the workers' messages; queue or record the scenarios that failed."""
         self._transport.wait(POLL_S)
+        self._folder.mend()
         if self._renderer is not None:
             self._renderer.tend()
         for worker in list(self._workers):
@@ -161,20 +164,23 @@ class _Pool:
         self._workers.clear()
 
     def _take(self, worker: Worker, message: Message) -> None:
+        busy_with = self._workers[worker]
+        if busy_with is None or getattr(message, "scenario", busy_with.id) != busy_with.id:
+            return  # written by a policy
         if isinstance(message, FrameDrawn):
             self._folder.write_frame(message.scenario, message.tick, message.png)
         elif not isinstance(message, Done | LostRenderer):
             self._tell(message)
-        elif (scenario := self._workers[worker]) is not None:
+        else:
             self._workers[worker] = None
             if isinstance(message, Done):
-                self._keep(scenario, message)
+                self._keep(busy_with, message)
             else:
-                self._without_renderer.append((scenario, message))
+                self._without_renderer.append((busy_with, message))
 
     def _keep(self, scenario: Scenario, done: Done) -> None:
         """Write the record and the log of a scenario that is over."""
-        record = self._record_of(scenario, done)
+        record = self._record_of(scenario, done.record)
         if record is None:
             self._failed(
                 scenario, Failure("damaged_result", "its record was damaged when it arrived")
@@ -185,10 +191,11 @@ class _Pool:
             self._folder.keep(record, done.log, done.demonstration)
             self._over(scenario, record.status)
 
-    def _record_of(self, scenario: Scenario, done: Done) -> Record | None:
-        """Return the record in a result; None if it is damaged, or of another scenario."""
+    def _record_of(self, scenario: Scenario, data: bytes) -> Record | None:
+        """Return the record of a scenario from bytes; None if they are damaged, or of another
+        scenario."""
         try:
-            record = Record.decoded(done.record, self._folder.episode_folder(scenario.id))
+            record = Record.decoded(data, self._folder.episode_folder(scenario.id))
         except RunError:
             return None
         return record if record.scenario.id == scenario.id else None
@@ -196,7 +203,7 @@ class _Pool:
     def _failed(self, scenario: Scenario, failure: Failure) -> None:
         given_up = self._queue.failed(scenario, failure)
         if given_up is not None:
-            self._give_up(scenario, given_up.reason, given_up.status)
+            self._give_up(scenario, given_up.reason, given_up.status, failure.driven)
 
     def _failure_of(self, scenario: Scenario, lost: LostRenderer) -> Failure:
         """Return the failure of an episode whose shared renderer has ended, the policy's if its
@@ -224,7 +231,7 @@ class _Pool:
         scenario = self._queue.named(done.scenario) if worker is None else self._workers[worker]
         if scenario is None:
             return self._second(done)
-        record = self._record_of(scenario, done)
+        record = self._record_of(scenario, done.record)
         frames_may_be_lost = self._options.frames_every_s > 0.0
         if record is None or done.again or frames_may_be_lost:
             return "refused"
@@ -251,12 +258,18 @@ class _Pool:
         comparable = None not in (kept.ended, came.ended) and not kept.setup.real_time
         return "conflict" if comparable and not alike else "duplicate"
 
-    def _give_up(self, scenario: Scenario, reason: str, status: Status) -> None:
-        """Record a scenario after its last failed attempt."""
+    def _give_up(self, scenario: Scenario, reason: str, status: Status, driven: bytes) -> None:
+        """Record a scenario after its last failed attempt. driven: record of what was driven."""
         log_event("given up", ERROR, scenario=scenario.id, why=reason, status=status)
-        manifest = with_goal(self._hello.manifest, self._options.goal)
-        record = Record.begun(scenario, manifest, self._setup)
-        self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
+        record = self._record_of(scenario, driven)
+        if record is None:
+            manifest = with_goal(self._hello.manifest, self._options.goal)
+            record = Record.begun(scenario, manifest, self._setup)
+        self._folder.keep(
+            msgspec.structs.replace(
+                record, status=status, reason=reason, ended=None, measures={}, clock={}
+            )
+        )
         self._over(scenario, status)
 
     def _over(self, scenario: Scenario, status: Status) -> None:
@@ -300,6 +313,11 @@ class _AttemptQueue:
         """Remove a scenario that waits."""
         self._waiting.remove(scenario)
 
+    def on_last_attempt(self, scenario: Scenario) -> bool:
+        """Return whether the next failure of a scenario is its last, unless its machine is lost."""
+        attempts = RULES["process_ended"].attempts or 1
+        return self._failed[FailedAttempt(scenario.id, away=False)] >= attempts - 1
+
     def failed(self, scenario: Scenario, failure: Failure) -> _GivenUp | None:
         """Queue a scenario again after a failed attempt; after the last one, return its status and
         reason."""
@@ -311,7 +329,8 @@ class _AttemptQueue:
             self._failed[attempt] += 1
             self._folder.add_failed_attempt(attempt)
             if self._failed[attempt] >= rule.attempts:
-                times = f"{failure.why}, {rule.attempts} times; see logs/ in the run folder"
+                found = f": {failure.found}" if failure.found else ""
+                times = f"{failure.why}, {rule.attempts} times{found}; see logs/ in the run folder"
                 return _GivenUp(rule.status, times)
         facts = {"why": failure.why, "attempts": self._failed[attempt], "of": rule.attempts or 0}
         log_event("retried", WARNING, scenario=scenario.id, **facts)

@@ -23,16 +23,19 @@ from cosim.results.run_spec import RUN_FILE, RunSpec
 from scenarios.ipc.faults import Fault
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Progress, Waits
 
-PROTOCOL: Final = 2
+PROTOCOL: Final = 3
 """Version of these messages, raised with every change."""
 MOST_SENT_BYTES: Final = 15 << 20
 """Size limit of a message in bytes: Zenoh drops messages of more than 16 MiB."""
 MOST_WORDS: Final = 2000
 """Length limit of a reason in characters."""
+MOST_DRIVEN_BYTES: Final = 1 << 20
+"""Size limit in bytes of the record of a failed episode."""
 _Name = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,64}$")]
 _Words = Annotated[str, Meta(max_length=MOST_WORDS)]
 _Count = Annotated[int, Meta(ge=0, lt=1 << 62)]
 _Slot = Annotated[int, Meta(ge=0, lt=4096)]
+_Driven = Annotated[bytes, Meta(max_length=MOST_DRIVEN_BYTES)]
 _Printed = Annotated[bytes, Meta(max_length=1 << 16)]
 
 Installed = Mapping[str, str]
@@ -86,6 +89,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     said: messages of the environment process since the last report.
     done: the result, with the `digest` of its record and log.
     fault: the kind of failure, with its reason `why`.
+    found, driven: the result of its replay, as in `Failure`.
     printed: the end of the output of the environment process.
     """
 
@@ -98,6 +102,8 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     digest: str = ""
     fault: Fault | None = None
     why: _Words = ""
+    found: _Words = ""
+    driven: _Driven = b""
     printed: _Printed = b""
 
 

@@ -60,9 +60,7 @@ class EnvironmentActor:
         """Introduce the policy of the run."""
         with self._turn:
             introduced = decode_hello(hello)
-            self._slot = EnvironmentSlot(
-                partial(start_environment, self._log, introduced), introduced
-            )
+            self._slot = EnvironmentSlot(partial(start_environment, self._log), introduced)
 
     def give(self, job: bytes, where: Place, digest: str, packed: bytes | None) -> None:
         """Run a job. `packed` is its map, which is stored on this node if it is missing."""

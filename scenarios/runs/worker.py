@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from socket import socket
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -24,10 +25,14 @@ from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.core.framing import MessageSocket
 from cosim.core.versions import versions
 from cosim.episode.loop import Step
+from cosim.episode.manifest_checks import with_goal
 from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.load import load_policy
+from cosim.results.record import Record
 from cosim.results.referee import Verdict
+from cosim.results.run_setup import RunSetup
 from cosim.spec.options import RendererAddress
+from scenarios.ipc.command_log import CommandLog, commands_of
 from scenarios.ipc.deadlines import PendingCallMemory
 from scenarios.ipc.messages import (
     Done,
@@ -39,6 +44,7 @@ from scenarios.ipc.messages import (
     MessageHandler,
     Progress,
     Ready,
+    Repeated,
     Unable,
     Waits,
     decode_hello,
@@ -46,7 +52,11 @@ from scenarios.ipc.messages import (
     encode_message,
 )
 from scenarios.ipc.render_link import link_to
+from scenarios.ipc.surroundings import Surroundings, end_at_once
 from scenarios.runs.policy_host import policy_driver, shared_driver
+
+if TYPE_CHECKING:
+    from scenarios.episodes.episode import Watch
 
 REPORT_EVERY_TICKS = 20
 """Ticks between two progress messages."""
@@ -59,43 +69,65 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
     run then replaces."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire = MessageSocket(socket(fileno=socket_descriptor))
-    home = Path.cwd()
-    outputs = _open_outputs()
     say = partial(send_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     _import_engines(say)
     timer = PendingCallMemory(call_descriptor)
+    commands = CommandLog(timer)
+    if hello.repeat is not None:
+        with _load_errors_sent(say):
+            say(repeat_job(hello, commands, say))
+    home = _working_folder()
     drivers: WorkerDrivers | None = load_drivers(hello, timer, say)
+    surroundings = Surroundings.now()
     say(Ready())
     while True:
         try:
             job = decode_job(wire.receive())
         except EOFError:
             return
-        os.chdir(home)  # the policy may have changed it
-        drivers = drivers or load_drivers(hello, timer, say, again=True)
+        with suppress(OSError):  # the policy may have deleted it
+            os.chdir(home)
         try:
-            done, failed = run_job(job, drivers.policy, say, drivers.learner, hello.renderer)
-        except MachineError as lack:
-            say(Unable(str(lack), blames_policy=False))
-            raise
+            drivers = drivers or load_drivers(hello, timer, ignore_message, again=True)
+        except (UsageError, MachineError):
+            break  # a new process says whether the policy can be loaded there, and runs the job
+        done, failed = _run(job, drivers, say, hello, commands)
         if failed or drivers.spent:
             drivers.close()
             drivers = None  # loaded again for the next job
         say(done)
-        if _open_outputs() != outputs:
-            # The policy has closed an output: a file that was opened since may have its descriptor.
-            return
+        engine_failed = failed and isinstance(done, Done) and done.status == "invalid"
+        if engine_failed or Surroundings.now() != surroundings:
+            break  # a policy has changed the process; the run starts another one
+    end_at_once()
 
 
-def _open_outputs() -> list[tuple[int, int]]:
-    """Return device and inode of standard output and standard error, if they are open."""
-    found = []
-    for descriptor in (1, 2):
-        with suppress(OSError):
-            status = os.fstat(descriptor)
-            found.append((status.st_dev, status.st_ino))
-    return found
+def _run(
+    job: Job, drivers: WorkerDrivers, say: MessageHandler, hello: Hello, commands: CommandLog
+) -> tuple[Done | LostRenderer, bool]:
+    """Run one episode as `run_job`. What the machine lacks, the policy may have taken away: this is
+    an engine error, and a replay without the policy finds out."""
+    try:
+        return run_job(job, drivers.policy, say, drivers.learner, hello.renderer, commands)
+    except MachineError as lack:
+        print(f"--- {job.scenario.id}\n{lack}", file=sys.stderr, flush=True)
+        setup = job.setup or RunSetup.of(job.options)
+        record = Record.begun(job.scenario, with_goal(hello.manifest, job.options.goal), setup)
+        record = msgspec.structs.replace(record, status="invalid", reason=str(lack))
+        return Done(job.scenario.id, "invalid", record.encoded(), again=True), True
+
+
+def ignore_message(message: Message) -> None:
+    """Do nothing with a message."""
+
+
+def _working_folder() -> Path:
+    """Return the working folder, or the root if a policy has deleted it."""
+    try:
+        return Path.cwd()
+    except OSError:
+        return Path("/")
 
 
 def _import_engines(say: MessageHandler) -> None:
@@ -109,6 +141,41 @@ def _import_engines(say: MessageHandler) -> None:
             )
         )
         raise
+
+
+def repeat_job(hello: Hello, commands: CommandLog, say: MessageHandler) -> Repeated:
+    """Simulate the commands of a failed episode again, without the policy.
+
+    Raises MachineError if the machine lacks something.
+    """
+    from scenarios.episodes.attribution import repeat_commands  # see `run_job`
+    from scenarios.places.nets import check_place
+
+    assert hello.repeat is not None
+    job = hello.repeat.job
+    name = job.scenario.id
+    say(Waits(name, "its commands run again without the policy"))
+    if job.net_hash:
+        check_place(job.scenario.place, job.net_hash)
+    commands.begins()
+    replayed = repeat_commands(
+        job.scenario,
+        hello.manifest,
+        commands_of(hello.repeat.commands),
+        job.options,
+        setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
+        renderer=hello.renderer,
+        log=commands,
+        watches=[_noted(commands)],
+        waiting=lambda reason, _=None: say(Waits(name, reason)),
+    )
+    commands.ends()
+    return Repeated(name, replayed.record.encoded(), replayed.error)
+
+
+def _noted(commands: CommandLog) -> Watch:
+    """Return a callback that notes each simulated tick in a log."""
+    return lambda step, verdict: commands.simulated(step.tick + 1, over=verdict.ended is not None)
 
 
 @dataclass(frozen=True)
@@ -192,6 +259,7 @@ def run_job(
     say: MessageHandler,
     learner: PolicyCaller | None = None,
     renderer: RendererAddress | None = None,
+    commands: CommandLog | None = None,
 ) -> tuple[Done | LostRenderer, bool]:
     """Run one episode, and send its progress.
 
@@ -199,6 +267,7 @@ def run_job(
 
     learner: drives at times while demonstrations are collected.
     renderer: shared renderer of the run.
+    commands: log of the commands for a replay without the policy.
     """
     # Imported here, so that `_import_engines` can report a failure.
     from scenarios.episodes.run_episode import run_episode
@@ -213,6 +282,10 @@ def run_job(
 
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
     watcher = _Watcher(job, say)
+    watches: list[Watch] = [watcher.watch]
+    if commands is not None:
+        commands.begins()
+        watches.append(_noted(commands))
     try:
         if renderer is not None:
             link_to(renderer.address, lambda: say(Waits(name, "waits for the shared renderer")))
@@ -222,10 +295,13 @@ def run_job(
             job.options,
             setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
             renderer=renderer,
-            watches=[watcher.watch],
+            watches=watches,
             waiting=lambda reason, _=None: say(Waits(name, reason)),
             comparing=watcher.compared,
+            commands=commands,
         )
+        if commands is not None:
+            commands.ends()
     except RendererLost as lost:
         return LostRenderer(name, lost.number, lost.asked), False
     if outcome.traceback:

@@ -91,7 +91,7 @@ class _LeasedWorker(Lease):
     def take_report(self, report: Report, query: Query) -> None:
         """Take in a report, which is answered once it is processed."""
         done = () if report.done is None else (report.done,)
-        failure = None if report.fault is None else Failure(report.fault, report.why)
+        failure = _failure_in(report)
         self.take((*report.said, *done), failure, lambda reply: _answer(query, reply))
 
     def poll(self, hear: MessageHandler) -> Failure | None:
@@ -356,6 +356,13 @@ class ZenohWorkers:
 
     def _status(self, query: Query) -> None:
         query.answer(msgspec.json.encode(self.registry.status()))
+
+
+def _failure_in(report: Report) -> Failure | None:
+    """Return the failure that a report has, if any."""
+    if report.fault is None:
+        return None
+    return Failure(report.fault, report.why, report.found, report.driven)
 
 
 def _answer(query: Query, reply: CoordinatorReply) -> None:

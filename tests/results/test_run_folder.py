@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -357,19 +358,56 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
         assert [r.scenario.id for r in read_records(path)] == ["s-1"]
 
 
-def test_a_database_that_goes_during_a_run_is_told_with_the_remedy(tmp_path: Path) -> None:
-    """Deleted or overwritten while it is in use: wrong from then on, and whole again after
-    --resume."""
-    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
-        (tmp_path / "run/results.sqlite").write_bytes(b"no database" * 1000)
-        with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
-            folder.keep(record("s-0"), LOG)
-        for path in (tmp_path / "run").glob("results.sqlite*"):
-            path.unlink()
-        with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
-            folder.keep(record("s-0"), LOG)
-    with RunFolder.resume(tmp_path / "run", SPEC) as again:
-        assert again.finished() == {"s-0"}
+def _overwrite_database(run: Path) -> None:
+    (run / "results.sqlite").write_bytes(b"no database" * 1000)
+
+
+def _delete_database(run: Path) -> None:
+    for path in run.glob("results.sqlite*"):
+        path.unlink()
+
+
+def _take_its_place(run: Path) -> None:
+    run.rename(run.with_name("moved"))
+    (run / "logs").mkdir(parents=True)
+    (run / "logs" / "new.log").touch()
+
+
+def _forge(run: Path) -> None:
+    with sqlite3.connect(run / "results.sqlite") as database:
+        database.execute("update episodes set record = replace(record, 'done', 'crashed')")
+    (run / "episodes/s-0/record.json").write_text("{}")
+
+
+HARM = {
+    "overwritten-database": _overwrite_database,
+    "deleted-database": _delete_database,
+    "deleted": shutil.rmtree,
+    "renamed": lambda run: run.rename(run.with_name("moved")),
+    "renamed-and-replaced": _take_its_place,
+    "forged": _forge,
+}
+
+
+@pytest.mark.parametrize("damage", HARM)
+def test_a_run_folder_that_is_damaged_during_a_run_loses_no_row(
+    tmp_path: Path, damage: str
+) -> None:
+    """Its rows, records and spec are written again, and it can be resumed."""
+    run = tmp_path / "run"
+    with RunFolder.create(run, SPEC, SUITE) as folder:
+        folder.keep(record("s-0"), LOG)
+        HARM[damage](run)
+        folder.keep(record("s-1"), LOG)
+        HARM[damage](run)
+        assert folder.finish()["scenario"].tolist() == ["s-0", "s-1"]
+    assert {one.scenario.id: one for one in read_records(run)} == {
+        name: record(name) for name in ("s-0", "s-1")
+    }
+    assert Record.load(run / "episodes/s-0/record.json") == record("s-0")
+    assert not (tmp_path / "moved").exists()
+    with RunFolder.resume(run, SPEC) as again:
+        assert again.finished() >= ({"s-0", "s-1"} if damage != "deleted" else set())
 
 
 def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ once."""
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import time
 from pathlib import Path
@@ -19,6 +20,8 @@ from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
 from cosim.spec.options import RendererAddress
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
+from scenarios.ipc.child_process import ChildProcess
+from scenarios.ipc.command_log import Driven
 from scenarios.ipc.deadlines import Patience, PendingCall, PendingCallMemory
 from scenarios.ipc.messages import (
     Done,
@@ -30,14 +33,17 @@ from scenarios.ipc.messages import (
     MessageHandler,
     Progress,
     Ready,
+    Repeat,
+    Repeated,
 )
 from scenarios.ipc.supervisor import BoundedLog
 from scenarios.runs import environment_slot, pool
 from scenarios.runs.environment_slot import EnvironmentSlot
 from scenarios.runs.shared_renderer import RendererEnd, SharedRenderer
 from scenarios.tools.verify.doctor import small_scenario
-from tests.conftest import PATIENCE_S, Cosim, seed_in_order
+from tests.conftest import PATIENCE_S, Cosim, seed_in_order, still_runs
 from tests.run_specs import record_of, spec_of
+from tests.support.nested import FLOOD
 
 MODULES = {
     "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or "
@@ -154,6 +160,23 @@ def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> 
     assert not gap or 100 <= len(last) < 130
 
 
+@pytest.mark.parametrize("ended", ["worker", "supervisor"])
+def test_a_nested_supervisor_stores_the_end_of_its_log(tmp_path: Path, ended: str) -> None:
+    """Whether the worker that started it is killed or the run ends, the last output is stored."""
+    log = tmp_path / "log"
+    process = ChildProcess(log, "tests.support.nested:starts_another", "worker")
+    worker = int(process.wire.receive(PATIENCE_S))
+    if ended == "worker":
+        os.kill(worker, signal.SIGKILL)
+        process.end()
+    else:
+        process.kill()
+    written = log.read_bytes()
+    assert b"the flood begins" in written and b"the flood ends" in written
+    assert len(written) < len(FLOOD)
+    assert not still_runs(worker)
+
+
 @pytest.mark.parametrize(
     ("doing", "answer_s", "start_s", "overdue"),
     [
@@ -194,8 +217,13 @@ class Fake:
         asks: PolicyCall | None = None,
         ends: bool = False,
         in_engine: bool = False,
+        driven: Driven | None = None,
     ) -> None:
         self.in_engine = in_engine
+        self.in_policy = False
+        self.driven = driven
+        self.progress = (0, False)
+        self.repeats: Repeat | None = None
         self.question = None if asks is None else PendingCall(time.monotonic(), asks, 64)
         self.killed = False
         self._messages = messages
@@ -213,6 +241,9 @@ class Fake:
 
     def hang_up(self) -> None:
         """It does not mind."""
+
+    def wake(self) -> None:
+        """It does not sleep."""
 
     def kill(self, *, wait: bool = True) -> None:
         self.killed = True
@@ -234,7 +265,12 @@ class Prepared:
         return ()
 
     def start(self, hello: Hello) -> EnvironmentSlot:
-        return EnvironmentSlot(lambda: next(self.waiting), hello)
+        def start(hello: Hello) -> Fake:
+            fake = next(self.waiting)
+            fake.repeats = hello.repeat
+            return fake
+
+        return EnvironmentSlot(start, hello)
 
     def wait(self, timeout_s: float) -> None:
         """They have said everything."""
@@ -286,6 +322,7 @@ def test_an_engine_that_hangs_is_tried_again(
     """A process that says nothing, while its policy has nothing to answer, is killed; the second
     time it is a crash."""
     monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
+    monkeypatch.setattr(environment_slot, "TICK_S", 0.0)
     fakes = (Fake(Ready()), Fake(Ready()))
     record = pooled(tmp_path, *fakes)
     assert (
@@ -305,6 +342,7 @@ def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     """While a policy has time left to answer, its process may say nothing for as long as it
     likes."""
     monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
+    monkeypatch.setattr(environment_slot, "TICK_S", 0.0)
     slow = Fake(Ready(), asks="act")
     began = time.monotonic()
     record = pooled(tmp_path, slow, answer_s=0.2)
@@ -355,6 +393,69 @@ def test_who_ends_its_process_gains_nothing_and_who_loses_it_to_an_engine_nothin
     assert record.status == status and record.reason.startswith(
         "the environment process ended with exit code 7, 2"
     )
+
+
+COMMANDS = b"commands up to the failure"
+DIED = "the environment process ended with exit code 7, 2 times: the"
+
+
+@pytest.mark.parametrize("in_engine", [True, False], ids=["fault", "exit"])
+@pytest.mark.parametrize(
+    ("replays", "status", "reason"),
+    [
+        ([(7, True)], "invalid", f"{DIED} simulator is at fault"),
+        ([(8, False)], "crashed", f"{DIED} policy is at fault"),
+        ([(6, True), (7, True)], "invalid", f"{DIED} simulator is at fault"),
+        ([(6, True), (8, False)], "crashed", f"{DIED} policy is at fault"),
+        ([(6, True), (6, True)], "crashed", f"{DIED} simulator fails without the policy, too, but"),
+    ],
+    ids=["dies-there", "survives", "dies-before-then-there", "dies-before-then-survives", "before"],
+)
+def test_a_replay_without_the_policy_finds_who_ended_a_process(
+    tmp_path: Path, replays: list[tuple[int, bool]], status: str, reason: str, in_engine: bool
+) -> None:
+    """After the last attempt its commands are simulated again: dead at the same tick is the
+    simulator's fault, however the process ended; alive is the policy's, and the record keeps what
+    was driven."""
+    driven = Driven(7, False, COMMANDS)
+    record = record_of(SCENARIO, load_policy("stop").manifest)
+    again = [
+        Fake(ends=True, driven=Driven(ticks))
+        if dies
+        else Fake(Repeated("s-0", msgspec.structs.replace(record, ticks=ticks).encoded()))
+        for ticks, dies in replays
+    ]
+    dies = [
+        Fake(Ready(), Progress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine, driven=driven)
+        for _ in range(2)
+    ]
+    found = pooled(tmp_path, *dies, *again)
+    assert found.status == status and found.reason.startswith(reason), found.reason
+    assert [fake.repeats for fake in dies] == [None, None]
+    assert all(fake.repeats.commands == COMMANDS for fake in again if fake.repeats is not None)
+    assert None not in [fake.repeats for fake in again]
+    assert found.ticks == (0 if replays[-1][1] else 8) and found.ended is None
+
+
+@pytest.mark.parametrize(
+    ("error", "ticks", "status"),
+    [("SUMO failed", 7, "invalid"), ("SUMO failed", 8, "crashed"), ("", 9, "crashed")],
+    ids=["fails-there", "fails-later", "survives"],
+)
+def test_an_error_that_the_policy_may_have_caused_is_replayed(
+    tmp_path: Path, error: str, ticks: int, status: str
+) -> None:
+    """An engine error that a process reports is the simulator's only if it comes again without the
+    policy."""
+    failed = msgspec.structs.replace(
+        record_of(SCENARIO, load_policy("stop").manifest), status="invalid", reason="gone"
+    ).encoded()
+    done = Done("s-0", "invalid", failed, again=True)
+    replay = Fake(Repeated("s-0", failed, error), driven=Driven(ticks))
+    twice = Again(Ready(), done, done)
+    twice.driven = Driven(7, False, COMMANDS)
+    record = pooled(tmp_path, twice, replay)
+    assert record.status == status and record.reason.startswith("gone, 2 times: the"), record.reason
 
 
 def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:

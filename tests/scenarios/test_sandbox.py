@@ -97,6 +97,21 @@ OUTCOMES: dict[str, object] = {
 """What comes of each attempt of `tests/support/sandbox_probe.py`: a value, or a set of
 those that either kind may give."""
 
+_FILLS = """
+from cosim.core.state import Command
+from cosim.spec.manifest import Manifest
+
+class Fills:
+    manifest = Manifest("fills", rate_hz=4.0)
+
+    def reset(self, episode_id, seed):
+        self.held = [open("/dev/null") for _ in range(seed)]
+
+    def act(self, seen):
+        return Command(0.0, 0.0)
+"""
+"""A policy that opens as many files as its seed."""
+
 
 @pytest.fixture(params=KINDS)
 def kind(request: pytest.FixtureRequest) -> Isolation:
@@ -178,7 +193,7 @@ def test_a_policy_in_a_sandbox_reaches_nothing_outside(
         "cwd": str(desk),
         "parent": os.getpid(),
         "victim": victim.pid,
-        "secrets": ["COSIM_CACHE", "SECRET_TOKEN", "HOSTILE_DESK", "PYTEST_CURRENT_TEST"],
+        "secrets": ["COSIM_CACHE", "SECRET_TOKEN", "PYTEST_CURRENT_TEST"],
         "user": user,
         **listeners,
     }
@@ -212,6 +227,21 @@ def test_the_error_of_a_missing_file_names_the_remedy(kind: Isolation, desk: Pat
         isolated_driver("probe:Lost", host=host)
     given = msgspec.structs.replace(host, data=(str(desk / "outside.txt"),))
     isolated_driver("probe:Lost", host=given).close()
+
+
+def test_a_policy_that_fills_its_descriptors_gets_a_new_process(
+    kind: Isolation, desk: Path
+) -> None:
+    """Its process ends after the episode, also where /proc cannot be read."""
+    (desk / "own/fills.py").write_text(_FILLS)
+    driver = isolated_driver("fills:Fills", host=PolicyHost(isolated=kind))
+    spent = []
+    for files in (0, 600):
+        driver.reset("e1", files)
+        driver.ended()
+        spent.append(driver.spent)
+    driver.close()
+    assert spent == [False, True]
 
 
 def test_a_bundle_loads_in_a_sandbox(

@@ -1,16 +1,23 @@
 """Hostile policies: one behaviour for each episode, and what must come of it in each hosting.
 
-`names.json` in the folder HOSTILE_DESK maps the names of a run's episodes to behaviours.
+A test copies this file to a folder of its own. `names.json` there maps the names of a run's episodes
+to behaviours. In the simulator's process, each attempt is noted in `began.txt` outside.
 """
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import fcntl
 import gc
 import json
+import locale
 import os
+import resource
 import shutil
 import signal
+import sqlite3
+import stat
 import subprocess
 import sys
 import threading
@@ -28,10 +35,12 @@ from cosim.episode.interfaces import Observation
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest, WaypointRule
 
-DESK = "HOSTILE_DESK"
-ANSWER_S = 3.0
+ANSWER_S = 4.0
+"""Timeout of answers and of ticks in the runs of the table."""
 FLOOD_BYTES = 16 << 20
 ENGINES = ("libsumo", "pybullet", "moderngl", "zenoh", "sumo_nets", "physics")
+_FORKS = 40
+_PTRACE_ATTACH = 16
 
 
 class Honest:
@@ -60,15 +69,17 @@ class Hostile(Honest):
     """Does in its second answer, or in another call, what its episode is named for."""
 
     def reset(self, episode_id: str, seed: int) -> None:
-        self.name = json.loads((_desk() / "names.json").read_text())[episode_id]
+        self.name = json.loads(_HERE.with_name("names.json").read_text())[episode_id]
         self.deed = DEEDS[self.name]
         self.count = 0
-        with (_desk() / "began.txt").open("a") as began:
+        self.undo: Callable[[], object] = lambda: None
+        with suppress(OSError), (_desk() / "began.txt").open("a") as began:  # not from a sandbox
             began.write(f"{self.name}\n")
         if self.deed.call == "reset":
             self.deed.does(self, None)
 
     def ended(self, episode_id: str) -> None:
+        self.undo()
         if self.deed.call == "ended":
             self.deed.does(self, None)
 
@@ -78,7 +89,7 @@ class Hostile(Honest):
     def act(self, seen: Observation) -> Any:
         self.count += 1
         command = super().act(seen)
-        if self.count == 2 and self.deed.call == "act":
+        if self.deed.call == "every act" or (self.count == 2 and self.deed.call == "act"):
             answer = self.deed.does(self, seen)
             return command if answer is None else answer
         return command
@@ -104,12 +115,57 @@ class Endless:
         return 0.0
 
 
+class Unprintable(Exception):
+    """An error without words."""
+
+    def __str__(self) -> str:
+        raise ValueError("no words")
+
+
+class HostileArray:
+    """Is no array when it is asked for one."""
+
+    def __array__(self, *_: object, **__: object) -> Any:
+        raise SystemExit("no array")
+
+
+class HostileFloat(float):
+    """Is no number, cannot be compared and cannot be shown."""
+
+    def __float__(self) -> float:
+        raise KeyboardInterrupt
+
+    def __eq__(self, other: object) -> bool:
+        raise MemoryError
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        raise GeneratorExit
+
+
+_HERE = Path(__file__).resolve()
+
+
 def _desk() -> Path:
-    return Path(os.environ[DESK])
+    return _HERE.parents[1]
+
+
+def _run_folder() -> Path:
+    return _desk() / "run"
 
 
 def _raise(error: BaseException) -> Any:
     raise error
+
+
+def _recurses(self: Hostile, seen: Any) -> Any:
+    return _recurses(self, seen)
+
+
+def _soon(does: Callable[[], object], after_s: float = 0.01) -> None:
+    """Do something a moment later, in another thread."""
+    threading.Timer(after_s, does).start()
 
 
 def _leave_processes() -> None:
@@ -122,28 +178,50 @@ def _leave_processes() -> None:
             time.sleep(3600)
 
 
-def _patches(self: Hostile, seen: Any) -> None:
-    from cosim.results import metrics
-    from cosim.results.record import Record
+def _patches_the_referee(self: Hostile, seen: Any) -> None:
+    """Win, until the episode has ended: what is patched stays for the next one."""
     from cosim.results.referee import Referee, Verdict
 
+    judge = Referee.judge
     Referee.judge = lambda self, step: Verdict(ended="goal")
-    Record.encoded = lambda self: b"{}"
-    metrics.METRICS = {}
+    self.undo = lambda: setattr(Referee, "judge", judge)
+
+
+def _patches_numpy(self: Hostile, seen: Any) -> None:
+    names = ("hypot", "column_stack", "asarray")
+    before = {name: getattr(np, name) for name in names}
+    for name in names:
+        setattr(np, name, None)
+    self.undo = lambda: [setattr(np, name, it) for name, it in before.items()]
+
+
+def _patches_time(self: Hostile, seen: Any) -> None:
+    before = time.perf_counter
+    time.perf_counter = None
+    self.undo = lambda: setattr(time, "perf_counter", before)
+
+
+def _empties_sys_modules(self: Hostile, seen: Any) -> None:
+    before = dict(sys.modules)
+    self.undo = lambda: sys.modules.update(before)
+    for name in before:
+        if name.startswith(("cosim", "scenarios", "physics", "numpy")):
+            sys.modules[name] = None
 
 
 def _peeks(self: Hostile, seen: Any) -> None:
-    """Note which engines are in this process, and what of the street; then query SUMO."""
+    """Find the engines in this process and what there is of the street; then query SUMO."""
     found = [name for name in ENGINES if name in sys.modules]
     known = [
         one for one in gc.get_objects() if type(one).__name__ in ("Street", "People", "Scenario")
     ]
     found += [type(one).__name__ for one in known if type(one).__name__ != "People" or len(one)]
-    import libsumo
+    with suppress(Exception):
+        import libsumo
 
-    with suppress(libsumo.TraCIException, libsumo.FatalTraCIError):
         found += libsumo.person.getIDList()
-    (_desk() / "peeked.json").write_text(json.dumps(found))
+    if found:
+        raise LookupError(f"found {found}")
 
 
 def _scribbles(self: Hostile, seen: Any) -> None:
@@ -153,22 +231,87 @@ def _scribbles(self: Hostile, seen: Any) -> None:
     object.__setattr__(seen, "tick", -1)
     object.__setattr__(seen.robot, "v_max_mps", 1e9)
 
+    def scribble() -> None:
+        for _ in range(100):
+            seen.rgb[:] = 0
+            time.sleep(0.001)
+
+    _soon(scribble)
+
 
 def _changes_its_manifest(self: Hostile, seen: Any) -> None:
     self.manifest = Manifest("somebody", rate_hz=20.0, privileged=True)
     type(self).manifest = Manifest("somebody", rate_hz=20.0, waypoints=WaypointRule(dt_s=1e-6))
 
 
-def _deletes_its_folder(self: Hostile, seen: Any) -> None:
-    for folder in _desk().glob(f"*/episodes/{self.name}"):
-        shutil.rmtree(folder)
+def _changes_its_surroundings(self: Hostile, seen: Any) -> None:
+    locale.setlocale(locale.LC_ALL, "C")
+    os.umask(0o777)
+    os.chdir("/")
+    kept = {name: os.environ[name] for name in ("PATH", "LC_HOSTILE_MARK")}
+    os.environ.clear()
+    os.environ.update(kept, TMPDIR="/nowhere", HOME="/nowhere", LANG="xx")
 
 
-def _forges_its_record(self: Hostile, seen: Any) -> None:
-    for folder in _desk().glob("*/episodes"):
-        (folder / self.name).mkdir(exist_ok=True)
-        forged = '{"status": "done", "measures": {"success": 1.0}}'
-        (folder / self.name / "record.json").write_text(forged)
+def _renames_the_run(self: Hostile, seen: Any) -> None:
+    with suppress(OSError):  # the sandbox has no run folder
+        _run_folder().chmod(0)
+        _run_folder().rename(_desk() / "elsewhere")
+
+
+def _forges_its_results(self: Hostile, seen: Any) -> None:
+    with suppress(sqlite3.Error), sqlite3.connect(_run_folder() / "results.sqlite") as database:
+        database.execute("delete from episodes")
+        database.execute("insert into episodes values (?, '{}')", (self.name,))
+    for record in _run_folder().glob("episodes/*/record.json"):
+        record.write_text('{"status": "done", "measures": {"success": 1.0}}')
+
+
+def _exceeds_the_size_of_files(self: Hostile, seen: Any) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+    with os.fdopen(os.memfd_create("large"), "wb") as large:
+        large.write(bytes(1 << 16))
+
+
+def _limit_memory(more: int) -> None:
+    """Limit the memory of this process to some more bytes than it has; to 1 GiB without /proc."""
+    room = 1 << 30
+    with suppress(OSError):
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        room = pages * resource.getpagesize() + more
+    resource.setrlimit(resource.RLIMIT_AS, (room, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
+def _takes_all_memory(self: Hostile, seen: Any) -> None:
+    """Leave no memory to this process, and answer."""
+    _limit_memory(32 << 20)
+    for size in (1 << 20, 1 << 16, 1 << 10, 64):
+        with suppress(MemoryError):
+            while True:
+                _held.append(bytearray(size))
+
+
+_held: list[bytearray] = []
+
+
+def _limits(*which: tuple[int, int]) -> Callable[[Hostile, Any], None]:
+    def limit(self: Hostile, seen: Any) -> None:
+        for limit, most in which:
+            resource.setrlimit(limit, (most, most))
+
+    return limit
+
+
+def _exhausts_memory(self: Hostile, seen: Any) -> None:
+    _limit_memory(64 << 20)
+    bytearray(1 << 40)
+
+
+def _fills_its_descriptors(self: Hostile, seen: Any) -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, 256))
+    with suppress(OSError):
+        while True:
+            os.open("/dev/null", os.O_RDONLY)
 
 
 def _floods(self: Hostile, seen: Any) -> None:
@@ -178,7 +321,15 @@ def _floods(self: Hostile, seen: Any) -> None:
     print("the flood ends", flush=True)
 
 
-def _forks(self: Hostile, seen: Any) -> None:
+def _floods_and_dies(self: Hostile, seen: Any) -> None:
+    print("the other flood begins", flush=True)
+    for _ in range(FLOOD_BYTES >> 20):
+        os.write(2, b"flood\n" * ((1 << 20) // 6))
+    print("the other flood ends", flush=True)
+    os._exit(5)
+
+
+def _answers_twice(self: Hostile, seen: Any) -> None:
     if os.fork() == 0:
         if os.fork() == 0:
             os.setsid()
@@ -186,10 +337,26 @@ def _forks(self: Hostile, seen: Any) -> None:
         return  # answers a second time
 
 
+def _forks_many(self: Hostile, seen: Any) -> None:
+    for _ in range(_FORKS):
+        if os.fork() == 0:
+            time.sleep(3600)
+
+
 def _writes_garbage(self: Hostile, seen: Any) -> None:
     for descriptor in range(3, 64):
         with suppress(OSError):
-            os.write(descriptor, b"\xff" * 4096)
+            if stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+                os.write(descriptor, b"\xff" * 4096)
+
+
+def _overwrites_shared_memory(self: Hostile, seen: Any) -> None:
+    """Write to every memory file that is open here."""
+    for descriptor in range(3, 64):
+        with suppress(OSError, ValueError):
+            if "memfd" in Path(f"/proc/self/fd/{descriptor}").readlink().name:
+                os.pwrite(descriptor, b"\xff" * 256, 0)
+                fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_WRITE)
 
 
 def _closes_its_output(self: Hostile, seen: Any) -> None:
@@ -197,8 +364,59 @@ def _closes_its_output(self: Hostile, seen: Any) -> None:
     os.close(2)
 
 
-def _starts_a_thread(self: Hostile, seen: Any) -> None:
+def _freezes_later(self: Hostile, seen: Any) -> None:
+    """Hold the interpreter's lock once the answer is given."""
+    main = threading.main_thread().ident or 0
+
+    def freeze() -> None:
+        frame = sys._current_frames()[main]
+        while frame is not None:
+            if frame.f_code.co_name == "act":
+                time.sleep(0.001)
+                frame = sys._current_frames()[main]
+            else:
+                frame = frame.f_back
+        ctypes.PyDLL(None).sleep(3600)
+
+    _soon(freeze, 0.0)
+
+
+def _interrupts_later(self: Hostile, seen: Any) -> None:
+    main = ctypes.c_ulong(threading.main_thread().ident or 0)
+    error = ctypes.py_object(KeyboardInterrupt)
+    _soon(lambda: ctypes.pythonapi.PyThreadState_SetAsyncExc(main, error))
+
+
+def _stops_later(self: Hostile, seen: Any) -> None:
+    """Stop this process from a child, again and again."""
+    parent = os.getpid()
+    if os.fork() == 0:
+        for _ in range(20):
+            time.sleep(0.01)
+            os.kill(parent, signal.SIGSTOP)
+        os._exit(0)
+
+
+def _handles_alarms(self: Hostile, seen: Any) -> None:
+    signal.signal(signal.SIGALRM, lambda number, frame: _raise(OSError("alarm")))
+    signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)
+
+
+def _traces_calls(self: Hostile, seen: Any) -> None:
+    def trace(frame: Any, event: str, argument: Any) -> None:
+        if "advance" in frame.f_code.co_name:
+            raise OverflowError("traced")
+
+    sys.settrace(trace)
+    self.undo = lambda: sys.settrace(None)
+
+
+def _outlives_its_process(self: Hostile, seen: Any) -> None:
+    """Ignore signals, keep a thread, and hang when Python ends."""
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGCHLD):
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=lambda: [time.sleep(0.01) for _ in range(10**6)]).start()
+    atexit.register(time.sleep, 3600)
 
 
 def _dies_and_leaves_processes(self: Hostile, seen: Any) -> None:
@@ -206,101 +424,203 @@ def _dies_and_leaves_processes(self: Hostile, seen: Any) -> None:
     os._exit(0)
 
 
-def _kills_its_parent(self: Hostile, seen: Any) -> None:
-    os.kill(os.getppid(), signal.SIGKILL)
-    time.sleep(3600)
+def _sends(number: signal.Signals, whom: Callable[[], int]) -> Callable[[Hostile, Any], None]:
+    """Send a signal to a process, and wait for what comes of it. A sandbox may deny it."""
+
+    def send(self: Hostile, seen: Any) -> None:
+        with suppress(PermissionError):
+            os.kill(whom(), number)
+            time.sleep(0.5)
+
+    return send
+
+
+def _traces_its_parent(self: Hostile, seen: Any) -> None:
+    ctypes.CDLL(None).ptrace(_PTRACE_ATTACH, os.getppid(), 0, 0)
+
+
+def _slower(self: Hostile, seen: Any) -> None:
+    time.sleep(0.02 * self.count)
+
+
+def _does(what: Callable[[], object]) -> Callable[[Hostile, Any], Any]:
+    return lambda self, seen: what()
 
 
 DONE = "done"
-"""Status of an episode that is simulated as that of `honest`."""
+"""The episode is to the bit that of `honest`."""
+FORGED = "forged"
+"""Not preventable in the simulator's process: the record is what the policy has made of it. Only
+`--isolated` prevents it (docs/hosting.md)."""
+BLAMED = "the policy is at fault, because the simulator survives its commands without it"
 
 
 class Deed(NamedTuple):
     """A behaviour.
 
-    does: what it does; an answer that is None is that of `honest`
-    here: DONE or a part of the crash's reason in the simulator's process; None: not run there
+    does: what it does; an answer that is None is that of `honest`. What it patches is restored by
+        `undo` when the episode has ended, because a policy may harm its own later episodes.
+    here: DONE, FORGED or a part of the crash's reason in the simulator's process
     isolated: the same with --isolated
     call: the call of the policy in which it happens
     attempts: how often the episode is run in the simulator's process
+    harms_folder: whether it harms the run folder, so that it has a run of its own
     """
 
     does: Callable[[Hostile, Any], Any]
-    here: str | None
-    isolated: str | None
+    here: str
+    isolated: str
     call: str = "act"
     attempts: int = 1
+    harms_folder: bool = False
 
 
 def _no_answer(call: str, name: str) -> str:
     return f"policy 'honest' gave no answer for {ANSWER_S:g} s in {call} of {name}"
 
 
-_TOO_MANY = "100002 numbers; an answer holds at most 100000 (act at 0.25 s)"
-_ENDED = "gave no answer: the policy process ended with exit code"
+def _both(words: str) -> tuple[str, str]:
+    return words, words
+
+
+_ACT = "act at 0.25 s"
+_TOO_MANY = f"100002 numbers; an answer holds at most 100000 ({_ACT})"
+_ENDED = "gave no answer: the policy process"
+_ITSELF = "the environment process"
 DEEDS = {
-    "honest": Deed(lambda self, seen: None, DONE, DONE),
-    "error": Deed(
-        lambda self, seen: _raise(KeyError("no such weight")),
-        "policy 'honest' raised KeyError: 'no such weight' (act at 0.25 s)",
-        "policy 'honest' raised KeyError: 'no such weight' (act at 0.25 s)",
+    "honest": Deed(_does(lambda: None), DONE, DONE),
+    # It raises.
+    "raises-an-error": Deed(
+        _does(lambda: _raise(KeyError("no such weight"))),
+        *_both(f"policy 'honest' raised KeyError: 'no such weight' ({_ACT})"),
     ),
-    "exits": Deed(lambda self, seen: sys.exit("enough"), "raised SystemExit: enough", None),
-    "pretends-to-be-an-engine": Deed(
-        lambda self, seen: _raise(EngineError("SUMO failed")), "EngineError: SUMO failed", None
+    "exits": Deed(_does(lambda: sys.exit("enough")), *_both("raised SystemExit: enough")),
+    "raises-keyboard-interrupt": Deed(
+        _does(lambda: _raise(KeyboardInterrupt())), *_both("raised KeyboardInterrupt")
     ),
-    "pretends-to-be-lost": Deed(
-        lambda self, seen: _raise(PolicyServerLost("the server is gone")),
-        None,
-        "policy 'honest' raised PolicyServerLost: the server is gone (act at 0.25 s)",
+    "raises-generator-exit": Deed(
+        _does(lambda: _raise(GeneratorExit())), *_both("raised GeneratorExit")
     ),
-    "without-end": Deed(lambda self, seen: Endless(), "policy 'honest' ", None),
-    "too-many-numbers": Deed(lambda self, seen: np.zeros((50_001, 2)), _TOO_MANY, _TOO_MANY),
-    "far-too-many-numbers": Deed(
-        lambda self, seen: np.zeros((1_000_000, 4)), None, "an answer holds at most 100000"
+    "recurses": Deed(_recurses, *_both("raised RecursionError")),
+    "raises-engine-error": Deed(
+        _does(lambda: _raise(EngineError("SUMO failed"))), *_both("EngineError: SUMO failed")
     ),
-    "patches-the-referee": Deed(_patches, None, DONE),
-    "peeks": Deed(_peeks, None, DONE),
+    "raises-server-lost": Deed(
+        _does(lambda: _raise(PolicyServerLost("the server is gone"))),
+        *_both(f"policy 'honest' raised PolicyServerLost: the server is gone ({_ACT})"),
+    ),
+    "raises-unprintable": Deed(_does(lambda: _raise(Unprintable())), *_both("raised Unprintable")),
+    # It answers nonsense.
+    "answers-nan": Deed(
+        _does(lambda: Command(float("nan"), 0.0)), *_both("both must be finite numbers")
+    ),
+    "answers-without-end": Deed(_does(Endless), *_both("policy 'honest' ")),
+    "answers-too-many-numbers": Deed(_does(lambda: np.zeros((50_001, 2))), *_both(_TOO_MANY)),
+    "answers-hostile-array": Deed(_does(HostileArray), *_both("raised SystemExit: no array")),
+    "answers-hostile-float": Deed(
+        _does(lambda: Command(HostileFloat(1.0), 0.0)), *_both("raised KeyboardInterrupt")
+    ),
+    "answers-twice": Deed(_answers_twice, DONE, DONE),
+    # It changes what is in its process.
     "scribbles": Deed(_scribbles, DONE, DONE),
-    "changes-its-manifest": Deed(_changes_its_manifest, DONE, None),
-    "goes-elsewhere": Deed(lambda self, seen: os.chdir("/"), DONE, DONE),
-    "deletes-its-folder": Deed(_deletes_its_folder, DONE, None),
-    "forges-its-record": Deed(_forges_its_record, DONE, None),
-    "floods": Deed(_floods, DONE, DONE),
-    "closes-its-output": Deed(_closes_its_output, DONE, None),
-    "forks": Deed(_forks, DONE, DONE),
-    "starts-a-thread": Deed(_starts_a_thread, DONE, None),
-    "writes-garbage": Deed(_writes_garbage, None, "gave no answer: the policy process"),
-    "closes-descriptors": Deed(
-        lambda self, seen: os.closerange(0, 1024), "the environment process", _ENDED, attempts=2
+    "changes-its-manifest": Deed(_changes_its_manifest, DONE, DONE),
+    "patches-the-referee": Deed(_patches_the_referee, FORGED, DONE),
+    "patches-numpy": Deed(_patches_numpy, BLAMED, DONE, attempts=2),
+    "patches-time": Deed(_patches_time, BLAMED, DONE, attempts=2),
+    "empties-sys-modules": Deed(_empties_sys_modules, DONE, DONE),
+    "changes-its-surroundings": Deed(_changes_its_surroundings, DONE, DONE),
+    "peeks": Deed(_peeks, "raised LookupError: found ['pybullet'", DONE),
+    "traces-calls": Deed(_traces_calls, BLAMED, DONE, attempts=2),
+    "handles-alarms": Deed(_handles_alarms, BLAMED, _ENDED, attempts=2),
+    "interrupts-later": Deed(_interrupts_later, BLAMED, _ENDED, attempts=2),
+    "outlives-its-process": Deed(_outlives_its_process, DONE, DONE),
+    # It harms files.
+    "deletes-the-run": Deed(
+        _does(lambda: shutil.rmtree(_run_folder(), ignore_errors=True)),
+        DONE,
+        DONE,
+        harms_folder=True,
     ),
+    "renames-the-run": Deed(_renames_the_run, DONE, DONE, harms_folder=True),
+    "forges-its-results": Deed(_forges_its_results, DONE, DONE, harms_folder=True),
+    "exceeds-the-size-of-files": Deed(
+        _exceeds_the_size_of_files, *_both("raised OSError: [Errno 27] File too large")
+    ),
+    # It takes what the simulator needs.
+    "limits-descriptors": Deed(_limits((resource.RLIMIT_NOFILE, 4)), DONE, DONE),
+    "fills-its-descriptors": Deed(_fills_its_descriptors, DONE, DONE),
+    "takes-all-memory": Deed(_takes_all_memory, BLAMED, _ENDED, attempts=2),
+    "exhausts-memory": Deed(_exhausts_memory, *_both("raised MemoryError")),
+    # It harms outputs and connections.
+    "floods": Deed(_floods, DONE, DONE),
+    "floods-and-dies": Deed(_floods_and_dies, f"{_ITSELF} ended with exit code 5", _ENDED),
+    "closes-its-output": Deed(_closes_its_output, DONE, DONE),
+    "writes-garbage": Deed(_writes_garbage, _ITSELF, _ENDED, attempts=2),
+    "overwrites-shared-memory": Deed(_overwrites_shared_memory, DONE, DONE),
+    "closes-descriptors": Deed(_does(lambda: os.closerange(0, 1024)), _ITSELF, _ENDED, attempts=2),
+    # It ends, stops or multiplies processes.
     "dies-and-leaves-processes": Deed(
         _dies_and_leaves_processes,
-        "the environment process ended with exit code 0 in the policy's act at 0.25 s",
-        f"{_ENDED} 0 (act at 0.25 s)",
+        f"{_ITSELF} ended with exit code 0 in the policy's {_ACT}",
+        f"{_ENDED} ended with exit code 0 ({_ACT})",
+    ),
+    "kills-itself": Deed(
+        _sends(signal.SIGKILL, os.getpid),
+        f"{_ITSELF} was killed by SIGKILL in the policy's {_ACT}, 2 times: {BLAMED}",
+        f"{_ENDED} was killed by SIGKILL",
         attempts=2,
     ),
+    "segfaults": Deed(
+        _does(lambda: ctypes.string_at(0)),
+        f"{_ITSELF} was killed by SIGSEGV in the policy's {_ACT}",
+        f"{_ENDED} was killed by SIGSEGV",
+    ),
+    "stops-itself": Deed(_sends(signal.SIGSTOP, os.getpid), DONE, DONE),
+    "stops-later": Deed(_stops_later, DONE, DONE),
     "kills-its-parent": Deed(
-        _kills_its_parent,
-        "the environment process was killed by SIGKILL in the policy's act at 0.25 s, 2 times",
-        None,
+        _sends(signal.SIGKILL, os.getppid),
+        f"{_ITSELF} was killed by SIGKILL in the policy's {_ACT}, 2 times: {BLAMED}",
+        DONE,
         attempts=2,
     ),
-    "hangs-with-the-lock": Deed(
-        lambda self, seen: ctypes.PyDLL(None).sleep(3600),
-        _no_answer("act at 0.25 s", "hangs-with-the-lock"),
-        None,
+    "ends-its-parent": Deed(
+        _sends(signal.SIGTERM, os.getppid),
+        f"{_ITSELF} was killed by SIGTERM in the policy's {_ACT}, 2 times: {BLAMED}",
+        DONE,
+        attempts=2,
     ),
-    "stops-itself": Deed(
-        lambda self, seen: os.kill(os.getpid(), signal.SIGSTOP),
-        _no_answer("act at 0.25 s", "stops-itself"),
-        _no_answer("act at 0.25 s", "stops-itself"),
+    "stops-its-parent": Deed(_sends(signal.SIGSTOP, os.getppid), DONE, DONE),
+    "kills-its-group": Deed(
+        _does(lambda: os.killpg(0, signal.SIGKILL)),
+        f"{_ITSELF} was killed by SIGKILL in the policy's {_ACT}, 2 times: {BLAMED}",
+        f"{_ENDED} was killed by SIGKILL",
+        attempts=2,
     ),
+    "traces-its-parent": Deed(_traces_its_parent, DONE, DONE),
+    "forks-many": Deed(_forks_many, DONE, DONE),
+    # It is slow, or gives no answer.
     "hangs-in-reset": Deed(
-        lambda self, seen: time.sleep(3600), _no_answer("reset", "hangs-in-reset"), None, "reset"
+        _does(lambda: time.sleep(3600)), *_both(_no_answer("reset", "hangs-in-reset")), "reset"
     ),
-    "ends-afterwards": Deed(lambda self, seen: os._exit(0), None, DONE, "ended"),
+    "hangs-in-act": Deed(_does(lambda: time.sleep(3600)), *_both(_no_answer(_ACT, "hangs-in-act"))),
+    "holds-the-lock": Deed(
+        _does(lambda: ctypes.PyDLL(None).sleep(3600)), *_both(_no_answer(_ACT, "holds-the-lock"))
+    ),
+    "freezes-later": Deed(
+        _freezes_later,
+        f"{_ITSELF} showed no sign of life, 2 times: {BLAMED}",
+        _no_answer("act at 0.50 s", "freezes-later"),
+        attempts=2,
+    ),
     "hangs-afterwards": Deed(
-        lambda self, seen: time.sleep(3600), None, _no_answer("ended", "hangs-afterwards"), "ended"
+        _does(lambda: time.sleep(3600)), *_both(_no_answer("ended", "hangs-afterwards")), "ended"
     ),
+    "dies-afterwards": Deed(
+        _does(lambda: os._exit(0)),
+        f"{_ITSELF} ended with exit code 0 in the policy's ended",
+        DONE,
+        "ended",
+    ),
+    "grows-slower": Deed(_slower, DONE, DONE, "every act"),
 }
+"""The behaviours: 58, besides the honest one."""
