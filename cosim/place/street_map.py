@@ -158,7 +158,7 @@ class Feature:
 
 
 class Located(NamedTuple):
-    """Result of `StreetMap.locate`: kind of piece, and the SUMO edge there."""
+    """Result of `StreetMap.locate`: kind of ground at a point, and its SUMO edge, "" if off."""
 
     kind: Literal["walk", "road", "off"]
     edge: str

@@ -344,7 +344,8 @@ class RunFolder:
             (frames / f"{tick:06d}.png").write_bytes(png)
 
     def failed_attempts(self) -> Counter[FailedAttempt]:
-        """Return the number of failed attempts by scenario since the run began."""
+        """Count the failed attempts since the run began, by scenario and cause. Raises MachineError
+        or UsageError if the file cannot be read."""
         try:
             lines = (self.path / _ATTEMPTS).read_bytes().splitlines()
         except FileNotFoundError:

@@ -93,7 +93,10 @@ def sandwich_board(size: Size) -> tuple[Part, ...]:
 
 
 def construction_fence(size: Size) -> tuple[Part, ...]:
-    """Return a red and white board over bars between two posts on heavy feet."""
+    """Return the parts of a fence: a red and white board over bars and uprights, on two feet.
+
+    size: length, depth and height in metres.
+    """
     length, depth, h = size
     count = max(2 * round(length / _BOARD_M / 2.0) + 1, 3)
     step = length / count

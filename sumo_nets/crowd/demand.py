@@ -64,8 +64,8 @@ VEHICLE_TYPES: Mapping[str, tuple[float, float, float]] = {
 
 
 class Seen(NamedTuple):
-    """Position of a person, or of a vehicle's front bumper, in metres, and its waiting time in
-    seconds."""
+    """Position of a person (middle) or vehicle (front bumper), metres in the net's frame, with its
+    waiting time in seconds."""
 
     x_m: float
     y_m: float

@@ -74,8 +74,10 @@ class Spots:
             self._high = np.maximum.reduceat(whole, starts)
 
     def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
-        """Return the spots at a distance in [low_m, high_m), as pairs of line index and spot
-        index."""
+        """Return the spots whose distance from (x_m, y_m) is in [low_m, high_m] metres.
+
+        Each is a pair of line index and spot index.
+        """
         if not self._lines:
             return []
         gap_m = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)

@@ -269,8 +269,10 @@ def scan_elements(file: MapFile, elements: Elements) -> None:
 
 
 def osm_facts(file: MapFile) -> OsmFacts:
-    """Read the facts of an OSM file in one pass. Raises MapError if it is damaged or has no
-    street."""
+    """Read the facts of an OSM file in one pass.
+
+    Raises MapError if the file is damaged, has no walkable street, or is not in WGS 84 degrees.
+    """
     scan = _Scan()
     scan_elements(file, scan)
     if not scan.lonlat or not scan.roads + scan.on_foot:
