@@ -349,6 +349,7 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         out.print("No event of this run's episodes was triggered.")
         return
     heads = (
+        "stated\nm",
         "trigger\nm",
         "error\nm",
         "tick\nm",
@@ -363,7 +364,7 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
         numbers = (
             f"{value:.{digits}f}"
-            for value, digits in zip(row[2:], (2, 3, 3, 2, 2, 2, 0, 2), strict=True)
+            for value, digits in zip(row[2:], (2, 2, 3, 3, 2, 2, 2, 0, 2), strict=True)
         )
         rows.append((name, *("-" if n == "nan" else n for n in numbers)))
     tables.show(out, [*tables.names("episode"), *tables.figures(*heads)], rows)
@@ -373,9 +374,9 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         tables.show(out, [*tables.names(kind), *tables.figures(*others)], counts)
     out.print(
         "trigger: distance from the robot to the event's place when it began; error: difference "
-        "to the stated distance; tick: metres that the robot drove in a tick, the largest "
-        "expected error; off: triggers beyond it; speed: of the walking person; stated: by the "
-        "scenario; left: of the middle of the route; angle: between its walk and the robot's "
+        "to the distance stated by the scenario, else the kind; tick: metres that the robot drove in a tick, the largest "
+        "expected error; off: triggers beyond it; speed: of the walking person, then the "
+        "scenario's; left: of the middle of the route; angle: between its walk and the robot's "
         "heading; least: distance between the centres of person and robot"
     )
 

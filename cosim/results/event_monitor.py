@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -44,8 +44,6 @@ _BODY_M: Final = np.stack(
 """Sample points of a body as seen by the camera: metres to its left and up."""
 PASSED_M: Final = 5.0
 """Distance, metres, that the robot must be beyond an event to have passed it."""
-_MOVED_M: Final = 1e-6
-_HAS_MOVED: Final = np.full(2, np.nan)
 
 OcclusionTest = Callable[[Floats, Floats], NDArray[np.bool_]]
 """Occlusion test: for each of (N, 3) points, whether a solid is between it and the eye (3,),
@@ -86,7 +84,6 @@ class EventMonitor:
         self._seen = [False] * len(self._events)
         self._went_between = [False] * len(self._events)
         self._furthest_m = 0.0
-        self._waiting: dict[tuple[int, int], Floats] = {}
         self._tracks: list[tuple[float, ...]] = []
 
     def see(self, step: Step) -> None:
@@ -102,24 +99,16 @@ class EventMonitor:
         after = step.motion.robot.pose
         for i, (event, state) in enumerate(zip(self._events, self._states, strict=True)):
             places = {k: shown[name] for k, name in enumerate(event.names) if name in shown}
-            self._track(step.tick, i, places)
-            window = self._windows[i]
-            if window is not None and state.triggered_tick is not None:
-                window.see(step.tick, step.route_s_after_m, places)
+            if state.triggered_tick is not None:
+                self._tracks += [(step.tick, i, person, *xy) for person, xy in places.items()]
+                if (window := self._windows[i]) is not None:
+                    window.see(step.tick, step.route_s_after_m, places)
             if state.phase not in ("acting", "over"):
                 continue
             bodies = np.array(list(places.values())).reshape(-1, 2)
             self._seen[i] = self._seen[i] or self._sees(step.motion.robot, bodies)
             if state.phase == "acting" and self._passed_round[i]:
                 self._went_between[i] |= passed_between(before.xy, after.xy, bodies)
-
-    def _track(self, tick: int, event: int, places: Mapping[int, Floats]) -> None:
-        """Record the positions of an event's people, each from its first move."""
-        for person, xy in places.items():
-            waits_at = self._waiting.setdefault((event, person), xy)
-            if waits_at is _HAS_MOVED or np.abs(xy - waits_at).max() > _MOVED_M:
-                self._waiting[event, person] = _HAS_MOVED
-                self._tracks.append((tick, event, person, *xy))
 
     def _sees(self, robot: RobotState, bodies: Floats) -> bool:
         """Return whether the camera sees one of the (N, 2) bodies."""
@@ -135,7 +124,7 @@ class EventMonitor:
 
     @property
     def tracks(self) -> Floats:
-        """Return (E, 5) from each person's first move: tick, event, person, x m, y m."""
+        """Return (E, 5) from each event's trigger on: tick, event, person, x m, y m."""
         return np.array(self._tracks, dtype=float).reshape(-1, 5)
 
     def outcomes(self, ended: Ended | None) -> tuple[TriggeredEvent, ...]:

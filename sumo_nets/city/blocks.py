@@ -69,9 +69,7 @@ class StreetClass(NamedTuple):
     driveways: float = 0.0
 
     def section(self, rng: np.random.Generator) -> Section:
-        """Draw a cross-section: widths within the ranges in steps of 5 cm, and a sidewalk width from
-        `sidewalks_m`.
-        """
+        """Draw a cross-section: widths in steps of 5 cm, and a sidewalk width of `sidewalks_m`."""
 
         def within(span: Range) -> float:
             return round(round(float(rng.uniform(*span)) / 0.05) * 0.05, 2)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.results.log import Log
+from cosim.results.record import TriggeredEvent
 from cosim.spec.events import Event
 from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
@@ -65,7 +66,12 @@ def test_a_crossing_walker_is_measured_as_it_walked() -> None:
     y = 1.0 - 1.2 * TICK_S * np.arange(20)
     tracks = np.column_stack([ticks, np.zeros(20), np.zeros(20), np.full(20, 12.0), y])
     scenario = scenario_of("lateral")
-    record = msgspec.structs.replace(record_of(scenario, Manifest("p", camera=None)), status="done")
+    outcome = TriggeredEvent(
+        id="e0", kind="lateral", passed=True, triggered_at_s=tick * TICK_S, trigger_distance_m=3.95
+    )
+    record = msgspec.structs.replace(
+        record_of(scenario, Manifest("p", camera=None)), status="done", events=(outcome,)
+    )
     (row,) = rows_of(scenario, record, log_of(x_m, tracks))
     found = dict(zip(COLUMNS, row, strict=True))
     assert found["trigger_m"] == pytest.approx(3.95) and found["error_m"] == pytest.approx(0.05)
@@ -80,8 +86,8 @@ def test_a_late_trigger_is_counted() -> None:
     """One that comes half a metre late at 0.1 m a tick."""
     import pandas as pd
 
-    late = ("t", "frontal", 19.5, 0.5, 0.1, 1.2, 1.2, 0.0, 180.0, 0.9)
-    fine = ("u", "frontal", 19.95, 0.05, 0.1, 1.2, 1.2, 0.0, -180.0, 1.0)
+    late = ("t", "frontal", 20.0, 19.5, 0.5, 0.1, 1.2, 1.2, 0.0, 180.0, 0.9)
+    fine = ("u", "frontal", 20.0, 19.95, 0.05, 0.1, 1.2, 1.2, 0.0, -180.0, 1.0)
     triggers, walks = summary(pd.DataFrame([late, fine], columns=list(COLUMNS)))
     assert triggers["off"].tolist() == ["1"] and triggers["n"].tolist() == [2]
     assert triggers["trigger m"].tolist() == ["19.50..19.95"] and walks["m/s"].tolist() == ["1.20"]

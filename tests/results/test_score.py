@@ -325,8 +325,8 @@ def test_another_metric_schema_is_refused(tmp_path: Path, cosim: Cosim) -> None:
 @pytest.mark.parametrize(
     ("policy", "ends"),
     [
-        ("straight", {"conversing-001": "failure", "static-001": "goal"}),
-        ("orca", {"gesturing-001": "stop"}),
+        ("straight", {"conversing-001": "failure"}),
+        ("orca", {"gesturing-001": "stop", "static-001": "goal"}),
     ],
     ids=["straight", "orca"],
 )

@@ -174,7 +174,10 @@ def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
     ):
         read_suite(tmp_path / "s.json", EVENT_KINDS)
     few = CrowdSpec(persons=3, radius_m=40.0, vehicles=0)
-    scenario = msgspec.structs.replace(whole, crowd=few, time_limit_s=7.0)
+    scenario = msgspec.structs.replace(whole, crowd=few, obstacles=(), time_limit_s=11.0)
+    (planned,) = scenario.events
+    assert planned.trigger_m is not None and planned.trigger_m <= TRIGGER_M
+    stops_at_m = planned.route_s_m - planned.trigger_m + 0.3
     manifest = Manifest("ahead", camera=None)
     with (
         pytest.raises(SpecError, match=f"scenario '{scenario.id}': .*'swapping'"),
@@ -195,7 +198,7 @@ def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
     with Episode(scenario, manifest, watches=[watch], kinds=KINDS) as episode:
         episode.reset()
         while not episode.over:
-            episode.advance(Command(0.9 if episode.time_s < 3.5 else 0.0, 0.0))
+            episode.advance(Command(0.9 if episode.moment.route_s_m < stops_at_m else 0.0, 0.0))
     record, log = episode.result()
     (event,) = record.events
     assert (record.status, event.kind, event.seen, event.rule_met) == (
@@ -204,7 +207,7 @@ def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
         True,
         True,
     ), record.reason
-    assert event.trigger_distance_m == pytest.approx(TRIGGER_M, abs=0.06)
+    assert event.trigger_distance_m == pytest.approx(planned.trigger_m, abs=0.06)
     assert (
         ("stand", "stand") in doing
         and ("walk", "walk") in doing
@@ -213,5 +216,7 @@ def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
     assert phases == {"waiting", "acting", "over"}
     sheet = pd.DataFrame(rows_of(scenario, record, log, KINDS), columns=list(COLUMNS))
     assert sheet["kind"].tolist() == ["swapping"] * 2
-    triggers, _ = summary(sheet, KINDS)
-    assert triggers[["event", "stated", "off"]].to_numpy().tolist() == [["swapping", "7", "0"]]
+    triggers, _ = summary(sheet)
+    assert triggers[["event", "stated", "off"]].to_numpy().tolist() == [
+        ["swapping", f"{planned.trigger_m:.2f}", "0"]
+    ]

@@ -73,9 +73,7 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
     cities = {scenario.place.name for scenario in whole.scenarios}
     assert len(cities) == 100
     structures = (*EVENT_KINDS, "static")
-    places = {
-        one: [s.place.name for s in events if s.structure == one] for one in structures
-    }
+    places = {one: [s.place.name for s in events if s.structure == one] for one in structures}
     assert all(len(there) == 100 and set(there) == cities for there in places.values())
     assert [s.place.name for s in whole.scenarios] == sorted(
         (s.place.name for s in whole.scenarios), key=lambda name: int(name.rpartition("-")[2])

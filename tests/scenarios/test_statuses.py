@@ -96,7 +96,7 @@ def test_who_comes_by_an_event_that_nobody_could_see_has_done_nothing(
 
     monkeypatch.setattr(Scorer, "__init__", veiled)
     short = obstructing(20.0)
-    near = msgspec.structs.replace(short, route=short.route[:6], goal=short.route[5])
+    near = msgspec.structs.replace(short, route=short.route[:6], goal=short.route[5], obstacles=())
     record = run_episode(near, Blind(1.5)).record
     assert outcome(record) == ("invalid", "goal", 1.0, True)
     assert record.reason == "nobody of event e0 (obstructing) could be seen"

@@ -1,6 +1,7 @@
 """Measurements of the events of an episode, to compare with their definitions.
 
-They use only `trajectory.npz` and the spec, and no reports of an event director.
+They use `trajectory.npz`, the spec, and the time of each trigger in the record. Distances and
+speeds are measured, not taken from the event director.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ LATE_M: Final = 0.005
 COLUMNS: Final = (
     "scenario",
     "kind",
+    "stated_m",
     "trigger_m",
     "error_m",
     "period_m",
@@ -57,8 +59,9 @@ def rows_of(
 ) -> list[tuple[object, ...]]:
     """Return the rows of an episode.
 
+    stated_m: trigger distance of the event, else of its kind; NaN if the crosswalk is the trigger.
     trigger_m: metres along the route from the robot to the event's place at the trigger.
-    error_m: difference between trigger_m and the stated distance.
+    error_m: difference between trigger_m and stated_m, or half the crosswalk's length.
     period_m: largest possible error: distance driven in a tick, or progress on the route, which may
     cut a bend.
     speed_mps: median while walking, absent for a person that never walks.
@@ -69,30 +72,43 @@ def rows_of(
     least_m: least distance of the person's centre from the robot's.
     """
     rows: list[tuple[object, ...]] = []
+    triggered_s = {event.id: event.triggered_at_s for event in record.events}
     for number, event in enumerate(scenario.events):
-        tracks = log.event_tracks[log.event_tracks[:, 1] == number]
-        if not len(tracks):
+        at_s = triggered_s.get(event.id)
+        if at_s is None:
             continue
-        first = int(tracks[0, 0])
+        tracks = log.event_tracks[log.event_tracks[:, 1] == number]
+        first = round(at_s / log.tick_s)
         before = max(first - 1, 0)
         trigger_m = event.route_s_m - float(log.route_s_m[before] if first else 0.0)
         stated_m = event.trigger_m
         if stated_m is None:
             stated_m = kinds[event.kind].trigger_m
-        if stated_m is None:
-            stated_m = event.half_length_m
+        error_m = abs((event.half_length_m if stated_m is None else stated_m) - trigger_m)
         came_m = float(log.route_s_m[before] - log.route_s_m[before - 1]) if before else 0.0
         period_m = max(float(log.travelled_m[before]), came_m)
         for person in range(event.people):
             track = tracks[tracks[:, 2] == person]
             name = scenario.id if event.people == 1 else f"{scenario.id} {person + 1}"
-            told = (trigger_m, abs(stated_m - trigger_m), period_m, *walked(event, track, log))
-            rows.append((name, event.kind, *told[:4], event.speed_mps, *told[4:]))
+            speed_mps, *walk = walked(event, track, log, first)
+            found = (
+                math.nan if stated_m is None else stated_m,
+                trigger_m,
+                error_m,
+                period_m,
+                speed_mps,
+            )
+            rows.append((name, event.kind, *found, event.speed_mps, *walk))
     return rows
 
 
-def walked(event: Event, track: Floats, log: Log) -> tuple[float, float, float, float]:
-    """Return (speed_mps, left_m, angle_deg, least_m) of a person's track (T, 5); see `rows_of`."""
+def walked(event: Event, track: Floats, log: Log, first: int) -> tuple[float, float, float, float]:
+    """Return (speed_mps, left_m, angle_deg, least_m) of a person's track (T, 5); see `rows_of`.
+
+    first: tick of the trigger. Without a track, all are NaN.
+    """
+    if not len(track):
+        return math.nan, math.nan, math.nan, math.nan
     xy = track[:, 3:5]
     steps = np.diff(xy, axis=0)
     far_m = np.hypot(steps[:, 0], steps[:, 1])
@@ -104,16 +120,14 @@ def walked(event: Event, track: Floats, log: Log) -> tuple[float, float, float, 
     if not moves.any():
         return math.nan, float(np.median(left_m)), math.nan, least_m
     stands = np.append(~moves, False)
-    way_rad = log.pose[max(int(track[0, 0]) - 1, 0), 2]
-    first = steps[moves][: max(round(1.0 / log.tick_s), 1)].sum(axis=0)
-    angle = float(wrap_angles(math.atan2(first[1], first[0]) - way_rad))
+    way_rad = log.pose[max(first - 1, 0), 2]
+    begun = steps[moves][: max(round(1.0 / log.tick_s), 1)].sum(axis=0)
+    angle = float(wrap_angles(math.atan2(begun[1], begun[0]) - way_rad))
     where_m = float(np.median(left_m[stands] if stands.sum() > moves.sum() else left_m))
     return float(np.median(far_m[moves]) / log.tick_s), where_m, math.degrees(angle), least_m
 
 
-def summary(
-    sheet: pd.DataFrame, kinds: EventKinds = EVENT_KINDS
-) -> tuple[pd.DataFrame, pd.DataFrame]:
+def summary(sheet: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return two tables with a row per kind of event: its triggers, and the motion of its people.
 
     off: number of triggers whose error exceeds the motion of the robot in a tick.
@@ -121,13 +135,12 @@ def summary(
     triggers = []
     walks = []
     for kind, part in sheet.groupby("kind", sort=False):
-        stated_m = kinds[str(kind)].trigger_m
         triggers.append(
             {
                 "event": kind,
                 "n": part["scenario"].str.split().str[0].nunique(),
                 "people": len(part),
-                "stated": "entry" if stated_m is None else f"{stated_m:g}",
+                "stated": "entry" if part["stated_m"].isna().all() else _spread(part["stated_m"]),
                 "trigger m": _spread(part["trigger_m"]),
                 "error m": _spread(part["error_m"]),
                 "tick m": f"{part['period_m'].max():.3f}",
