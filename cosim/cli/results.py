@@ -373,11 +373,11 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         counts = [tuple(str(value) for value in row) for row in short.itertuples(index=False)]
         tables.show(out, [*tables.names(kind), *tables.figures(*others)], counts)
     out.print(
-        "trigger: distance from the robot to the event's place when it began; error: difference "
-        "to the distance stated by the scenario, else the kind; tick: metres that the robot drove in a tick, the largest "
-        "expected error; off: triggers beyond it; speed: of the walking person, then the "
-        "scenario's; left: of the middle of the route; angle: between its walk and the robot's "
-        "heading; least: distance between the centres of person and robot"
+        "stated: trigger distance and speed by the scenario; trigger: distance from the robot to "
+        "the event's place when it began; error: difference to the stated distance; tick: metres "
+        "that the robot drove in a tick, the largest expected error; off: triggers beyond it; "
+        "speed: of the walking person; left: of the middle of the route; angle: between "
+        "its walk and the robot's heading; least: distance between the centres of person and robot"
     )
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from cosim.results.log import Log
-from cosim.results.record import TriggeredEvent
+from cosim.results.record import Record, TriggeredEvent
 from cosim.spec.events import Event
 from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
-from scenarios.tools.viewing.event_sheet import COLUMNS, rows_of, summary
+from scenarios.tools.viewing.event_sheet import COLUMNS, rows_of, sheet_of_run, summary
 from tests.conftest import Cosim
 from tests.logs import log_with
 from tests.run_specs import record_of
@@ -126,6 +126,14 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(
         and "frontal" not in shown.stdout
         and "trigger m" in shown.stdout
     )
+    (outcome,) = Record.load(tmp_path / f"mine/episodes/{made[1].id}/record.json").events
+    (row,) = sheet_of_run(tmp_path / "mine").itertuples(index=False)
+    assert outcome.triggered_at_s is not None and outcome.seen
+    assert row.trigger_m == pytest.approx(outcome.trigger_distance_m, abs=1e-6)
+    assert row.stated_m == made[1].events[0].trigger_m and row.error_m <= row.period_m + 0.005
+    beside_m = -0.9 * made[1].events[0].free_side
+    assert np.isnan(row.speed_mps) and row.left_m == pytest.approx(beside_m, abs=0.01)
+    assert cosim("score", "mine", cwd=tmp_path).returncode == 0
     wrong = cosim("run", "tiny.json", "--event", "frontl", cwd=tmp_path)
     assert (
         wrong.returncode == 2

@@ -88,7 +88,7 @@ def of_comparison(out: Console) -> None:
 
 
 def of_sheet(out: Console) -> None:
-    row = (LONG, "ped_crossing", -19.98, 0.123, 0.060, 34.56, 34.56, -12.34, -180.0, 12.34)
+    row = (LONG, "ped_crossing", -19.86, -19.98, 0.123, 0.060, 34.56, 34.56, -12.34, -180.0, 12.34)
     print_sheet(out, pd.DataFrame([row], columns=list(COLUMNS)))
 
 
