@@ -86,7 +86,7 @@ def keep_worker(
     with suppress(_Ended):
         signal.signal(signal.SIGTERM, _ended)
         status = _status_of(pid)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     kill_children()
     log.join(KILLING_S)
     if boxed is not None:
@@ -177,6 +177,7 @@ class _Ended(Exception):
 
 
 def _ended(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)  # another SIGTERM may follow at once
     raise _Ended
 
 
