@@ -360,7 +360,8 @@ def bench(
         ),
     ] = None,
     write: Annotated[
-        bool, typer.Option("--write", help="For `exploit`: store the result beside the suite.")
+        bool,
+        typer.Option("--write", help="For `exploit`: store the result next to the suite."),
     ] = False,
     cheats: Annotated[
         bool,

@@ -89,7 +89,7 @@ def steered(
 ) -> Vector:
     """Return the velocity (m/s) of a person, no faster than preferred.
 
-    It is exactly the preferred velocity if nobody is in the way. A person who wants to stand does.
+    It is exactly the preferred velocity if the way is free, or if that is zero.
 
     at_m: position.
     moving_mps: current velocity.

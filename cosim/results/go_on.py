@@ -74,7 +74,7 @@ class PassingWindow:
     """
 
     def __init__(self, route: Polyline, event: Event, kind: EventKind) -> None:
-        trigger_m = kind.trigger_m if event.trigger_m is None else event.trigger_m
+        trigger_m = kind.trigger_m_of(event)
         self._from_behind = trigger_m is not None and trigger_m < 0.0
         self._route = route
         self._passed = [False] * event.people

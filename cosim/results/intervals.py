@@ -91,10 +91,13 @@ def counts_in_words(counted: float, n: int, metres: float = math.nan) -> str:
 
 def estimate_of_share(values: Floats) -> Estimate:
     """Estimate a share from values (N,), each 0 or 1."""
-    n = len(values)
+    return estimate_of_counts(float(values.sum()), len(values))
+
+
+def estimate_of_counts(counted: float, n: int) -> Estimate:
+    """Estimate a share from the number of episodes that count, of n."""
     if not n:
         return NO_ESTIMATE
-    counted = float(values.sum())
     interval = wilson(counted, n) if n >= MIN_N else _NONE
     return Estimate(counted / n, *interval, n, counted)
 

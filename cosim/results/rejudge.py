@@ -178,7 +178,7 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
 def _passings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
     """Check the go-on rule in the windows of the record, which the goal ends at the latest.
 
-    A group may break its other rule where the robot goes on.
+    A group may break its other rule where the robot continues.
     """
     outcomes = {outcome.id: outcome for outcome in record.events}
     for event in (event for event in scenario.events if is_measured(event, scenario)):

@@ -253,7 +253,7 @@ class EventKind:
     blocked: returns the lateral interval (right, left) in metres that people of an event with a
         free side block, left positive; None for people who block none.
     has_free_side: whether a suite draws `Event.free_side`. People who block no side then stand
-        beside the robot's way.
+        next to the robot's way.
     decoy: behaviour of its decoys; None if a decoy is the event with the other side free.
     """
 
@@ -272,6 +272,11 @@ class EventKind:
     blocked: Callable[[Event], tuple[float, float]] | None = None
     has_free_side: bool = False
     decoy: Decoy | None = None
+
+    def trigger_m_of(self, event: Event) -> float | None:
+        """Return the distance before an event at which it begins, in metres: its own, else the
+        kind's."""
+        return self.trigger_m if event.trigger_m is None else event.trigger_m
 
     def decoy_of(self, event: Event) -> Event:
         """Return the event's decoy, equal to it until the trigger.

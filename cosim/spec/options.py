@@ -39,7 +39,7 @@ class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
     """Location of a run's policy.
 
     isolated: run it in a process of its own, in a sandbox of this kind.
-    data: paths that an isolated policy may read, beside its own folder.
+    data: paths that an isolated policy may read, in addition to its own folder.
     memory_gb: limit of the memory of each of its processes.
     hidden: folders of this machine that it may not read, even in its own folder.
     servers: connections to the servers of a remote policy.

@@ -140,8 +140,8 @@ class RunConfig:
     policy_data: Annotated[
         tuple[str, ...],
         Option(
-            "File or folder that an --isolated policy may read, beside its own folder; may be "
-            "repeated.",
+            "File or folder that an --isolated policy may read, in addition to its own folder; "
+            "may be repeated.",
             metavar="PATH",
             panel=_POLICY,
         ),

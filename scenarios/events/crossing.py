@@ -22,6 +22,7 @@ from scenarios.events.walking import (
     along_m,
     come_at_robot,
     edge_m,
+    has_passed,
     lead_to_meeting_m,
     left_m,
     lost_patience,
@@ -73,7 +74,7 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     walker = state.walkers[number]
     sight = sight_of(event, number, query)
     heading_rad = event.heading_rad + (math.pi if from_front(number) else 0.0)
-    if from_front(number) and not _passed(event, walker, query):
+    if from_front(number) and not has_passed(event, walker, query):
         walker = waiting_for_robot(event, walker, query)
         if not lost_patience(event, walker, query):
             if number == 0:
@@ -118,11 +119,6 @@ def _decoy_ends(event: Event, state: EventState, query: EventQuery) -> bool:
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
     return all(_across(event, walker, number) for number, walker in enumerate(state.walkers))
-
-
-def _passed(event: Event, walker: Walker, query: EventQuery) -> bool:
-    here = along_m(event, walker.x_m, walker.y_m)
-    return here < along_m(event, query.robot_x_m, query.robot_y_m) - 1.0
 
 
 def _across(event: Event, walker: Walker, number: int) -> bool:

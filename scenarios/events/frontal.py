@@ -31,6 +31,7 @@ from scenarios.events.walking import (
     come_at_robot,
     distance_m,
     edge_m,
+    has_passed,
     lost_patience,
     waiting_for_robot,
     walk_on,
@@ -72,16 +73,11 @@ def _decoy_step(event: Event, state: EventState, number: int, query: EventQuery)
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
     (walker,) = state.walkers
-    return _passed(event, walker, query) or lost_patience(event, walker, query)
+    return has_passed(event, walker, query) or lost_patience(event, walker, query)
 
 
 def _decoy_ends(event: Event, state: EventState, query: EventQuery) -> bool:
-    return _passed(event, state.walkers[0], query)
-
-
-def _passed(event: Event, walker: Walker, query: EventQuery) -> bool:
-    here_m = along_m(event, walker.x_m, walker.y_m)
-    return here_m < along_m(event, query.robot_x_m, query.robot_y_m) - 1.0
+    return has_passed(event, state.walkers[0], query)
 
 
 FRONTAL: Final = EventKind(

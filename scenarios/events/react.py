@@ -92,8 +92,7 @@ def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery
         state, robot_stood_ticks=state.robot_stood_ticks + 1 if robot_stands(query) else 0
     )
     if state.phase == "waiting":
-        own_m = event.trigger_m
-        gap_m = _triggered_m(kind.trigger_m if own_m is None else own_m, event, query)
+        gap_m = _triggered_m(kind.trigger_m_of(event), event, query)
         if gap_m is None:
             return state
         state = msgspec.structs.replace(

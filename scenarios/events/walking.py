@@ -75,6 +75,12 @@ def left_m(event: Event, x_m: float, y_m: float) -> float:
     )
 
 
+def has_passed(event: Event, walker: Walker, query: EventQuery) -> bool:
+    """Return whether a person who comes towards the robot is 1 m behind it along the event."""
+    here_m = along_m(event, walker.x_m, walker.y_m)
+    return here_m < along_m(event, query.robot_x_m, query.robot_y_m) - 1.0
+
+
 def edge_m(event: Event) -> float:
     """Return the largest lateral offset at which both shoulders are on the sidewalk."""
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)

@@ -195,7 +195,7 @@ def _write_maps(child: int) -> None:
 
 
 class _Inside(NamedTuple):
-    """What the set-up needs beside the sandbox.
+    """Needs of the set-up in addition to the sandbox.
 
     status: pipe to the watcher.
     begun: pipe that closes when Python starts, -1 for none.

@@ -62,12 +62,12 @@ class Lanes:
     """Lanes parallel to a straight route. width_m: width of the robot."""
 
     def __init__(self, route: Polyline, street_map: StreetMap, width_m: float) -> None:
-        right_m, left_m = walkable_width_m(route, street_map)
+        walkable = street_map.walkable_near(shapely.buffer(LineString(route.points), _WIDEST_M))
+        right_m, left_m = walkable_width_m(route, walkable)
         half_m = 0.5 * width_m
         self.offsets_m: Floats = np.linspace(half_m - right_m, left_m - half_m, LANES)
         self._width_m = width_m
         self._swept = [_swept(route, left_m, width_m) for left_m in self.offsets_m.tolist()]
-        walkable = street_map.walkable_near(shapely.buffer(LineString(route.points), _WIDEST_M))
         self._inside = shapely.covers(shapely.buffer(walkable, 1e-3), self._swept)
 
     def free(self, grounds: Sequence[Polygon]) -> NDArray[np.bool_]:
@@ -85,10 +85,9 @@ def _swept(route: Polyline, left_m: float, width_m: float) -> Polygon:
     return shapely.buffer(line, 0.5 * width_m, cap_style="flat")
 
 
-def walkable_width_m(route: Polyline, street_map: StreetMap) -> tuple[float, float]:
+def walkable_width_m(route: Polyline, walkable: shapely.Geometry) -> tuple[float, float]:
     """Return the walkable width to the right and left of a route: its medians, in metres."""
     at = [route.at(float(s_m)) for s_m in np.arange(0.25, route.length_m, _STEP_M)]
-    walkable = street_map.walkable_near(shapely.buffer(LineString(route.points), _WIDEST_M))
     found = []
     for side in (-1.0, 1.0):
         rays = [

@@ -290,11 +290,11 @@ def event_share(scenario: Scenario, kind: EventKind) -> float:
     """
     (event,) = scenario.events
     length_m = scenario.route_line.length_m
-    if kind.layout is None or kind.trigger_m is None:
+    trigger_m = kind.trigger_m_of(event)
+    if kind.layout is None or trigger_m is None:
         low_m = ROUND_CROSSING_M[0] + event.half_length_m
         high_m = length_m - ROUND_CROSSING_M[1] - event.half_length_m
     else:
-        trigger_m = kind.trigger_m if event.trigger_m is None else event.trigger_m
         low_m, high_m = event_range_m(trigger_m, kind.layout.after_m, length_m)
     if high_m - low_m < 0.9 * _BAND_M:
         return 0.5

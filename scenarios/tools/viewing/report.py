@@ -137,10 +137,7 @@ def blind_rows(runs: Sequence[ReportedRun]) -> dict[str, dict[str, Estimate]]:
     for run in runs:
         exploit = exploit_of(run.spec.setup.suite_hash)
         if exploit is not None:
-            found[run.spec.suite] = {
-                kind: Estimate(share.mean, *share.interval, share.n, share.solved)
-                for kind, share in exploit.row().items()
-            }
+            found[run.spec.suite] = {kind: share.estimate for kind, share in exploit.row().items()}
     return found
 
 
