@@ -45,7 +45,8 @@ from scenarios.ipc.messages import (
 STARTS: Final = 2
 """Number of processes in a row that may end before they are ready."""
 REPLAYS: Final = 2
-"""Number of replays of a failed episode; another one if the first ends at another tick."""
+"""Number of replays of a failed episode; another one if the first ends at another tick or was
+killed by a signal."""
 SURVIVES: Final = "the policy is at fault, because the simulator survives its commands without it"
 FAILS_ELSEWHERE: Final = "the simulator fails without the policy, too, but at another tick"
 FAILS_AGAIN: Final = "the simulator is at fault, because it fails there without the policy, too"
@@ -140,7 +141,7 @@ class EnvironmentSlot:
         if isinstance(reported, Repeated):
             if end is not None:
                 self._watchdog = None
-            return self._judged(reported.error, watchdog.process.driven, reported.record)
+            return self._judged(reported.error, watchdog.process.driven, record=reported.record)
         if isinstance(reported, Done):
             return self._reported_failure(watchdog, reported)
         return None if end is None else self._ended(watchdog, end)
@@ -207,23 +208,29 @@ class EnvironmentSlot:
         repeat = Repeat(job, suspect.driven.commands)
         self._start(msgspec.structs.replace(self._hello, repeat=repeat))
 
-    def _judged(self, error: str, driven: Driven | None, record: bytes = b"") -> Failure | None:
+    def _judged(
+        self, error: str, driven: Driven | None, *, record: bytes = b"", killed: bool = False
+    ) -> Failure | None:
         """Return the failure of a job after its replay; None if another replay was started.
 
         error: why the replay has failed, "" if the simulator survived.
         driven: what was driven in the replay.
+        killed: whether the replay's process ended without a fault of its own, so that something
+        else may have killed it.
         """
         suspect, job = self._suspect, self.job
         if suspect is None or job is None:
             return None
         failure = suspect.failure
+        there = bool(error) and driven is not None and driven.ticks == suspect.driven.ticks
+        another = suspect.replays < REPLAYS and self._watchdog is None
         if RULES[failure.fault].attempts == 1:
             failure = failure._replace(driven=record)
-        elif error and driven is not None and driven.ticks == suspect.driven.ticks:
-            failure = Failure("engine_failed", failure.why, FAILS_AGAIN, record)
-        elif error and suspect.replays < REPLAYS and self._watchdog is None:
+        elif error and another and (killed or not there):
             self._replay(suspect._replace(replays=suspect.replays + 1), job)
             return None
+        elif there:
+            failure = Failure("engine_failed", failure.why, FAILS_AGAIN, record)
         else:
             found = FAILS_ELSEWHERE if error else SURVIVES
             failure = Failure("process_ended", failure.why, found, record)
@@ -235,7 +242,7 @@ class EnvironmentSlot:
         self._watchdog = None
         if self._suspect is not None:
             log_event("replay ended", WARNING, log=Path(self.log).name, why=end.words)
-            return self._judged(end.words, end.driven)
+            return self._judged(end.words, end.driven, killed=not end.in_engine)
         idle = (
             self._ran
             and watchdog.heard_s <= self._given_s

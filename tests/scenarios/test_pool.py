@@ -403,27 +403,41 @@ DIED = "the environment process ended with exit code 7, 2 times: the"
 @pytest.mark.parametrize(
     ("replays", "status", "reason"),
     [
-        ([(7, True)], "invalid", f"{DIED} simulator is at fault"),
-        ([(8, False)], "crashed", f"{DIED} policy is at fault"),
-        ([(6, True), (7, True)], "invalid", f"{DIED} simulator is at fault"),
-        ([(6, True), (8, False)], "crashed", f"{DIED} policy is at fault"),
-        ([(6, True), (6, True)], "crashed", f"{DIED} simulator fails without the policy, too, but"),
+        ([(7, "fault")], "invalid", f"{DIED} simulator is at fault"),
+        ([(8, "")], "crashed", f"{DIED} policy is at fault"),
+        ([(6, "fault"), (7, "fault")], "invalid", f"{DIED} simulator is at fault"),
+        ([(6, "fault"), (8, "")], "crashed", f"{DIED} policy is at fault"),
+        (
+            [(6, "fault"), (6, "fault")],
+            "crashed",
+            f"{DIED} simulator fails without the policy, too, but",
+        ),
+        ([(7, "killed"), (8, "")], "crashed", f"{DIED} policy is at fault"),
+        ([(7, "killed"), (7, "killed")], "invalid", f"{DIED} simulator is at fault"),
     ],
-    ids=["dies-there", "survives", "dies-before-then-there", "dies-before-then-survives", "before"],
+    ids=[
+        "dies-there",
+        "survives",
+        "dies-before-then-there",
+        "dies-before-then-survives",
+        "before",
+        "killed-there-then-survives",
+        "killed-there-twice",
+    ],
 )
 def test_a_replay_without_the_policy_finds_who_ended_a_process(
-    tmp_path: Path, replays: list[tuple[int, bool]], status: str, reason: str, in_engine: bool
+    tmp_path: Path, replays: list[tuple[int, str]], status: str, reason: str, in_engine: bool
 ) -> None:
     """After the last attempt its commands are simulated again: dead at the same tick is the
-    simulator's fault, however the process ended; alive is the policy's, and the record keeps what
-    was driven."""
+    simulator's fault; alive is the policy's, and the record keeps what was driven. A replay that
+    was killed says nothing until a second one dies there, too."""
     driven = Driven(7, False, COMMANDS)
     record = record_of(SCENARIO, load_policy("stop").manifest)
     again = [
-        Fake(ends=True, driven=Driven(ticks))
-        if dies
+        Fake(ends=True, in_engine=end == "fault", driven=Driven(ticks))
+        if end
         else Fake(Repeated("s-0", msgspec.structs.replace(record, ticks=ticks).encoded()))
-        for ticks, dies in replays
+        for ticks, end in replays
     ]
     dies = [
         Fake(Ready(), Progress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine, driven=driven)
