@@ -224,9 +224,10 @@ def parse_areas(data: bytes) -> tuple[ScanArea, ...]:
             raise ValueError(f"feature {number}: kind must be one of {', '.join(AREA_KINDS)}")
         shape = shapely.geometry.shape(feature["geometry"])
         parts = shape.geoms if isinstance(shape, shapely.MultiPolygon) else (shape,)
-        if not all(isinstance(part, shapely.Polygon) and part.is_valid for part in parts):
-            raise ValueError(f"feature {number}: geometry must be a valid Polygon or MultiPolygon")
-        areas += [ScanArea(kind, part) for part in parts]
+        for part in parts:
+            if not isinstance(part, shapely.Polygon) or not part.is_valid:
+                raise ValueError(f"feature {number}: geometry must be a valid (Multi)Polygon")
+            areas.append(ScanArea(kind, part))
     return tuple(areas)
 
 
