@@ -40,8 +40,8 @@ _FINE_M: Final = 4.0
 """Distance in metres from an area within which the ground has the lattice of the height grid."""
 _BLOCK_M: Final = 1.0
 """Side of a square of the ground elsewhere in metres."""
-_LEVELS: Final = 6
-"""Levels of each colour channel for cameras with one colour per body."""
+_LEVELS: Final = 24
+"""Levels of brightness for cameras with one colour per body."""
 
 _KINDS: Final[tuple[AreaKind, ...]] = ("crossing", "sidewalk", "road", "verge")
 """Kinds of areas with their own ground; where areas overlap, the first one counts."""
@@ -281,11 +281,12 @@ def posterized(patches: Sequence[ScannedPatch]) -> list[tuple[Mesh, Colour, str]
     colours of vertices."""
     found = []
     for mesh, colours, label in patches:
-        level = np.rint(colours[mesh.triangles].mean(axis=1) * (_LEVELS - 1)).astype(int)
-        for shade in np.unique(level, axis=0):
-            rows = (level == shade).all(axis=1)
+        colour = colours[mesh.triangles].mean(axis=1)
+        level = np.rint(colour.mean(axis=1) * (_LEVELS - 1)).astype(int)
+        for shade in np.unique(level):
+            rows = level == shade
             vertices, triangles, used = _picked(mesh.vertices, mesh.triangles[rows])
-            red, green, blue = (shade / (_LEVELS - 1)).tolist()
+            red, green, blue = colour[rows].mean(axis=0).tolist()
             part = Mesh(vertices, mesh.normals[used], triangles)
             found.append((part, (red, green, blue), label))
     return found
