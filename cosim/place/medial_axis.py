@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -76,8 +76,10 @@ class _Chain(NamedTuple):
     length_m: float
 
 
-def medial_axis(ground: Polygon | MultiPolygon) -> Axis:
-    """Return the medial axis of walkable ground, in the order of its coordinates.
+def medial_axis(ground: Polygon | MultiPolygon, *, whole: bool = False) -> Axis:
+    """Return the medial axis of ground, in the order of its coordinates.
+
+    whole: whether pieces run from fork to fork, however long and of whatever width.
 
     Ground narrower than twice OPENED_M has no axis.
     """
@@ -89,7 +91,16 @@ def medial_axis(ground: Polygon | MultiPolygon) -> Axis:
         for line, ends in _lines(_with_islands_joined(part)):
             here = [_node_of(nodes, end) for end in (line[0], line[-1])]
             loop = here[0] == here[1]
-            pieces += _cut(line, here, loop, boundary, nodes, ends)
+            s_m, clear_m = clear_widths(line, boundary, ends)
+            parts = [(0.0, float(s_m[-1]))] if whole else _parts(s_m, clear_m, loop)
+            before = here[0]
+            for low_m, high_m in parts:
+                last = high_m == parts[-1][1]
+                after = here[1] if last else _node_of(nodes, Polyline(line).at(high_m).xy)
+                inside = (s_m >= low_m - 1e-6) & (s_m <= high_m + 1e-6)
+                least_m = float(clear_m[inside].min())
+                pieces.append(Piece(before, after, between(line, low_m, high_m), least_m))
+                before = after
     return Axis(np.array(nodes).reshape(-1, 2), tuple(pieces))
 
 
@@ -302,32 +313,14 @@ def _smoothed(line: Floats, boundary: shapely.Geometry) -> Floats:
     return shapely.get_coordinates(shapely.simplify(LineString(points), 0.04))
 
 
-def _cut(
-    line: Floats,
-    ends: Sequence[int],
-    loop: bool,
-    boundary: shapely.Geometry,
-    nodes: list[Floats],
-    dead: tuple[bool, bool],
-) -> Iterable[Piece]:
+def _parts(s_m: Floats, clear_m: Floats, loop: bool) -> list[tuple[float, float]]:
     """Cut a line where its clear width changes, and where it is too long or a loop."""
-    s_m, clear_m = clear_widths(line, boundary, dead)
-    cuts = [float(s_m[i]) for i in _width_cuts(s_m, clear_m)]
-    bounds = [0.0, *cuts, float(s_m[-1])]
+    bounds = [0.0, *(float(s_m[i]) for i in _width_cuts(s_m, clear_m)), float(s_m[-1])]
     parts: list[tuple[float, float]] = []
     for low, high in pairwise(bounds):
         count = max(1, math.ceil((high - low) / LONGEST_M), 3 if loop and len(bounds) == 2 else 1)
-        steps = np.linspace(low, high, count + 1).tolist()
-        parts += pairwise(steps)
-    pieces = []
-    before = ends[0]
-    for k, (low, high) in enumerate(parts):
-        after = ends[1] if k == len(parts) - 1 else _node_of(nodes, Polyline(line).at(high).xy)
-        inside = (s_m >= low - 1e-6) & (s_m <= high + 1e-6)
-        # Samples at forks may be nearer to a corner; the lane ends before.
-        pieces.append(Piece(before, after, between(line, low, high), float(clear_m[inside].min())))
-        before = after
-    return pieces
+        parts += pairwise(np.linspace(low, high, count + 1).tolist())
+    return parts
 
 
 def _width_cuts(s_m: Floats, clear_m: Floats) -> list[int]:
