@@ -14,9 +14,10 @@ from cosim.core.geometry import Floats
 from cosim.place.scan import HeightGrid, ScanArea, ScanMesh, Splats
 from physics.scans.clean import above_ground, grid_cells, walkable_area
 from physics.scans.findings import Finding, note, refusal, warning
-from physics.scans.frame import UP_AXES, Matrix, move, scale_of
+from physics.scans.frame import UP_AXES, Matrix, move, move_splats
 from physics.scans.mesh_distance import MeshDistance, areas_of, unit_normals
 from physics.scans.ordering import take_splats
+from physics.scans.read_splats import QuaternionOrder, RawSplats
 
 MOST_TILT_DEG: Final = 5.0
 """Largest angle between the ground's normal and the stated up axis, in degrees."""
@@ -48,7 +49,6 @@ _MEASURED: Final = 20_000
 _PLANES: Final = 300
 _POINTS: Final = 6000
 """Numbers of random planes and points by which the ground is found."""
-_UNITS: Final = {"centimetres": 0.01, "millimetres": 0.001, "feet": 0.3048, "inches": 0.0254}
 
 
 class Ground(NamedTuple):
@@ -168,7 +168,7 @@ def _winding(ground: Ground) -> list[Finding]:
                 "reads backwards in `cosim scan show`, else --flip"
             )
         ]
-    if down > 0.1:
+    if down > 0.6:
         words = f"the fronts of {down:.0%} of the ground's triangles face down"
         return [warning(f"{words}: they count as no ground; unify the normals before the export")]
     return []
@@ -323,17 +323,18 @@ def check_alignment(
 
 def best_shift(sample: Splats, distance: MeshDistance) -> Finding | None:
     """Return a refusal if a shift of the splats fits the mesh much better than none."""
-    points = sample.centres[:: max(1, len(sample) // 1500)].astype(np.float64)
+    points = sample.centres[:: max(1, len(sample) // 700)].astype(np.float64)
 
     def share(shift: Floats) -> float:
         return float((distance.to_planes(points + shift, 0.4) < 0.1).mean())
 
     unmoved = share(np.zeros(3))
     best, found = np.zeros(3), unmoved
-    for reach_m, step_m in ((2.0, 0.5), (0.5, 0.25), (0.2, 0.1)):
+    for reach_m, step_m in ((2.0, 0.5), (0.25, 0.25), (0.1, 0.1)):
         steps = np.arange(-round(reach_m / step_m), round(reach_m / step_m) + 1) * step_m
+        heights = steps[np.abs(steps) <= 1.0]
         middle = best
-        for offset in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3):
+        for offset in np.stack(np.meshgrid(steps, steps, heights), axis=-1).reshape(-1, 3):
             shift = middle + offset
             if (there := share(shift)) > found + 1e-3:
                 best, found = shift, there
@@ -341,9 +342,10 @@ def best_shift(sample: Splats, distance: MeshDistance) -> Finding | None:
     if length_m < REFUSED_SHIFT_M or found < 1.25 * unmoved + 0.05:
         return None
     return refusal(
-        f"splats lie {length_m:.1f} m beside the mesh: {unmoved:.0%} of the opaque ones are within "
-        f"0.1 m of it, and {found:.0%} after a shift by ({', '.join(f'{s:+.1f}' for s in best)}) m: "
-        "add it to the translation of --splat-transform"
+        f"splats lie {length_m:.1f} m beside the mesh: {unmoved:.0%} of the opaque ones are "
+        f"within 0.1 m of it, and {found:.0%} after a shift by "
+        f"({', '.join(f'{one:+.1f}' for one in best)}) m: add it to the translation of "
+        "--splat-transform"
     )
 
 
@@ -379,29 +381,46 @@ def fitting_frame(
     return advice
 
 
-def check_rotations(splats: Splats, distance: MeshDistance) -> list[Finding]:
-    """Check that flat splats lie along the mesh's surfaces, as in the right quaternion order."""
-    sample = opaque_sample(splats, 3000)
-    xx, xy, xz, yy, yz, zz = sample.covariances.astype(np.float64).T
-    matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-    values, vectors = np.linalg.eigh(matrices)
-    gaps, owners = distance.to_mesh(sample.centres)
-    flat = (values[:, 0] < 0.1 * values[:, 1]) & (gaps < 0.2)
-    if np.count_nonzero(flat) < 200:
+def check_rotations(
+    raw: RawSplats, matrix: Matrix, order: QuaternionOrder, distance: MeshDistance
+) -> list[Finding]:
+    """Check the order of quaternions: flat splats lie along the mesh's surface in the right one.
+
+    matrix: from the file's frame to the net's.
+    """
+    opaque = np.flatnonzero(raw.rgba[:, 3] >= _OPAQUE)
+    rows = opaque[:: max(1, len(opaque) // 6000)]
+    scales = np.sort(raw.scales[rows], axis=1)
+    rows = rows[scales[:, 0] < 0.3 * scales[:, 1]]
+    gaps, owners = distance.to_mesh(move(raw.centres[rows], matrix))
+    near = gaps < 0.2
+    if np.count_nonzero(near) < 200:
         return []
-    cosines = np.abs((vectors[flat, :, 0] * distance.normals[owners[flat]]).sum(axis=1))
-    share = float((cosines > 0.8).mean())
-    words = f"{share:.0%} of the flat splats lie along the mesh's surface"
-    if share >= 0.35:
+    rows, normals = rows[near], distance.normals[owners[near]]
+    other: QuaternionOrder = "xyzw" if order == "wxyz" else "wxyz"
+    columns = [3, 0, 1, 2] if order == "wxyz" else [1, 2, 3, 0]
+    shares = [
+        _along(
+            RawSplats(raw.centres[rows], raw.scales[rows], quaternions, raw.rgba[rows]),
+            matrix,
+            normals,
+        )
+        for quaternions in (raw.quaternions[rows], raw.quaternions[rows][:, columns])
+    ]
+    words = f"{shares[0]:.0%} of the flat splats lie along the mesh's surface"
+    if shares[1] < 1.15 * shares[0] + 0.02:
         return [note(words)]
     return [
         warning(
-            f"{words}; at random it would be 20 %: their rotations may be stored x, y, z, w: try "
-            "--quaternions xyzw"
+            f"{words}, and {shares[1]:.0%} with rotations stored as {other}: try --quaternions "
+            f"{other}"
         )
     ]
 
 
-def check_unit(matrix: Matrix, words: str) -> list[Finding]:
-    """Return a note with the metres per unit of a frame."""
-    return [note(f"{words}: {scale_of(matrix):.6g} m per unit")]
+def _along(raw: RawSplats, matrix: Matrix, normals: Floats) -> float:
+    """Return the share of splats whose shortest axis is along a normal."""
+    xx, xy, xz, yy, yz, zz = move_splats(raw, matrix).covariances.astype(np.float64).T
+    matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+    _, vectors = np.linalg.eigh(matrices)
+    return float((np.abs((vectors[:, :, 0] * normals).sum(axis=1)) > 0.8).mean())
