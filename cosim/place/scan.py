@@ -111,7 +111,8 @@ class ScanFacts(msgspec.Struct, frozen=True, kw_only=True):
     exposure_ev: stops by which people and objects are drawn brighter, to match the scan.
     findings: results of the checks, a sentence each.
     versions: of the importer and of libraries that affect the result.
-    mesh_hash, splats_hash, areas_hash: content hashes; splats_hash is "" without splats.
+    mesh_hash, splats_hash, heights_hash, areas_hash: content hashes; splats_hash is "" without
+        splats.
     """
 
     name: str
@@ -128,6 +129,7 @@ class ScanFacts(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str] = {}
     mesh_hash: str = ""
     splats_hash: str = ""
+    heights_hash: str = ""
     areas_hash: str = ""
 
 
@@ -208,6 +210,9 @@ def write_scan(scan: Scan, map_folder: Path) -> ScanFacts:
         scan.facts,
         mesh_hash=_hash_of(scan.mesh, ScanMesh.__slots__),
         splats_hash="" if scan.splats is None else _hash_of(scan.splats, Splats.__slots__),
+        heights_hash=hashlib.sha256(
+            words + _hash_of(grid, HeightGrid.__slots__[2:]).encode()
+        ).hexdigest()[:16],
         areas_hash=hashlib.sha256(areas).hexdigest()[:16],
     )
     (folder / _FACTS).write_bytes(msgspec.json.format(msgspec.json.encode(facts), indent=2))

@@ -174,11 +174,13 @@ class StreetMap:
     """A place. Ids are SUMO edge, lane or junction ids; mappings are in the net's order.
 
     bounds: x0, y0, x1, y1 in metres.
-    net_hash: content hash of the net and of its features, if any.
+    net_hash: content hash of the net, of its features, and of its scan, if any.
     features: mapped objects off the walkable area.
     terrain: None if the place is flat.
     elevation: how the net's elevations were processed, None without any.
     planned: whether it is a generated city, whose net names the class of each street.
+    scanned: whether its ground and surroundings are a scan, whose edge is a dead end of the walks.
+    uncrowded: strips that are too narrow for the crowd; robots may use them.
     """
 
     name: str
@@ -193,6 +195,8 @@ class StreetMap:
     terrain: Terrain | None = None
     elevation: Elevation | None = None
     planned: bool = False
+    scanned: bool = False
+    uncrowded: tuple[str, ...] = ()
     _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )

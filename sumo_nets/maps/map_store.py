@@ -23,6 +23,7 @@ from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap, Place
 from sumo_nets.maps.feature_file import FEATURES_FILE, read_features, with_features, write_features
+from sumo_nets.maps.ground_file import GROUND_FILE, with_drawn_ground, with_scan
 from sumo_nets.maps.import_rules import IMPORTER_VERSION, WHEEL_PLACES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
 from sumo_nets.net.net_facts import read_facts
@@ -161,19 +162,21 @@ def _is_outdated(folder: Path) -> bool:
 
 
 def read_map(place: CityMap | str) -> StreetMap:
-    """Return the StreetMap of a map, under the map's name, with its features."""
+    """Return the StreetMap of a map, under the map's name, with its features and drawn ground."""
     name = place if isinstance(place, str) else place.map
     path = map_net(place)
-    street_map = street_map_of(path)
+    street_map = with_drawn_ground(street_map_of(path), path.with_name(GROUND_FILE))
     features = read_features(path.with_name(FEATURES_FILE))
-    known_as = with_features(street_map.net_hash, path.with_name(FEATURES_FILE))
+    known_as = with_scan(
+        with_features(street_map.net_hash, path.with_name(FEATURES_FILE)), path.parent
+    )
     whole = dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
     return whole.with_source_hash(f"{street_map.made_of}-{known_as}")
 
 
 def map_hash(net: Path) -> str:
-    """Return the content hash of a map, of its net and the features next to it."""
-    return with_features(net_content_hash(net), net.with_name(FEATURES_FILE))
+    """Return the content hash of a map, of its net and the features and scan next to it."""
+    return with_scan(with_features(net_content_hash(net), net.with_name(FEATURES_FILE)), net.parent)
 
 
 def file_hash(path: Path) -> str:

@@ -1,0 +1,362 @@
+"""Build the walking net of a scan from its areas.
+
+The medial axis of the walkable ground becomes edges for pedestrians, each as wide as its narrowest
+place. SUMO walks there, inside of the drawn ground. Drawn roads carry cars; drawn crossings lead
+over them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString, MultiPolygon, Polygon
+
+from cosim.core.errors import MapError
+from cosim.core.geometry import Floats, Polyline
+from cosim.core.progress import Progress, ignore
+from cosim.place import overlay
+from cosim.place.medial_axis import Axis, between, medial_axis
+from cosim.place.scan import Georeference, HeightGrid, ScanArea
+from cosim.place.scan_areas import WALKED, walkable_ground
+from cosim.place.street_map import StreetMap
+from cosim.place.walk_graph import WalkGraph
+from sumo_nets.maps.driving_side import left_hand_country
+from sumo_nets.maps.ground_file import GROUND_FILE, drawn_ground, write_ground
+from sumo_nets.maps.net_steps import start_net
+from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.net_file import read_net
+
+CROWD_M: Final = 1.2
+"""Clear width below which the crowd does not walk, in metres."""
+INNER_M: Final = 0.2
+"""Width by which lanes are narrower than the clear width, in metres."""
+_LEAST_LANE_M: Final = 0.4
+_TWO_WAY_M: Final = 5.0
+"""Clear width from which a road has a lane in each direction, in metres."""
+_LANE_MPS: Final = 8.33
+_WALK_MPS: Final = 1.4
+_JOIN_M: Final = 20.0
+"""Largest distance from a crossing to the axis of a sidewalk, in metres."""
+_NEAR_END_M: Final = 3.0
+"""Distance from the end of a piece up to which a crossing joins its node, in metres."""
+_ROAD_END_M: Final = 6.0
+"""Least distance of a crossing from the end of a road, in metres."""
+_ON_ROAD_M2: Final = 0.5
+_KERB_M: Final = 0.6
+"""Length of the corner between a crossing and its sidewalk, in metres."""
+_OPTIONS: Final = (
+    "--walkingareas",
+    "--no-turnarounds.except-deadend",
+    "--offset.disable-normalization",
+    "--default.junctions.radius=0.5",
+)
+
+
+@dataclass(slots=True)
+class _Edge:
+    """Edge of the net. lane_m: width; drive: whether it is a road."""
+
+    start: int
+    end: int
+    line: Floats
+    lane_m: float
+    drive: bool = False
+
+
+class _Zebra(NamedTuple):
+    """Crossing at a node. line: from curb to curb; outline: of the node."""
+
+    node: int
+    line: Floats
+    width_m: float
+    outline: Floats
+
+
+@dataclass(slots=True)
+class _Plan:
+    nodes: list[Floats] = field(default_factory=list)
+    edges: list[_Edge] = field(default_factory=list)
+    zebras: list[_Zebra] = field(default_factory=list)
+
+    def node(self, xy: Floats) -> int:
+        self.nodes.append(np.asarray(xy, dtype=float))
+        return len(self.nodes) - 1
+
+
+class ScanNet(NamedTuple):
+    """Built net. findings: a sentence each; inner_iou: of SUMO's lanes and the drawn ground."""
+
+    path: Path
+    findings: tuple[str, ...]
+    inner_iou: float
+
+
+def build_scan_net(
+    areas: Sequence[ScanArea],
+    heights: HeightGrid,
+    georeference: Georeference | None,
+    folder: Path,
+    progress: Progress = ignore,
+) -> ScanNet:
+    """Build `net.xml` and the shares of the drawn ground in `folder`, and start SUMO on the net.
+
+    georeference: decides on which side people drive; on the right without it.
+
+    Raises MapError if nothing is walkable or netconvert or SUMO refuses the net.
+    """
+    progress("finding the walkable ground")
+    ground = walkable_ground(areas, heights)
+    progress("finding the axis of the walkable ground")
+    plan = _plan(areas, ground)
+    progress("building the net")
+    path = _converted(plan, georeference, folder)
+    street_map = read_net(path)
+    findings = _checked(plan, street_map)
+    progress("starting SUMO on the net")
+    start_net(path, str(path))
+    names = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
+    narrow = [name for name, edge in names.items() if edge.lane_m < CROWD_M - INNER_M - 1e-9]
+    write_ground(drawn_ground(street_map, ground, tuple(narrow)), folder / GROUND_FILE)
+    if narrow:
+        at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
+        findings.append(
+            f"{len(narrow)} of {len(names)} pieces of the walking net are narrower than "
+            f"{CROWD_M:g} m, one of them at ({at[0]:.1f}, {at[1]:.1f}): robots may use them, the "
+            "crowd does not"
+        )
+    inner = overlay.union_all(
+        [strip.polygon for strip in street_map.strips.values()]
+        + [corner.polygon for corner in street_map.corners.values()]
+    )
+    both = shapely.intersection(inner, ground).area
+    iou = both / (inner.area + ground.area - both)
+    findings.append(
+        f"{ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by {iou:.0%} "
+        f"(intersection over union), {1.0 - both / inner.area:.1%} of the lanes are outside"
+    )
+    return ScanNet(path, tuple(findings), float(iou))
+
+
+def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
+    roads = overlay.union_all([area.polygon for area in areas if area.kind == "road"])
+    walks = overlay.union_all([a.polygon for a in areas if a.kind in WALKED - {"crossing"}])
+    over = [
+        area.polygon
+        for area in areas
+        if area.kind == "crossing"
+        and shapely.intersection(area.polygon, roads).area > _ON_ROAD_M2
+    ]
+    off_road = overlay.difference(
+        ground, overlay.union_all([overlay.difference(one, walks) for one in over])
+    )
+    axis = medial_axis(off_road)
+    if not axis.pieces:
+        raise MapError("the walkable ground is nowhere wide enough to walk: draw wider areas")
+    plan = _Plan(list(axis.nodes))
+    for piece in axis.pieces:
+        lane_m = max(piece.clear_m - INNER_M, _LEAST_LANE_M)
+        plan.edges.append(_Edge(piece.start, piece.end, piece.line, lane_m))
+    if not roads.is_empty:
+        _add_roads(plan, medial_axis(roads, whole=True))
+    for crossing in over:
+        _add_crossing(plan, crossing, roads)
+    return plan
+
+
+def _add_roads(plan: _Plan, axis: Axis) -> None:
+    first = len(plan.nodes)
+    plan.nodes += list(axis.nodes)
+    for piece in axis.pieces:
+        ends = (first + piece.start, first + piece.end)
+        plan.edges.append(_Edge(*ends, piece.line, piece.clear_m - INNER_M, drive=True))
+
+
+def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> None:
+    """Add a crossing, with links to the sidewalks on both sides.
+
+    Raises MapError if it joins no road or no sidewalk.
+    """
+    where = f"the crossing near ({crossing.centroid.x:.1f}, {crossing.centroid.y:.1f})"
+    road, _ = _nearest(plan, crossing.centroid, drive=True)
+    if road is None:
+        raise MapError(f"{where} leads over a road that is too narrow for cars: widen the road")
+    on_road = shapely.intersection(crossing, roads)
+    middle, along, width_m = _direction(on_road, road)
+    half = crossing.length * along
+    kerbs = shapely.get_coordinates(
+        shapely.intersection(LineString([middle - half, middle + half]), roads)
+    )
+    reach = (kerbs - middle) @ along
+    low, high = float(reach[reach < 0].max(initial=-1e9)), float(reach[reach > 0].min(initial=1e9))
+    if not (-_JOIN_M < low < 0.0 < high < _JOIN_M):
+        raise MapError(f"{where} does not lead from one side of its road to the other: redraw it")
+    node = _split(plan, road, middle, _ROAD_END_M, where)
+    ends = np.array([middle + low * along, middle + high * along])
+    aside = np.array([-along[1], along[0]]) * (0.5 * width_m + 0.1)
+    out = _KERB_M * along
+    outline = np.array(
+        [ends[0] - out - aside, ends[1] + out - aside, ends[1] + out + aside, ends[0] - out + aside]
+    )
+    plan.zebras.append(_Zebra(node, ends, width_m, outline))
+    for end, outward in ((ends[0], -along), (ends[1], along)):
+        meets = _joint(plan, end, outward)
+        if meets is None:
+            raise MapError(f"{where} joins no sidewalk at one end: draw one there")
+        piece, at = meets
+        joint = _split(plan, piece, at, _NEAR_END_M, where)
+        line = np.vstack([plan.nodes[joint], middle])
+        plan.edges.append(_Edge(joint, node, line, max(width_m - INNER_M, _LEAST_LANE_M)))
+
+
+def _direction(on_road: shapely.Geometry, road: _Edge) -> tuple[Floats, Floats, float]:
+    """Return the middle of a crossing, its direction across the road, and its width in metres."""
+    box = shapely.minimum_rotated_rectangle(on_road)
+    corners = shapely.get_coordinates(box)[:4]
+    middle = corners.mean(axis=0)
+    sides = [corners[1] - corners[0], corners[2] - corners[1]]
+    line = Polyline(road.line)
+    pose = line.at(line.project(*middle.tolist())[0])
+    across = np.array([-math.sin(pose.heading_rad), math.cos(pose.heading_rad)])
+    lengths = [float(np.hypot(*side)) for side in sides]
+    units = [side / length for side, length in zip(sides, lengths, strict=True)]
+    k = int(np.argmax([abs(float(unit @ across)) for unit in units]))
+    along = units[k] * (1.0 if float(units[k] @ across) > 0.0 else -1.0)
+    return middle, along, lengths[1 - k]
+
+
+def _nearest(plan: _Plan, point: shapely.Point, *, drive: bool) -> tuple[_Edge | None, float]:
+    """Return the nearest road or walk, and its distance in metres."""
+    found = [
+        (float(LineString(edge.line).distance(point)), i)
+        for i, edge in enumerate(plan.edges)
+        if edge.drive == drive
+    ]
+    if not found:
+        return None, math.inf
+    gap_m, i = min(found)
+    return plan.edges[i], gap_m
+
+
+def _joint(plan: _Plan, end: Floats, outward: Floats) -> tuple[_Edge, Floats] | None:
+    """Return the walk that a crossing joins straight on, else the nearest one, and the place."""
+    ray = LineString([end, end + _JOIN_M * outward])
+    hits = []
+    for i, edge in enumerate(plan.edges):
+        if not edge.drive:
+            for xy in shapely.get_coordinates(shapely.intersection(ray, LineString(edge.line))):
+                hits.append((float(np.hypot(*(xy - end))), i, xy))
+    if hits:
+        _, i, xy = min(hits, key=lambda hit: hit[:2])
+        return plan.edges[i], xy
+    edge, gap_m = _nearest(plan, shapely.Point(end + outward), drive=False)
+    if edge is None or gap_m > _JOIN_M:
+        return None
+    line = Polyline(edge.line)
+    return edge, line.at(line.project(*(end + outward).tolist())[0]).xy
+
+
+def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float, where: str) -> int:
+    """Return the node of an edge at a place: one of its ends if near, else a new one."""
+    line = Polyline(edge.line)
+    s_m = line.project(*np.asarray(at).tolist())[0]
+    if edge.drive and line.length_m < 2.0 * near_m:
+        raise MapError(f"{where}: its road is shorter than {2.0 * near_m:g} m: draw it longer")
+    if edge.drive:
+        s_m = min(max(s_m, near_m), line.length_m - near_m)
+    elif s_m < near_m or s_m > line.length_m - near_m:
+        return edge.start if s_m < 0.5 * line.length_m else edge.end
+    node = plan.node(line.at(s_m).xy)
+    rest = _Edge(
+        node, edge.end, between(edge.line, s_m, line.length_m), edge.lane_m, edge.drive
+    )
+    edge.end, edge.line = node, between(edge.line, 0.0, s_m)
+    plan.edges.append(rest)
+    return node
+
+
+def _converted(plan: _Plan, georeference: Georeference | None, folder: Path) -> Path:
+    """Write the plan as plain XML and build the net."""
+    outlines = {zebra.node: zebra.outline for zebra in plan.zebras}
+    nodes = [
+        f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"'
+        + (f' shape="{_shape(outlines[i])}"' if i in outlines else "")
+        + "/>"
+        for i, xy in enumerate(plan.nodes)
+    ]
+    edges = [row for i, edge in enumerate(plan.edges) for row in _rows(i, edge)]
+    zebras = []
+    for zebra in plan.zebras:
+        arm = next(i for i, e in enumerate(plan.edges) if e.drive and zebra.node in (e.start, e.end))
+        both = [f"r{arm}"] + ([f"-r{arm}"] if _two_way(plan.edges[arm]) else [])
+        zebras.append(
+            f'<crossing node="n{zebra.node}" edges="{" ".join(both)}" '
+            f'width="{zebra.width_m - INNER_M:.2f}" priority="true" shape="{_shape(zebra.line)}"/>'
+        )
+    files = {"nodes": nodes, "edges": edges, "connections": zebras}
+    paths = {}
+    for tag, rows in files.items():
+        paths[tag] = folder / f"plain.{tag}.xml"
+        paths[tag].write_text(f"<{tag}>\n" + "\n".join(rows) + f"\n</{tag}>\n")
+    left = georeference is not None and left_hand_country(
+        georeference.longitude_deg, georeference.latitude_deg
+    )
+    arguments = ["-n", str(paths["nodes"]), "-e", str(paths["edges"]), "-x"]
+    arguments += [str(paths["connections"]), *_OPTIONS, *(["--lefthand"] if left else [])]
+    try:
+        return netconvert(arguments, folder / "net.xml")
+    finally:
+        for plain in paths.values():
+            plain.unlink()
+
+
+def _two_way(edge: _Edge) -> bool:
+    return edge.lane_m + INNER_M >= _TWO_WAY_M
+
+
+def _rows(number: int, edge: _Edge) -> list[str]:
+    """Return the XML of an edge: a walk, or a road with a lane in one or both directions."""
+    if not edge.drive:
+        return [_row(f"w{number}", edge.start, edge.end, edge.line, edge.lane_m, "pedestrian")]
+    if not _two_way(edge):
+        return [_row(f"r{number}", edge.start, edge.end, edge.line, edge.lane_m, "passenger")]
+    half_m = 0.5 * edge.lane_m
+    return [
+        _row(f"r{number}", edge.start, edge.end, edge.line, half_m, "passenger", "right"),
+        _row(f"-r{number}", edge.end, edge.start, edge.line[::-1], half_m, "passenger", "right"),
+    ]
+
+
+def _row(
+    name: str, start: int, end: int, line: Floats, lane_m: float, allowed: str, spread: str = "center"
+) -> str:
+    speed_mps = _WALK_MPS if allowed == "pedestrian" else _LANE_MPS
+    return (
+        f'<edge id={quoteattr(name)} from="n{start}" to="n{end}" numLanes="1" type="scan" '
+        f'speed="{speed_mps}" width="{lane_m:.2f}" allow="{allowed}" spreadType="{spread}" '
+        f'shape="{_shape(line)}"/>'
+    )
+
+
+def _shape(line: Floats) -> str:
+    return " ".join(f"{x:.3f},{y:.3f}" for x, y in line.tolist())
+
+
+def _checked(plan: _Plan, street_map: StreetMap) -> list[str]:
+    """Return findings on a built net. Raises MapError if it lacks pieces or connections."""
+    wanted = [f"w{i}" for i, edge in enumerate(plan.edges) if not edge.drive]
+    if missing := [name for name in wanted if name not in street_map.strips]:
+        raise MapError(f"netconvert left out {len(missing)} walks of {len(wanted)}: {missing[0]}")
+    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing"]
+    if len(crossings) != len(plan.zebras):
+        raise MapError(f"netconvert made {len(crossings)} of {len(plan.zebras)} crossings")
+    parts = len(set(WalkGraph(street_map).component.tolist()))
+    if parts == 1:
+        return []
+    return [f"the walkable ground is in {parts} separate parts: scenarios use the largest"]
