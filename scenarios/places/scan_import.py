@@ -174,9 +174,9 @@ def _holes(heights: HeightGrid) -> list[Finding]:
     rows, columns = heights.heights.shape
     return [
         note(
-            f"ground: {heights.measured.mean():.0%} of {columns} x {rows} points, {heights.step_m:g}"
-            f" m apart, are measured; {holes.count} holes of together {holes.area_m2:.0f} m2 are "
-            "interpolated"
+            f"ground: {heights.measured.mean():.0%} of {columns} x {rows} points, "
+            f"{heights.step_m:g} m apart, are measured; {holes.count} holes of together "
+            f"{holes.area_m2:.0f} m2 are interpolated"
         )
     ]
 
