@@ -49,14 +49,15 @@ _NEAR_END_M: Final = 3.0
 _ROAD_END_M: Final = 6.0
 """Least distance of a crossing from the end of a road, in metres."""
 _ON_ROAD_M2: Final = 0.5
-_KERB_M: Final = 0.6
-"""Length of the corner between a crossing and its sidewalk, in metres."""
+_KERB_M: Final = 0.3
+"""Distance before the curb from which the link to a crossing runs straight, in metres."""
 _OPTIONS: Final = (
     "--walkingareas",
     "--no-turnarounds.except-deadend",
     "--offset.disable-normalization",
-    "--default.junctions.radius=0.5",
 )
+_RADII_M: Final = (0.5, 1.5, 3.0)
+"""Radii of junctions, in metres, of which the first is taken that keeps all crossings."""
 
 
 @dataclass(slots=True)
@@ -116,8 +117,12 @@ def build_scan_net(
     progress("finding the axis of the walkable ground")
     plan = _plan(areas, ground)
     progress("building the net")
-    path = _converted(plan, georeference, folder)
-    street_map = read_net(path)
+    for radius_m in _RADII_M:
+        path = _converted(plan, georeference, folder, radius_m)
+        street_map = read_net(path)
+        crossings = sum(strip.kind == "crossing" for strip in street_map.strips.values())
+        if crossings == len(plan.zebras):
+            break
     findings = _checked(plan, street_map)
     progress("starting SUMO on the net")
     start_net(path, str(path))
@@ -200,10 +205,7 @@ def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> No
     node = _split(plan, road, middle, _ROAD_END_M, where)
     ends = np.array([middle + low * along, middle + high * along])
     aside = np.array([-along[1], along[0]]) * (0.5 * width_m + 0.1)
-    out = _KERB_M * along
-    outline = np.array(
-        [ends[0] - out - aside, ends[1] + out - aside, ends[1] + out + aside, ends[0] - out + aside]
-    )
+    outline = np.array([ends[0] - aside, ends[1] - aside, ends[1] + aside, ends[0] + aside])
     plan.zebras.append(_Zebra(node, ends, width_m, outline))
     for end, outward in ((ends[0], -along), (ends[1], along)):
         meets = _joint(plan, end, outward)
@@ -211,7 +213,7 @@ def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> No
             raise MapError(f"{where} joins no sidewalk at one end: draw one there")
         piece, at = meets
         joint = _split(plan, piece, at, _NEAR_END_M, where)
-        line = np.vstack([plan.nodes[joint], middle])
+        line = np.vstack([plan.nodes[joint], end + _KERB_M * outward, middle])
         plan.edges.append(_Edge(joint, node, line, max(width_m - INNER_M, _LEAST_LANE_M)))
 
 
@@ -281,8 +283,13 @@ def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float, where: str) -> i
     return node
 
 
-def _converted(plan: _Plan, georeference: Georeference | None, folder: Path) -> Path:
+def _converted(
+    plan: _Plan, georeference: Georeference | None, folder: Path, radius_m: float
+) -> Path:
     """Write the plan as plain XML and build the net."""
+    left = georeference is not None and bool(
+        left_hand_country(georeference.longitude_deg, georeference.latitude_deg)
+    )
     outlines = {zebra.node: zebra.outline for zebra in plan.zebras}
     nodes = [
         f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"'
@@ -297,23 +304,34 @@ def _converted(plan: _Plan, georeference: Georeference | None, folder: Path) -> 
         both = [f"r{arm}"] + ([f"-r{arm}"] if _two_way(plan.edges[arm]) else [])
         zebras.append(
             f'<crossing node="n{zebra.node}" edges="{" ".join(both)}" '
-            f'width="{zebra.width_m - INNER_M:.2f}" priority="true" shape="{_shape(zebra.line)}"/>'
+            f'width="{zebra.width_m - INNER_M:.2f}" priority="true" '
+            f'shape="{_shape(_clockwise(zebra, plan.edges[arm], left))}"/>'
         )
     files = {"nodes": nodes, "edges": edges, "connections": zebras}
     paths = {}
     for tag, rows in files.items():
         paths[tag] = folder / f"plain.{tag}.xml"
         paths[tag].write_text(f"<{tag}>\n" + "\n".join(rows) + f"\n</{tag}>\n")
-    left = georeference is not None and left_hand_country(
-        georeference.longitude_deg, georeference.latitude_deg
-    )
     arguments = ["-n", str(paths["nodes"]), "-e", str(paths["edges"]), "-x"]
     arguments += [str(paths["connections"]), *_OPTIONS, *(["--lefthand"] if left else [])]
+    arguments.append(f"--default.junctions.radius={radius_m}")
     try:
         return netconvert(arguments, folder / "net.xml")
     finally:
         for plain in paths.values():
             plain.unlink()
+
+
+def _clockwise(zebra: _Zebra, road: _Edge, left: bool) -> Floats:
+    """Return a crossing's line as netconvert expects it: from the right of a road that leaves its
+    node, or from the left where people drive there."""
+    line = Polyline(road.line)
+    away_m = min(3.0, line.length_m)
+    at = line.at(away_m) if road.start == zebra.node else line.at(line.length_m - away_m)
+    out = at.xy - zebra.line.mean(axis=0)
+    right = np.array([out[1], -out[0]])
+    from_right = float((zebra.line[0] - zebra.line[1]) @ right) > 0.0
+    return zebra.line if from_right != left else zebra.line[::-1]
 
 
 def _two_way(edge: _Edge) -> bool:
