@@ -217,7 +217,8 @@ def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> No
         raise MapError(f"{where} does not lead from one side of its road to the other: redraw it")
     node = _split(plan, road, middle, _ROAD_END_M, where)
     ends = np.array([middle + low * along, middle + high * along])
-    plan.zebras.append(_Zebra(node, ends, _inner(width_m)))
+    lane_m = _inner(width_m - INNER_M)
+    plan.zebras.append(_Zebra(node, ends, lane_m))
     for end, outward in ((ends[0], -along), (ends[1], along)):
         meets = _joint(plan, end, outward)
         if meets is None:
@@ -225,7 +226,7 @@ def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> No
         piece, at = meets
         joint = _split(plan, piece, at, _NEAR_END_M, where)
         line = np.vstack([plan.nodes[joint], end + _KERB_M * outward, middle])
-        plan.edges.append(_Edge(joint, node, line, width_m, _inner(width_m)))
+        plan.edges.append(_Edge(joint, node, line, width_m, lane_m))
 
 
 def _direction(on_road: shapely.Geometry, road: _Edge) -> tuple[Floats, Floats, float]:
