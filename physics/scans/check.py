@@ -164,8 +164,8 @@ def _winding(ground: Ground) -> list[Finding]:
         return [
             refusal(
                 f"mirrored: the fronts of {down:.0%} of the ground's triangles face down: axes "
-                "are mirrored, or triangles are wound clockwise: use --mirror x if writing on walls "
-                "reads backwards in a viewer, else --flip"
+                "are mirrored, or triangles are wound clockwise: use --mirror x if writing on "
+                "walls reads backwards in a viewer, else --flip"
             )
         ]
     if down > 0.6:

@@ -20,7 +20,14 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, Splats, write_scan
-from cosim.place.scan_areas import corridor, draft_areas, read_areas, read_way
+from cosim.place.scan_areas import (
+    corridor,
+    cut_to_scan,
+    draft_areas,
+    fit_to_ground,
+    read_areas,
+    read_way,
+)
 from physics.scans.check import (
     check_alignment,
     check_areas,
@@ -36,7 +43,7 @@ from physics.scans.ground import closed_holes, height_grid, slope
 from physics.scans.labels import label_mesh
 from physics.scans.mesh_distance import MeshDistance
 from scenarios.places.scan_options import ScanOptions
-from scenarios.places.scan_sources import LoadedScan, load_scan, splat_hint
+from scenarios.places.scan_sources import LoadedScan, load_mesh, load_splats, splat_hint
 from sumo_nets.maps.import_rules import IMPORTER_VERSION
 from sumo_nets.maps.map_store import About, licence_texts, map_name, store_map
 
@@ -92,13 +99,15 @@ def check_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) 
 
     Raises MapError for files that cannot be read. Later refusals are findings.
     """
-    loaded = load_scan(folder, options, progress)
+    loaded, splat_files = load_mesh(folder, options, progress)
     findings = loaded.findings
     progress("checking axes and scale")
     findings += check_scale(loaded.mesh)
     findings += check_up(loaded.mesh, loaded.up)
     if any(one.level == "refused" for one in findings):
         return CheckedScan(None, tuple(findings))
+    if splat_files:
+        load_splats(loaded, splat_files, options, progress)
     progress("measuring the ground")
     heights = height_grid(loaded.mesh, None, _step_m(loaded))
     findings += _holes(heights)
@@ -146,14 +155,14 @@ def _mapped(
     path: Path, heights: HeightGrid, loaded: LoadedScan, progress: Progress
 ) -> tuple[tuple[ScanArea, ...], list[Finding]]:
     """Return the areas of a map, moved to fit the ground."""
-    from cosim.place.scan_areas import cut_to_scan, fit_to_ground
     from sumo_nets.maps.scan_osm import osm_areas
 
     if loaded.georeference is None:
         raise MapError(
             f"{path}: a map needs to know where the scan is: give --georeference LATITUDE,LONGITUDE"
         )
-    mapped, licences = osm_areas(path, loaded.georeference, progress)
+    reach = np.abs(loaded.mesh.vertices[:, :2]).max()
+    mapped, licences = osm_areas(path, loaded.georeference, float(reach), progress)
     moved, fit = fit_to_ground(mapped, heights)
     areas = cut_to_scan(moved, heights)
     words = f"areas: {len(areas)} from {path.name}, {fit}"

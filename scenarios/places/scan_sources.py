@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 from cosim.core.errors import MapError
 from cosim.core.progress import Progress, ignore
 from cosim.place.scan import Georeference, ScanMesh, Splats
-from physics.scans.check import ground_plane, guess_up
+from physics.scans.check import fitting_frame, ground_plane, guess_up
 from physics.scans.clean import largest_m
 from physics.scans.findings import Finding, note, warning
-from physics.scans.frame import UP_AXES, Matrix, combine, file_matrix, move, move_splats, place
+from physics.scans.frame import (
+    UP_AXES,
+    Matrix,
+    combine,
+    file_matrix,
+    move,
+    move_splats,
+    place,
+    scale_of,
+)
 from physics.scans.mesh_distance import MeshDistance
 from physics.scans.ordering import order_mesh, order_splats, take_splats
 from physics.scans.read_mesh import MOST_TRIANGLES, RawMesh, read_mesh
@@ -26,6 +35,7 @@ from scenarios.places.scan_options import ScanOptions, read_transform
 
 BUDGET: Final = 4_000_000
 """Number of splats above which a scan is refused: 3 million are drawn at 60 frames/s on a GPU."""
+_RAW_ARRAYS: Final = ("centres", "scales", "quaternions", "rgba")
 _ENDINGS: Final = (".glb", ".ply", ".obj", ".spz", ".splat")
 
 
@@ -62,14 +72,17 @@ class _Found:
     files: dict[str, str] = field(default_factory=dict)
 
 
-def load_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) -> LoadedScan:
-    """Return the scan of a folder. Raises MapError with a finding and a remedy."""
+def load_mesh(
+    folder: Path, options: ScanOptions, progress: Progress = ignore
+) -> tuple[LoadedScan, dict[Path, bytes]]:
+    """Return the scan of a folder without its splats, and the contents of their files.
+
+    Raises MapError with a finding and a remedy.
+    """
     found = _found(folder, options, progress)
     loaded = _load_mesh(found, options, progress)
     loaded.files, loaded.findings = found.files, found.findings + loaded.findings
-    if found.splats:
-        _load_splats(loaded, found.splats, options, progress)
-    return loaded
+    return loaded, found.splats
 
 
 def _found(folder: Path, options: ScanOptions, progress: Progress) -> _Found:
@@ -119,7 +132,7 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
         if transform is None and (scale is None or up is None):
             _refuse_unstated(path, data, scale, up)
         matrix = _mirrored(file_matrix(scale or 1.0, up or "+z", transform), options.mirror)
-        unit_m = scale or 1.0 if transform is None else _size(matrix)
+        unit_m = scale or 1.0 if transform is None else scale_of(matrix)
         raw = read_mesh(path, data, unit_m, options.colours)
         meshes.append((matrix, "" if transform else str(up), raw))
     parts = [move(raw.vertices, matrix) for matrix, _, raw in meshes]
@@ -155,7 +168,7 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
         combine(placing, matrix),
         up,
         georeference,
-        _size(matrix),
+        scale_of(matrix),
         placing=placing,
         findings=findings,
     )
@@ -182,10 +195,10 @@ def _refuse_unstated(path: Path, data: bytes, scale: float | None, up: str | Non
     )
 
 
-def _load_splats(
+def load_splats(
     loaded: LoadedScan, files: dict[Path, bytes], options: ScanOptions, progress: Progress
 ) -> None:
-    """Read all splats, in their frame, into a loaded scan."""
+    """Read all splats into a loaded scan. Raises MapError with a finding and a remedy."""
     raws = []
     for path, data in files.items():
         progress(f"reading the splats {path.name}")
@@ -212,9 +225,6 @@ def _load_splats(
         )
         splats = _reduced(splats, options.most_splats)
     loaded.splats = splats
-
-
-_RAW_ARRAYS: Final = ("centres", "scales", "quaternions", "rgba")
 
 
 def _splat_matrix(loaded: LoadedScan, names: str, raw: RawSplats, options: ScanOptions) -> Matrix:
@@ -246,8 +256,6 @@ def _splat_matrix(loaded: LoadedScan, names: str, raw: RawSplats, options: ScanO
 
 def splat_hint(loaded: LoadedScan, raw: RawSplats, scale: float | None) -> str:
     """Return advice with the up axis, and if need be a mirrored one, that fits the mesh."""
-    from physics.scans.check import fitting_frame
-
     frames = {}
     for mirror in (None, "x", "y", "z"):
         for up in UP_AXES:
@@ -272,9 +280,3 @@ def _mirrored(matrix: Matrix, axis: str | None) -> Matrix:
         return matrix
     signs = [-1.0 if axis == one else 1.0 for one in "xyz"] + [1.0]
     return tuple(tuple(a * sign for a, sign in zip(row, signs, strict=True)) for row in matrix)
-
-
-def _size(matrix: Matrix) -> float:
-    from physics.scans.frame import scale_of
-
-    return scale_of(matrix)
