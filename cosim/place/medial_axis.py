@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -29,8 +29,8 @@ SHORTEST_M: Final = 4.0
 """Shortest piece that a change of width cuts off, in metres."""
 _SPACING_M: Final = 0.25
 """Distance of points on the outline, in metres."""
-_ISLAND_M2: Final = 4.0
-"""Area in m2 below which an obstacle does not split the axis: it passes on the wider side."""
+_ISLAND_GAP_M: Final = 1.2
+"""Gap beside an obstacle below which the axis passes only on the other side, in metres."""
 _STEP_M: Final = 0.5
 _NARROW_M: Final = 1.0
 """Clearance below which the axis stays in the middle, in metres."""
@@ -87,7 +87,7 @@ def medial_axis(ground: Polygon | MultiPolygon, *, whole: bool = False) -> Axis:
     pieces: list[Piece] = []
     boundary = ground.boundary
     shapely.prepare(boundary)
-    for part in shapely.get_parts(_opened(ground)):
+    for part in shapely.get_parts(shapely.simplify(opened(ground, OPENED_M), 0.05)):
         for line, ends in _lines(_with_islands_joined(part)):
             here = [_node_of(nodes, end) for end in (line[0], line[-1])]
             loop = here[0] == here[1]
@@ -133,25 +133,24 @@ def between(line: Floats, from_m: float, to_m: float) -> Floats:
     return np.vstack([whole.at(from_m).xy[None], inner, whole.at(to_m).xy[None]])
 
 
-def _opened(ground: Polygon | MultiPolygon) -> shapely.Geometry:
-    eroded = shapely.buffer(ground, -OPENED_M, quad_segs=4)
-    return shapely.simplify(shapely.buffer(eroded, OPENED_M, quad_segs=4), 0.05)
+def opened(ground: shapely.Geometry, radius_m: float) -> shapely.Geometry:
+    """Return ground without what is narrower than twice a radius."""
+    return overlay.grown(shapely.buffer(ground, -radius_m, quad_segs=4), radius_m)
 
 
 def _with_islands_joined(part: Polygon) -> Polygon:
-    """Return ground whose small obstacles are joined to the nearest other edge."""
+    """Return ground whose obstacles are joined to the edges that are very near."""
     for _ in range(len(part.interiors)):
-        small = [ring for ring in part.interiors if Polygon(ring).area < _ISLAND_M2]
-        if not small:
-            break
         gaps = []
-        for ring in small:
+        for ring in part.interiors:
             others = [part.exterior, *(other for other in part.interiors if other is not ring)]
             gap = min(
                 (shapely.shortest_line(ring, other) for other in others), key=lambda one: one.length
             )
             gaps.append(gap)
-        nearest = min(gaps, key=lambda one: (round(one.length, 6), one.bounds))
+        nearest = min(gaps, key=lambda one: (round(one.length, 6), one.bounds), default=None)
+        if nearest is None or nearest.length > _ISLAND_GAP_M:
+            break
         cut = overlay.difference(part, shapely.buffer(nearest, 0.02, cap_style="square"))
         part = max(shapely.get_parts(cut), key=lambda one: float(one.area))
     return part
@@ -166,19 +165,22 @@ def _lines(part: Polygon) -> list[tuple[Floats, tuple[bool, bool]]]:
     shapely.prepare(boundary)
     clearance = shapely.distance(shapely.points(xy), boundary)
     _prune(xy, graph, clearance)
-    merged = _contracted(xy, graph, clearance)
+    merged = _contracted(xy, graph, clearance, part)
     found = []
-    for chain in _chains(xy, graph):
+    for chain in _chains(xy, graph, merged):
         ends = (chain.nodes[0], chain.nodes[-1])
-        dead = (len(graph[ends[0]]) == 1, len(graph[ends[1]]) == 1)
+        first, last = (len(graph[end]) == 1 and end not in merged for end in ends)
+        dead = (first, last)
         line = xy[list(chain.nodes)]
         line[0], line[-1] = (xy[merged.get(end, end)] for end in ends)
         if merged.get(ends[0], ends[0]) == merged.get(ends[1], ends[1]) and len(line) < 8:
             continue
+        if len(line) < 2 or np.hypot(*np.diff(line, axis=0).T).sum() < OPENED_M:
+            continue
         for end in (0, 1):
             if dead[end]:
                 line = _extended(line[::-1], part)[::-1] if end == 0 else _extended(line, part)
-        if len(line) > 1 and Polyline(line).length_m > 2.0 * OPENED_M:
+        if Polyline(line).length_m > 2.0 * OPENED_M:
             found.append((_smoothed(line, boundary), dead))
     return sorted(found, key=lambda one: (one[0][0].tolist(), one[0][-1].tolist()))
 
@@ -196,7 +198,10 @@ def _voronoi_graph(part: Polygon) -> tuple[Floats, _Graph]:
     ]
     points = np.concatenate(rings)
     following = np.concatenate(
-        [start + np.roll(np.arange(len(ring)), -1) for ring, start in zip(rings, _starts(rings), strict=True)]
+        [
+            start + np.roll(np.arange(len(ring)), -1)
+            for ring, start in zip(rings, _starts(rings), strict=True)
+        ]
     )
     diagram = Voronoi(points - points.mean(axis=0))
     xy: Floats = diagram.vertices + points.mean(axis=0)
@@ -204,8 +209,12 @@ def _voronoi_graph(part: Polygon) -> tuple[Floats, _Graph]:
     pairs = np.asarray(diagram.ridge_points)
     inside = np.append(shapely.contains_xy(part, xy[:, 0], xy[:, 1]), False)
     neighbours = (following[pairs[:, 0]] == pairs[:, 1]) | (following[pairs[:, 1]] == pairs[:, 0])
+    arcs = ridges[inside[ridges].all(axis=1) & ~neighbours]
+    shapely.prepare(part)
+    # Across thin obstacles, arcs may run from one side to the other.
+    arcs = arcs[shapely.covers(part, shapely.linestrings(xy[arcs]))]
     graph: _Graph = defaultdict(set)
-    for a, b in ridges[inside[ridges].all(axis=1) & ~neighbours].tolist():
+    for a, b in arcs.tolist():
         graph[a].add(b)
         graph[b].add(a)
     return xy, dict(graph)
@@ -215,17 +224,20 @@ def _starts(rings: Sequence[Floats]) -> list[int]:
     return np.cumsum([0, *map(len, rings)])[:-1].tolist()
 
 
-def _chains(xy: Floats, graph: _Graph) -> list[_Chain]:
-    """Return the chains between nodes with other than two neighbours, loops included."""
+def _chains(xy: Floats, graph: _Graph, forks: Collection[int] = ()) -> list[_Chain]:
+    """Return the chains between forks and ends, loops included.
+
+    forks: nodes that are forks whatever the number of their neighbours.
+    """
     found = []
     seen: set[tuple[int, int]] = set()
-    order = sorted(graph, key=lambda i: (len(graph[i]) == 2, xy[i].tolist()))
-    for start in order:
+    inner = {node for node, near in graph.items() if len(near) == 2 and node not in forks}
+    for start in sorted(graph, key=lambda i: (i in inner, xy[i].tolist())):
         for second in sorted(graph[start], key=lambda i: xy[i].tolist()):
-            if (start, second) in seen or (len(graph[start]) == 2 and _visited(seen, start)):
+            if (start, second) in seen or (start in inner and _visited(seen, start)):
                 continue
             nodes = [start, second]
-            while len(graph[nodes[-1]]) == 2 and nodes[-1] != start:
+            while nodes[-1] in inner and nodes[-1] != start:
                 nodes.append(next(i for i in graph[nodes[-1]] if i != nodes[-2]))
             seen.update(pairwise(nodes))
             seen.update(pairwise(reversed(nodes)))
@@ -263,26 +275,31 @@ def _prune(xy: Floats, graph: _Graph, clearance: NDArray[np.float64]) -> None:
             del graph[node]
 
 
-def _contracted(xy: Floats, graph: _Graph, clearance: NDArray[np.float64]) -> dict[int, int]:
-    """Return the node that replaces each fork next to another fork."""
+def _contracted(
+    xy: Floats, graph: _Graph, clearance: NDArray[np.float64], part: Polygon
+) -> dict[int, int]:
+    """Return the node that replaces each fork next to another fork, in sight of it."""
     merged: dict[int, int] = {}
     for chain in sorted(_chains(xy, graph), key=lambda one: one.length_m):
         a, b = (merged.get(node, node) for node in (chain.nodes[0], chain.nodes[-1]))
         forks = all(len(graph[node]) > 2 for node in (chain.nodes[0], chain.nodes[-1]))
-        if forks and a != b and chain.length_m < _JOINED * (clearance[a] + clearance[b]):
+        sight = LineString([xy[a], xy[b]]).buffer(OPENED_M)
+        most_m = _JOINED * float(clearance[a] + clearance[b])
+        if forks and a != b and chain.length_m < most_m and part.covers(sight):
             for node in [a, b, *(n for n, target in merged.items() if target in (a, b))]:
                 merged[node] = min(a, b)
             for c, d in pairwise(chain.nodes):
                 graph[c].discard(d)
                 graph[d].discard(c)
-    # Chains end at forks also where the contraction left two or less neighbours.
     return merged
 
 
 def _extended(line: Floats, part: Polygon) -> Floats:
     """Return a line whose dead end runs straight to the end of the ground."""
     whole = Polyline(line)
-    radius_m = float(shapely.distance(shapely.Point(whole.at(0.5 * whole.length_m).xy), part.boundary))
+    radius_m = float(
+        shapely.distance(shapely.Point(whole.at(0.5 * whole.length_m).xy), part.boundary)
+    )
     cut_m = max(0.5 * whole.length_m, whole.length_m - 1.5 * radius_m)
     short = between(line, 0.0, cut_m)
     back = Polyline(short).at(max(0.0, cut_m - 2.0)).xy
@@ -290,7 +307,9 @@ def _extended(line: Floats, part: Polygon) -> Floats:
     along /= max(float(np.hypot(*along)), 1e-9)
     ray = LineString([short[-1], short[-1] + 4.0 * (radius_m + 1.0) * along])
     inside = [
-        p for p in shapely.get_parts(shapely.intersection(ray, part)) if p.distance(shapely.Point(short[-1])) < 1e-6
+        p
+        for p in shapely.get_parts(shapely.intersection(ray, part))
+        if p.distance(shapely.Point(short[-1])) < 1e-6
     ]
     ahead_m = max((p.length for p in inside), default=0.0) - _END_GAP_M
     return np.vstack([short, short[-1] + ahead_m * along]) if ahead_m > 0.0 else short

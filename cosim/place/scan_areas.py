@@ -20,6 +20,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from cosim.core.errors import MapError, UsageError
 from cosim.core.geometry import Floats
 from cosim.place import overlay
+from cosim.place.medial_axis import opened
 from cosim.place.scan import AREA_KINDS, AreaKind, Georeference, HeightGrid, ScanArea
 
 WIDTHS_M: Final = (1.0, 20.0)
@@ -192,7 +193,7 @@ def draft_areas(
     Raises MapError if no piece is large enough.
     """
     free = grid.measured & ~grid.blocked & (grade < most_grade)
-    ground = _opened(_cells(grid, free), 0.5 * _DRAFT_WIDTH_M)
+    ground = opened(_cells(grid, free), 0.5 * _DRAFT_WIDTH_M)
     simple = shapely.simplify(shapely.buffer(ground, -0.5 * _SIMPLE_M), _SIMPLE_M)
     parts = [Polygon(part.exterior, _large_rings(part)) for part in _large(simple, _DRAFT_M2)]
     if not parts:
@@ -228,8 +229,7 @@ def walkable_ground(areas: Iterable[ScanArea], grid: HeightGrid) -> Polygon | Mu
 def uncovered(grid: HeightGrid, around: shapely.Geometry) -> Polygon | MultiPolygon:
     """Return the part of an area that is farther than half a metre from measured ground."""
     near = _cells(grid, grid.measured, shapely.buffer(around, 2.0 * _GAP_M))
-    covered: Polygon = shapely.buffer(near, _GAP_M, quad_segs=4)
-    found: Polygon | MultiPolygon = overlay.difference(around, covered)
+    found: Polygon | MultiPolygon = overlay.difference(around, overlay.grown(near, _GAP_M))
     return found
 
 
@@ -323,10 +323,6 @@ def _cells(
     return found
 
 
-def _opened(area: shapely.Geometry, radius_m: float) -> shapely.Geometry:
-    return shapely.buffer(shapely.buffer(area, -radius_m, quad_segs=4), radius_m, quad_segs=4)
-
-
 def _large(shape: shapely.Geometry, least_m2: float) -> list[Polygon]:
     """Return the polygons of a shape of at least an area, largest first."""
     parts = [
@@ -380,7 +376,10 @@ def _placer(
     if frame not in (None, "local", "wgs84"):
         raise MapError(f"{path}: frame is {frame!r}, but must be 'local' or 'wgs84'")
     xy = np.concatenate(
-        [shapely.get_coordinates(_geometry(f"{path}: feature {i}", f)) for i, f in enumerate(features)]
+        [
+            shapely.get_coordinates(_geometry(f"{path}: feature {i}", f))
+            for i, f in enumerate(features)
+        ]
     )
     if not len(xy) or not np.isfinite(xy).all():
         raise MapError(f"{path}: coordinates must be finite numbers")

@@ -39,6 +39,11 @@ class Port(NamedTuple):
         return Port(self.strip, 1 if self.end == 0 else 0)
 
 
+def ports_of(strips: Iterable[str]) -> frozenset[Port]:
+    """Return both ends of each strip."""
+    return frozenset(port for strip in strips for port in (Port(strip, 0), Port(strip, 1)))
+
+
 @dataclass(frozen=True, slots=True)
 class SignalPlan:
     """Fixed-time program of a crossing's signal, repeated after the last phase.

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Final, NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -25,7 +26,7 @@ from cosim.place import overlay
 from cosim.place.medial_axis import Axis, between, medial_axis
 from cosim.place.scan import Georeference, HeightGrid, ScanArea
 from cosim.place.scan_areas import WALKED, walkable_ground
-from cosim.place.street_map import StreetMap
+from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from sumo_nets.maps.driving_side import left_hand_country
 from sumo_nets.maps.ground_file import GROUND_FILE, drawn_ground, write_ground
@@ -49,34 +50,43 @@ _NEAR_END_M: Final = 3.0
 _ROAD_END_M: Final = 6.0
 """Least distance of a crossing from the end of a road, in metres."""
 _ON_ROAD_M2: Final = 0.5
-_KERB_M: Final = 0.6
-"""Length of the corner between a crossing and its sidewalk, in metres."""
+_KERB_M: Final = 0.3
+"""Distance before the curb from which the link to a crossing runs straight, in metres."""
 _OPTIONS: Final = (
     "--walkingareas",
     "--no-turnarounds.except-deadend",
     "--offset.disable-normalization",
-    "--default.junctions.radius=0.5",
 )
+_ROUNDS: Final = 12
+"""Largest number of rounds in which lanes are narrowed."""
+_NARROWING: Final = 0.85
+_OUTSIDE_M: Final = 0.05
+"""Distance from the ground up to which lanes are inside, in metres."""
+_STRIPE_M: Final = 0.7
+"""Least width of a narrowed lane, in metres: one stripe of SUMO's pedestrians."""
+_RADII_M: Final = (0.5, 1.5, 3.0)
+"""Radii of junctions, in metres, of which the first is taken that keeps all crossings."""
 
 
 @dataclass(slots=True)
 class _Edge:
-    """Edge of the net. lane_m: width; drive: whether it is a road."""
+    """Edge of the net. drive: whether it is a road."""
 
     start: int
     end: int
     line: Floats
+    clear_m: float
     lane_m: float
     drive: bool = False
 
 
-class _Zebra(NamedTuple):
-    """Crossing at a node. line: from curb to curb; outline: of the node."""
+@dataclass(slots=True)
+class _Zebra:
+    """Crossing at a node. line: from curb to curb, (2, 2) metres."""
 
     node: int
     line: Floats
-    width_m: float
-    outline: Floats
+    lane_m: float
 
 
 @dataclass(slots=True)
@@ -116,13 +126,16 @@ def build_scan_net(
     progress("finding the axis of the walkable ground")
     plan = _plan(areas, ground)
     progress("building the net")
-    path = _converted(plan, georeference, folder)
-    street_map = read_net(path)
+    path, street_map = _built(plan, georeference, folder)
+    for _ in range(_ROUNDS):
+        if not _narrowed(plan, street_map, ground):
+            break
+        path, street_map = _built(plan, georeference, folder)
     findings = _checked(plan, street_map)
     progress("starting SUMO on the net")
     start_net(path, str(path))
     names = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
-    narrow = [name for name, edge in names.items() if edge.lane_m < CROWD_M - INNER_M - 1e-9]
+    narrow = [name for name, edge in names.items() if edge.clear_m < CROWD_M]
     write_ground(drawn_ground(street_map, ground, tuple(narrow)), folder / GROUND_FILE)
     if narrow:
         at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
@@ -161,8 +174,8 @@ def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
         raise MapError("the walkable ground is nowhere wide enough to walk: draw wider areas")
     plan = _Plan(list(axis.nodes))
     for piece in axis.pieces:
-        lane_m = max(piece.clear_m - INNER_M, _LEAST_LANE_M)
-        plan.edges.append(_Edge(piece.start, piece.end, piece.line, lane_m))
+        ends = (piece.start, piece.end)
+        plan.edges.append(_Edge(*ends, piece.line, piece.clear_m, _inner(piece.clear_m)))
     if not roads.is_empty:
         _add_roads(plan, medial_axis(roads, whole=True))
     for crossing in over:
@@ -175,7 +188,12 @@ def _add_roads(plan: _Plan, axis: Axis) -> None:
     plan.nodes += list(axis.nodes)
     for piece in axis.pieces:
         ends = (first + piece.start, first + piece.end)
-        plan.edges.append(_Edge(*ends, piece.line, piece.clear_m - INNER_M, drive=True))
+        lane_m = piece.clear_m - INNER_M
+        plan.edges.append(_Edge(*ends, piece.line, piece.clear_m, lane_m, drive=True))
+
+
+def _inner(clear_m: float) -> float:
+    return max(clear_m - INNER_M, _LEAST_LANE_M)
 
 
 def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> None:
@@ -199,20 +217,16 @@ def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> No
         raise MapError(f"{where} does not lead from one side of its road to the other: redraw it")
     node = _split(plan, road, middle, _ROAD_END_M, where)
     ends = np.array([middle + low * along, middle + high * along])
-    aside = np.array([-along[1], along[0]]) * (0.5 * width_m + 0.1)
-    out = _KERB_M * along
-    outline = np.array(
-        [ends[0] - out - aside, ends[1] + out - aside, ends[1] + out + aside, ends[0] - out + aside]
-    )
-    plan.zebras.append(_Zebra(node, ends, width_m, outline))
+    lane_m = _inner(width_m - INNER_M)
+    plan.zebras.append(_Zebra(node, ends, lane_m))
     for end, outward in ((ends[0], -along), (ends[1], along)):
         meets = _joint(plan, end, outward)
         if meets is None:
             raise MapError(f"{where} joins no sidewalk at one end: draw one there")
         piece, at = meets
         joint = _split(plan, piece, at, _NEAR_END_M, where)
-        line = np.vstack([plan.nodes[joint], middle])
-        plan.edges.append(_Edge(joint, node, line, max(width_m - INNER_M, _LEAST_LANE_M)))
+        line = np.vstack([plan.nodes[joint], end + _KERB_M * outward, middle])
+        plan.edges.append(_Edge(joint, node, line, width_m, lane_m))
 
 
 def _direction(on_road: shapely.Geometry, road: _Edge) -> tuple[Floats, Floats, float]:
@@ -273,21 +287,21 @@ def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float, where: str) -> i
     elif s_m < near_m or s_m > line.length_m - near_m:
         return edge.start if s_m < 0.5 * line.length_m else edge.end
     node = plan.node(line.at(s_m).xy)
-    rest = _Edge(
-        node, edge.end, between(edge.line, s_m, line.length_m), edge.lane_m, edge.drive
-    )
+    rest = replace(edge, start=node, line=between(edge.line, s_m, line.length_m))
     edge.end, edge.line = node, between(edge.line, 0.0, s_m)
     plan.edges.append(rest)
     return node
 
 
-def _converted(plan: _Plan, georeference: Georeference | None, folder: Path) -> Path:
+def _converted(
+    plan: _Plan, georeference: Georeference | None, folder: Path, radius_m: float
+) -> Path:
     """Write the plan as plain XML and build the net."""
-    outlines = {zebra.node: zebra.outline for zebra in plan.zebras}
+    left = georeference is not None and bool(
+        left_hand_country(georeference.longitude_deg, georeference.latitude_deg)
+    )
     nodes = [
-        f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"'
-        + (f' shape="{_shape(outlines[i])}"' if i in outlines else "")
-        + "/>"
+        f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"/>'
         for i, xy in enumerate(plan.nodes)
     ]
     edges = [row for i, edge in enumerate(plan.edges) for row in _rows(i, edge)]
@@ -297,23 +311,82 @@ def _converted(plan: _Plan, georeference: Georeference | None, folder: Path) -> 
         both = [f"r{arm}"] + ([f"-r{arm}"] if _two_way(plan.edges[arm]) else [])
         zebras.append(
             f'<crossing node="n{zebra.node}" edges="{" ".join(both)}" '
-            f'width="{zebra.width_m - INNER_M:.2f}" priority="true" shape="{_shape(zebra.line)}"/>'
+            f'width="{zebra.lane_m:.2f}" priority="true" '
+            f'shape="{_shape(_clockwise(zebra, plan.edges[arm], left))}"/>'
         )
     files = {"nodes": nodes, "edges": edges, "connections": zebras}
     paths = {}
     for tag, rows in files.items():
         paths[tag] = folder / f"plain.{tag}.xml"
         paths[tag].write_text(f"<{tag}>\n" + "\n".join(rows) + f"\n</{tag}>\n")
-    left = georeference is not None and left_hand_country(
-        georeference.longitude_deg, georeference.latitude_deg
-    )
     arguments = ["-n", str(paths["nodes"]), "-e", str(paths["edges"]), "-x"]
     arguments += [str(paths["connections"]), *_OPTIONS, *(["--lefthand"] if left else [])]
+    arguments.append(f"--default.junctions.radius={radius_m}")
     try:
         return netconvert(arguments, folder / "net.xml")
     finally:
         for plain in paths.values():
             plain.unlink()
+
+
+def _clockwise(zebra: _Zebra, road: _Edge, left: bool) -> Floats:
+    """Return a crossing's line as netconvert expects it: from the right of a road that leaves its
+    node, or from the left where people drive there."""
+    line = Polyline(road.line)
+    away_m = min(3.0, line.length_m)
+    at = line.at(away_m) if road.start == zebra.node else line.at(line.length_m - away_m)
+    out = at.xy - zebra.line.mean(axis=0)
+    right = np.array([out[1], -out[0]])
+    from_right = float((zebra.line[0] - zebra.line[1]) @ right) > 0.0
+    return zebra.line if from_right != left else zebra.line[::-1]
+
+
+def _built(
+    plan: _Plan, georeference: Georeference | None, folder: Path
+) -> tuple[Path, StreetMap]:
+    """Build the net with the first radius of junctions that keeps all crossings."""
+    for radius_m in _RADII_M:
+        path = _converted(plan, georeference, folder, radius_m)
+        street_map = read_net(path)
+        crossings = sum(strip.kind == "crossing" for strip in street_map.strips.values())
+        if crossings == len(plan.zebras):
+            break
+    return path, street_map
+
+
+def _narrowed(plan: _Plan, street_map: StreetMap, ground: Polygon | MultiPolygon) -> bool:
+    """Narrow the lanes on which people would leave the ground. Returns whether any was."""
+    inside = shapely.buffer(ground, _OUTSIDE_M)
+    shapely.prepare(inside)
+    wide = {name for name, s in street_map.strips.items() if not inside.covers(_lane_band(s))}
+    for corner in street_map.corners.values():
+        for one, other in combinations(dict.fromkeys(corner.ports), 2):
+            mouths = [_mouth(street_map.strips[port.strip], port) for port in (one, other)]
+            if not inside.covers(shapely.MultiPoint(np.vstack(mouths)).convex_hull):
+                wide |= {one.strip, other.strip}
+    changed = False
+    lanes: dict[str, _Edge | _Zebra] = {f"w{i}": edge for i, edge in enumerate(plan.edges)}
+    for zebra in plan.zebras:
+        lanes |= {name: zebra for name in wide if name.startswith(f":n{zebra.node}_c")}
+    for name in sorted(wide):
+        lane_m = max(_NARROWING * lanes[name].lane_m, min(_STRIPE_M, lanes[name].lane_m))
+        changed |= lane_m < lanes[name].lane_m
+        lanes[name].lane_m = lane_m
+    return changed
+
+
+def _lane_band(strip: Strip) -> shapely.Geometry:
+    return shapely.buffer(
+        LineString(strip.line[:, :2]), 0.5 * strip.width_m, cap_style="flat", join_style="mitre"
+    )
+
+
+def _mouth(strip: Strip, port: Port) -> Floats:
+    """Return both sides of the end of a lane, (2, 2) metres."""
+    end, inner = strip.line[[0, 1], :2] if port.end == 0 else strip.line[[-1, -2], :2]
+    along = (end - inner) / max(float(np.hypot(*(end - inner))), 1e-9)
+    aside = 0.5 * strip.width_m * np.array([-along[1], along[0]])
+    return np.array([end + aside, end - aside])
 
 
 def _two_way(edge: _Edge) -> bool:
