@@ -245,6 +245,62 @@ def areas(
     out.print(f"Areas: {output} ({count}){instead}", soft_wrap=True, highlight=False)
 
 
+@scan_app.command(
+    "make",
+    epilog="Examples:  \n`cosim scan make --city 7 -o demo && cosim scan import demo`  \n`cosim "
+    "scan make --city 7 --size 500 --box 100,100,180,160 --spacing 0.06 -o demo`",
+)
+def make(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write to.")],
+    city: Annotated[int, typer.Option(min=0, help="Seed of the generated city.")] = 7,
+    size: Annotated[float, typer.Option(help="Side of the city in metres.")] = 500.0,
+    style: Annotated[str, typer.Option(help="Style of the city.")] = "mixed",
+    box: Annotated[
+        str,
+        typer.Option(
+            metavar="X0,Y0,X1,Y1",
+            help="Part of the city, in metres. Default: 80 x 60 m around a crossing.",
+            show_default=False,
+        ),
+    ] = "",
+    hour: Annotated[float, typer.Option(min=0, max=24, help="Solar time of the light.")] = 13.0,
+    spacing: Annotated[float, typer.Option(help="Metres between splats on the ground.")] = 0.12,
+) -> None:
+    """Make a scan of a generated street: a mesh and splats, for demonstrations and tests.
+
+    The folder must be new or empty. It has scan.json, so that it can be imported without options.
+    """
+    from cosim.spec.scenario import City, Light
+    from scenarios.places.scan_make import make_scan
+
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise UsageError(f"{output} exists already: give a new folder with --output")
+    corners = _box(box) if box else None
+    with doing("building the city") as progress:
+        count = make_scan(
+            City(seed=city, size_m=size, style=style),
+            corners,
+            output,
+            light=Light(hour=hour),
+            spacing_m=spacing,
+            progress=progress,
+        )
+    out.print(
+        f"Scan: {output} ({count} splats): import it with `cosim scan import {output}`.",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _box(words: str) -> tuple[float, float, float, float]:
+    """Parse the corners of a box. Raises UsageError."""
+    try:
+        x0, y0, x1, y1 = map(float, words.split(","))
+    except ValueError:
+        raise UsageError(f"--box {words}: give X0,Y0,X1,Y1 in metres") from None
+    return x0, y0, x1, y1
+
+
 def print_findings(name: str, findings: Sequence[Finding]) -> None:
     """Print findings as a table: notes, then warnings, then refusals."""
     order = ("note", "warning", "refused")
