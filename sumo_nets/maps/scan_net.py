@@ -136,7 +136,8 @@ def build_scan_net(
     start_net(path, str(path))
     names = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
     narrow = [name for name, edge in names.items() if edge.clear_m < CROWD_M]
-    write_ground(drawn_ground(street_map, ground, tuple(narrow)), folder / GROUND_FILE)
+    widths_m = {name: round(edge.clear_m, 3) for name, edge in names.items()}
+    write_ground(drawn_ground(street_map, ground, widths_m, tuple(narrow)), folder / GROUND_FILE)
     if narrow:
         at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
         findings.append(
