@@ -48,12 +48,14 @@ _THICKNESS_M: Final = 0.004
 _OPACITY: Final = 0.98
 _MESH_EDGE_M: Final = 0.5
 """Longest edge of the mesh in metres, as colours are stored at its vertices."""
+_BORDER_M: Final = 0.5
+"""Longest edge of triangles at the border of the box in metres."""
 _TEXELS: Final = 256
 _SH_C0: Final = 0.28209479177387814
 """Value of the spherical harmonic of degree 0."""
 _STEPS: Final = (0.7548776662466927, 0.5698402909980532)
 """Steps of the low-discrepancy sequence of points in triangles."""
-_SPLAT_ROW: Final = np.dtype(
+SPLAT_ROW: Final = np.dtype(
     [
         (name, "<f4")
         for name in (
@@ -204,14 +206,24 @@ def _ground_piece(patch: Patch, layers: Layers) -> _Piece:
 
 
 def _clipped(piece: _Piece, box: Box) -> _Piece:
-    """Return the triangles whose middle lies in a box."""
-    corners = piece.mesh.vertices[piece.mesh.triangles]
-    x, y = (corners[:, :, axis].mean(axis=1) for axis in (0, 1))
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    here = (x > box[0]) & (x < box[2]) & (y > box[1]) & (y < box[3]) & (across != 0.0).any(axis=1)
-    return piece._replace(
-        mesh=Mesh(piece.mesh.vertices, piece.mesh.normals, piece.mesh.triangles[here])
+    """Return the part of a piece in a box; triangles across its border are divided."""
+    vertices, triangles = piece.mesh.vertices, piece.mesh.triangles
+    corners = vertices[triangles]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    out = ((high[:, :2] < box[:2]) | (low[:, :2] > box[2:])).any(axis=1)
+    inside = ((low[:, :2] >= box[:2]) & (high[:, :2] <= box[2:])).all(axis=1)
+    cut_vertices, cut = trimesh.remesh.subdivide_to_size(
+        vertices, triangles[~out & ~inside], _BORDER_M, max_iter=16
     )
+    x, y, _ = cut_vertices[cut].mean(axis=1).T
+    cut = cut[(x > box[0]) & (x < box[2]) & (y > box[1]) & (y < box[3])]
+    joined = np.concatenate([vertices, cut_vertices])
+    faces = np.concatenate([triangles[inside], cut + len(vertices)]).astype(np.int32)
+    across = np.cross(
+        joined[faces[:, 1]] - joined[faces[:, 0]], joined[faces[:, 2]] - joined[faces[:, 0]]
+    )
+    faces = faces[(across != 0.0).any(axis=1)]
+    return piece._replace(mesh=Mesh(joined, np.zeros_like(joined), faces))
 
 
 def _lit(piece: _Piece, at: Floats, normals: Floats, sky: Sky, size_m: float) -> Floats:
@@ -260,7 +272,7 @@ def _points(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
 
 
 def _write_splats(splats: SurfaceSplats, middle: Floats, path: Path) -> None:
-    rows = np.zeros(len(splats.centres), dtype=_SPLAT_ROW)
+    rows = np.zeros(len(splats.centres), dtype=SPLAT_ROW)
     for k, name in enumerate("xyz"):
         rows[name] = splats.centres[:, k] - middle[k]
         rows[f"n{name}"] = splats.normals[:, k]
@@ -279,7 +291,7 @@ def _write_splats(splats: SurfaceSplats, middle: Floats, path: Path) -> None:
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(rows)}",
-        *(f"property float {name}" for name in _SPLAT_ROW.names or ()),
+        *(f"property float {name}" for name in SPLAT_ROW.names or ()),
         "end_header",
     ]
     path.write_bytes("\n".join(head).encode() + b"\n" + rows.tobytes())
