@@ -25,6 +25,7 @@ from cosim.cli.places import city_app, map_app
 from cosim.cli.policy import policy_app
 from cosim.cli.results import compare_app, merge_app, report_app, score_app, show_app
 from cosim.cli.run import run_app
+from cosim.cli.scan import scan_app
 from cosim.cli.scenario import scenario_app
 from cosim.cli.suites import list_app, suite_app
 from cosim.cli.train import train_app
@@ -58,6 +59,7 @@ app.add_typer(scenario_app, name="scenario", rich_help_panel=MEASURE)
 app.add_typer(policy_app, name="policy", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)
 app.add_typer(map_app, name="map", rich_help_panel=PLACES)
+app.add_typer(scan_app, name="scan", rich_help_panel=PLACES)
 
 
 def _print_versions(requested: bool) -> None:

@@ -198,7 +198,10 @@ def _voronoi_graph(part: Polygon) -> tuple[Floats, _Graph]:
     ]
     points = np.concatenate(rings)
     following = np.concatenate(
-        [start + np.roll(np.arange(len(ring)), -1) for ring, start in zip(rings, _starts(rings), strict=True)]
+        [
+            start + np.roll(np.arange(len(ring)), -1)
+            for ring, start in zip(rings, _starts(rings), strict=True)
+        ]
     )
     diagram = Voronoi(points - points.mean(axis=0))
     xy: Floats = diagram.vertices + points.mean(axis=0)
@@ -294,7 +297,9 @@ def _contracted(
 def _extended(line: Floats, part: Polygon) -> Floats:
     """Return a line whose dead end runs straight to the end of the ground."""
     whole = Polyline(line)
-    radius_m = float(shapely.distance(shapely.Point(whole.at(0.5 * whole.length_m).xy), part.boundary))
+    radius_m = float(
+        shapely.distance(shapely.Point(whole.at(0.5 * whole.length_m).xy), part.boundary)
+    )
     cut_m = max(0.5 * whole.length_m, whole.length_m - 1.5 * radius_m)
     short = between(line, 0.0, cut_m)
     back = Polyline(short).at(max(0.0, cut_m - 2.0)).xy
@@ -302,7 +307,9 @@ def _extended(line: Floats, part: Polygon) -> Floats:
     along /= max(float(np.hypot(*along)), 1e-9)
     ray = LineString([short[-1], short[-1] + 4.0 * (radius_m + 1.0) * along])
     inside = [
-        p for p in shapely.get_parts(shapely.intersection(ray, part)) if p.distance(shapely.Point(short[-1])) < 1e-6
+        p
+        for p in shapely.get_parts(shapely.intersection(ray, part))
+        if p.distance(shapely.Point(short[-1])) < 1e-6
     ]
     ahead_m = max((p.length for p in inside), default=0.0) - _END_GAP_M
     return np.vstack([short, short[-1] + ahead_m * along]) if ahead_m > 0.0 else short

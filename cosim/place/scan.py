@@ -26,6 +26,7 @@ SCAN_FOLDER: Final = "scan"
 """Folder of a scan in the folder of its map."""
 _FACTS: Final = "facts.json"
 _AREAS: Final = "areas.geojson"
+_FLOATERS: Final = "floaters"
 
 AreaKind = Literal["sidewalk", "crossing", "road", "verge", "obstacle"]
 """Kinds of drawn areas. People and robots use sidewalks and crossings."""
@@ -142,13 +143,17 @@ class ScanArea(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A scanned place."""
+    """A scanned place.
+
+    floaters: (K, 3) float32 centres of splats that the import removed, for pictures of it.
+    """
 
     facts: ScanFacts
     mesh: ScanMesh
     heights: HeightGrid
     areas: tuple[ScanArea, ...]
     splats: Splats | None = None
+    floaters: NDArray[np.float32] | None = None
 
 
 def has_scan(map_folder: Path) -> bool:
@@ -185,9 +190,10 @@ def read_scan(map_folder: Path, *, splats: bool = True) -> Scan:
         if splats and facts.splats_hash:
             held = Splats(*(_array(folder, f"splats-{name}") for name in Splats.__slots__))
         areas = parse_areas((folder / _AREAS).read_bytes())
+        floaters = _array(folder, _FLOATERS) if held is not None else None
     except (OSError, KeyError, ValueError) as error:
         raise MapError(f"{folder}: cannot be read: {error}: import the scan again") from error
-    return Scan(facts, mesh, heights, areas, held)
+    return Scan(facts, mesh, heights, areas, held, floaters)
 
 
 def write_scan(scan: Scan, map_folder: Path) -> ScanFacts:
@@ -204,6 +210,8 @@ def write_scan(scan: Scan, map_folder: Path) -> ScanFacts:
     _save(folder, "grid", grid, HeightGrid.__slots__[2:])
     if scan.splats is not None:
         _save(folder, "splats", scan.splats, Splats.__slots__)
+        floaters = np.empty((0, 3), np.float32) if scan.floaters is None else scan.floaters
+        np.save(folder / f"{_FLOATERS}.npy", floaters, allow_pickle=False)
     areas = encode_areas(scan.areas)
     (folder / _AREAS).write_bytes(areas)
     facts = msgspec.structs.replace(

@@ -376,7 +376,10 @@ def _placer(
     if frame not in (None, "local", "wgs84"):
         raise MapError(f"{path}: frame is {frame!r}, but must be 'local' or 'wgs84'")
     xy = np.concatenate(
-        [shapely.get_coordinates(_geometry(f"{path}: feature {i}", f)) for i, f in enumerate(features)]
+        [
+            shapely.get_coordinates(_geometry(f"{path}: feature {i}", f))
+            for i, f in enumerate(features)
+        ]
     )
     if not len(xy) or not np.isfinite(xy).all():
         raise MapError(f"{path}: coordinates must be finite numbers")

@@ -196,7 +196,9 @@ def _rasterised(
         some = order[begin : begin + count]
         begin += count
         owner = np.repeat(some, spans[some])
-        offset = np.arange(len(owner)) - np.repeat(np.cumsum(spans[some]) - spans[some], spans[some])
+        offset = np.arange(len(owner)) - np.repeat(
+            np.cumsum(spans[some]) - spans[some], spans[some]
+        )
         width = last[owner, 0] - first[owner, 0] + 1
         column = first[owner, 0] + offset % width
         row = first[owner, 1] + offset // width

@@ -6,6 +6,7 @@ import dataclasses
 import gzip
 import hashlib
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -100,10 +101,7 @@ def import_map(
     is stored.
     """
     name = map_name(source) if name is None else name
-    if not MAP_NAME_PATTERN.fullmatch(name):
-        raise UsageError(
-            f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters"
-        )
+    _check_name(name)
     options = Options() if options is None else options
     if name in _supplied():
         if source != _supplied()[name] or options != Options():
@@ -243,44 +241,78 @@ def _source_of(name: str) -> str:
         return "damaged: import it again"
 
 
-def _store(
-    source: Path, name: str, options: Options, progress: Progress = ignore, *, in_place: bool = True
+def store_map(name: str, fill: Callable[[Path], About]) -> About:
+    """Store a map that `fill` writes into a temporary folder, replace an earlier one of that name,
+    and return its origin.
+
+    fill: writes `net.xml` and what belongs to it, and returns the origin without its hash.
+    Raises what `fill` raises, UsageError for an unusable name, MachineError for a full disk.
+    Then nothing is stored.
+    """
+    _check_name(name)
+    if name in _supplied():
+        raise UsageError(
+            f"'{name}' is the name of a net that comes with SUMO: choose another with --name"
+        )
+    return _stored(name, fill, "replace")
+
+
+def _check_name(name: str) -> None:
+    if not MAP_NAME_PATTERN.fullmatch(name):
+        raise UsageError(
+            f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters"
+        )
+
+
+def _stored(
+    name: str, fill: Callable[[Path], About], existing: Literal["replace", "keep"]
 ) -> About:
-    """Convert a map in a temporary folder, then move it into place."""
+    """Let `fill` write a map into a temporary folder, then move it into place."""
     folder = maps_folder()
-    existing: Literal["replace", "keep"] = "replace" if in_place else "keep"
     try:
         with atomic_folder(folder / name, existing=existing) as ready:
-            with TemporaryDirectory(dir=ready) as scratch:
-                converted = convert(source, Path(scratch), options, progress)
-                converted.net.rename(ready / "net.xml")
-            if converted.features:
-                write_features(converted.features, ready / FEATURES_FILE)
-            about = About(
-                name=name,
-                source=source.name,
-                source_hash=file_hash(source),
-                format=" ".join(
-                    filter(None, (converted.format, converted.facts.version, converted.packing))
-                ),
-                imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
-                bbox=options.bbox,
-                lefthand=options.lefthand,
-                as_is=options.as_is,
-                sidewalk_width_m=options.sidewalk_width_m,
-                versions={
-                    "importer": str(IMPORTER_VERSION),
-                    "eclipse-sumo": version("eclipse-sumo"),
-                },
-                changes=converted.changes,
-                guessed_share=converted.guessed_share,
-                licences=_licences(name, source, converted.licences),
-                net_hash=map_hash(ready / "net.xml"),
-            )
+            about = fill(ready)
+            about = msgspec.structs.replace(about, net_hash=map_hash(ready / "net.xml"))
             (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
         return about
     except OSError as error:
         raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error
+
+
+def _store(
+    source: Path, name: str, options: Options, progress: Progress = ignore, *, in_place: bool = True
+) -> About:
+    """Convert a map and store it."""
+
+    def fill(ready: Path) -> About:
+        with TemporaryDirectory(dir=ready) as scratch:
+            converted = convert(source, Path(scratch), options, progress)
+            converted.net.rename(ready / "net.xml")
+        if converted.features:
+            write_features(converted.features, ready / FEATURES_FILE)
+        return About(
+            name=name,
+            source=source.name,
+            source_hash=file_hash(source),
+            format=" ".join(
+                filter(None, (converted.format, converted.facts.version, converted.packing))
+            ),
+            imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
+            bbox=options.bbox,
+            lefthand=options.lefthand,
+            as_is=options.as_is,
+            sidewalk_width_m=options.sidewalk_width_m,
+            versions={
+                "importer": str(IMPORTER_VERSION),
+                "eclipse-sumo": version("eclipse-sumo"),
+            },
+            changes=converted.changes,
+            guessed_share=converted.guessed_share,
+            licences=_licences(name, source, converted.licences),
+            net_hash="",
+        )
+
+    return _stored(name, fill, "replace" if in_place else "keep")
 
 
 def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
@@ -290,9 +322,15 @@ def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...
         licences.append(GAME_LICENCE)
     if name in WHEEL_PLACES and WHEEL_PLACES[name].osm:
         licences.append(OSM_LICENCE)
+    return (*licences, *licence_texts(source.resolve().parent))
+
+
+def licence_texts(folder: Path) -> tuple[str, ...]:
+    """Return the texts of the licence files in a folder."""
+    licences = []
     for name in ("LICENCE.txt", "LICENSE.txt", "LICENSE", "SOURCE.txt"):
         try:
-            text = (source.resolve().parent / name).read_text(errors="replace")
+            text = (folder / name).read_text(errors="replace")
         except OSError:
             continue
         lines = [line.strip() for line in text.splitlines() if line.strip()]

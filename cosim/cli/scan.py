@@ -1,0 +1,269 @@
+"""The command `cosim scan`: import of scanned places."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
+import typer
+
+from cosim.cli import tables
+from cosim.cli.console import out, say
+from cosim.cli.generated_options import Fields, configured
+from cosim.cli.options import check_output, replacement_note
+from cosim.cli.progress import doing
+from cosim.core.errors import WRONG_USE, UsageError
+from cosim.spec.run_config import Option
+
+if TYPE_CHECKING:
+    from physics.scans.findings import Finding
+    from scenarios.places.scan_options import ScanOptions
+
+scan_app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Scanned places: a mesh, and Gaussian splats for pictures.",
+)
+
+_FRAME = "Frame of the files"
+_SPLATS = "Splats, if they differ from the mesh"
+_AREA = "Walkable area (by default a draft from the ground)"
+_FACTS = "Facts"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanChoices:
+    """Options of an import, as `scan.json` has them. None and "" are left to it."""
+
+    name: Annotated[str, Option("Name of the map.", default="the folder's", panel=_FACTS)] = ""
+    scale: Annotated[
+        float | None, Option("Metres per unit.", default="1 in .glb files", panel=_FRAME)
+    ] = None
+    up: Annotated[
+        Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None,
+        Option("Axis that points up.", default="+y in .glb and .spz files", panel=_FRAME),
+    ] = None
+    transform: Annotated[
+        str,
+        Option(
+            "File with a 4 x 4 matrix to metres with z up, in place of scale and up.",
+            metavar="FILE",
+            panel=_FRAME,
+        ),
+    ] = ""
+    mirror: Annotated[
+        Literal["x", "y", "z"] | None,
+        Option("Axis to negate, for left-handed files.", panel=_FRAME),
+    ] = None
+    flip: Annotated[
+        bool, Option("Reverse the winding of triangles.", flag="--flip", panel=_FRAME)
+    ] = False
+    colours: Annotated[
+        Literal["srgb", "linear"] | None,
+        Option("Encoding of vertex colours.", default="by format and program", panel=_FRAME),
+    ] = None
+    georeference: Annotated[
+        str,
+        Option(
+            "Origin of the files: LATITUDE,LONGITUDE, or CRS[,EAST,NORTH] such as EPSG:25833.",
+            metavar="PLACE",
+            panel=_FRAME,
+        ),
+    ] = ""
+    splat_scale: Annotated[float | None, Option("As --scale, of the splats.", panel=_SPLATS)] = None
+    splat_up: Annotated[
+        Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None,
+        Option("As --up, of the splats.", panel=_SPLATS),
+    ] = None
+    splat_transform: Annotated[
+        str, Option("As --transform, of the splats.", metavar="FILE", panel=_SPLATS)
+    ] = ""
+    splat_mirror: Annotated[
+        Literal["x", "y", "z"] | None, Option("As --mirror, of the splats.", panel=_SPLATS)
+    ] = None
+    quaternions: Annotated[
+        Literal["wxyz", "xyzw"] | None,
+        Option("Order of rotations in a .ply file.", default="wxyz", panel=_SPLATS),
+    ] = None
+    most_splats: Annotated[
+        int | None,
+        Option("Reduce to this number, least visible first.", least=1, panel=_SPLATS),
+    ] = None
+    areas: Annotated[
+        str,
+        Option("GeoJSON with drawn areas, by their kind.", metavar="FILE", panel=_AREA),
+    ] = ""
+    osm: Annotated[
+        str, Option("OpenStreetMap file; needs --georeference.", metavar="FILE", panel=_AREA)
+    ] = ""
+    way: Annotated[
+        str, Option("Walked path: GeoJSON line, or JSON.", metavar="FILE", panel=_AREA)
+    ] = ""
+    width: Annotated[
+        float | None, Option("Metres, of the corridor along --way.", default="3", panel=_AREA)
+    ] = None
+    sun: Annotated[
+        str,
+        Option(
+            "Sun of the scan: AZIMUTH,ELEVATION in degrees.",
+            metavar="ANGLES",
+            panel=_FACTS,
+        ),
+    ] = ""
+    exposure: Annotated[
+        float | None,
+        Option("Stops by which people and objects are brighter.", default="0", panel=_FACTS),
+    ] = None
+    licence: Annotated[
+        str, Option("Licence of the scan.", default="the folder's files", panel=_FACTS)
+    ] = ""
+
+    def options(self, folder: Path) -> ScanOptions:
+        """Return the options of a folder's `scan.json`, replaced by these.
+
+        Raises UsageError and SpecError for invalid values.
+        """
+        from scenarios.places.scan_options import parse_georeference, parse_sun, read_options
+
+        given: dict[str, Any] = dataclasses.asdict(self)
+        given["width_m"] = given.pop("width")
+        given["exposure_ev"] = given.pop("exposure")
+        given["flip"] = self.flip or None
+        given["georeference"] = parse_georeference(self.georeference) if self.georeference else None
+        given["sun"] = parse_sun(self.sun) if self.sun else None
+        return read_options(folder, given)
+
+
+_Folder = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="Folder with the mesh, the splats and scan.json.")
+]
+_Map = Annotated[str, typer.Argument(metavar="NAME", help="Name of an imported scan.")]
+
+
+@scan_app.command(
+    "import",
+    epilog="Examples:  \n`cosim scan import my-street`  \n`cosim scan import my-street --up +z "
+    "--scale 1 --areas areas.geojson`  \n`cosim scan import my-street --way walk.geojson --width 3 "
+    "--georeference 55.698,13.195`",
+)
+@configured
+def import_(folder: _Folder, choices: Annotated[ScanChoices, Fields(panels=True)]) -> None:
+    """Import a scan: read, check and clean it, build its net, and store it as a map."""
+    from scenarios.places.scan_import import import_scan
+
+    options = choices.options(folder)
+    with doing(f"reading {folder}") as progress:
+        about, checked = import_scan(folder, options, progress)
+    print_findings(about.name, checked.findings)
+    out.print(
+        f"Stored as '{about.name}': see it with `cosim scan show {about.name} -o scan.png`, run on "
+        f"it with --map {about.name}.",
+        soft_wrap=True,
+    )
+
+
+@scan_app.command(
+    "check",
+    epilog="Examples:  \n`cosim scan check my-street`  \n`cosim scan check my-street --up +z "
+    "--json`",
+)
+@configured
+def check(
+    folder: _Folder,
+    choices: Annotated[ScanChoices, Fields(panels=True)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> None:
+    """Check a scan as an import does, and store nothing. Exit code 2: it would be refused."""
+    from scenarios.places.scan_import import check_scan
+
+    options = choices.options(folder)
+    with doing(f"reading {folder}") as progress:
+        findings = check_scan(folder, options, progress).findings
+    if as_json:
+        rows = [{"level": one.level, "words": one.words} for one in findings]
+        typer.echo(msgspec.json.format(msgspec.json.encode(rows), indent=2).decode())
+    else:
+        print_findings(folder.resolve().name, findings)
+    if any(one.level == "refused" for one in findings):
+        raise typer.Exit(WRONG_USE)
+
+
+@scan_app.command(
+    "show",
+    epilog="Example:  \n`cosim scan show my-street -o scan.png`",
+)
+def show(
+    name: _Map,
+    picture: Annotated[
+        Path, typer.Option("-o", "--output", help="Where to write the picture, a PNG.")
+    ] = Path("scan.png"),
+) -> None:
+    """Draw a scan from above: areas, blocked ground, holes, removed floaters, coverage."""
+    from cosim.report.mapsheet import write_png
+    from cosim.report.scan_sheet import draw_scan
+    from scenarios.places.scan_views import coverage_of
+
+    check_output(picture, "a picture", (".png",))
+    folder = _map_folder(name)
+    instead = replacement_note(picture)
+    with doing(f"reading {name}") as progress:
+        from cosim.place.scan import read_scan
+
+        scan = read_scan(folder)
+        progress("measuring the coverage of views")
+        eyes, shares = coverage_of(scan)
+        progress("drawing")
+        write_png(draw_scan(scan, eyes, shares), picture)
+    for words in scan.facts.findings:
+        say(words)
+    out.print(f"Picture: {picture}{instead}", soft_wrap=True)
+
+
+@scan_app.command(
+    "areas",
+    epilog="Example:  \n`cosim scan areas my-street -o areas.geojson`",
+)
+def areas(
+    name: _Map,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Where to write them, a .geojson.")
+    ] = Path("areas.geojson"),
+) -> None:
+    """Write the areas of a scan as GeoJSON in metres, to edit and import again with --areas."""
+    from cosim.place.scan import read_scan
+    from cosim.place.scan_areas import write_areas
+
+    check_output(output, "areas", (".geojson", ".json"))
+    scan = read_scan(_map_folder(name), splats=False)
+    instead = replacement_note(output)
+    write_areas(scan.areas, output)
+    count = f"{len(scan.areas)} areas"
+    out.print(f"Areas: {output} ({count}){instead}", soft_wrap=True, highlight=False)
+
+
+def print_findings(name: str, findings: Sequence[Finding]) -> None:
+    """Print findings as a table: notes, then warnings, then refusals."""
+    order = ("note", "warning", "refused")
+    rows = [
+        (one.level, one.words)
+        for one in sorted(findings, key=lambda finding: order.index(finding.level))
+    ]
+    tables.show(out, [*tables.labels(name), *tables.words("finding")], rows)
+
+
+def _map_folder(name: str) -> Path:
+    """Return the folder of an imported scan. Raises UsageError for a name that is none."""
+    from cosim.place.scan import has_scan
+    from sumo_nets.maps.map_store import map_net, maps_folder
+
+    folder = maps_folder() / name
+    if not has_scan(folder):
+        map_net(name)  # raises for an unknown map
+        raise UsageError(
+            f"'{name}' is a map without a scan: scans are imported with `cosim scan import`"
+        )
+    return folder
