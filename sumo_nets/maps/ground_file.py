@@ -180,7 +180,9 @@ def _joined(one: Polygon, other: Polygon) -> list[Polygon]:
     both = shapely.union(one, other)
     if isinstance(both, Polygon):
         return [both]
-    closed = shapely.buffer(shapely.buffer(both, 1e-4, join_style="mitre"), -1e-4, join_style="mitre")
+    closed = shapely.buffer(
+        shapely.buffer(both, 1e-4, join_style="mitre"), -1e-4, join_style="mitre"
+    )
     return [closed] if isinstance(closed, Polygon) else [one]
 
 
