@@ -31,8 +31,8 @@ from cosim.place.walk_graph import WalkGraph
 from sumo_nets.maps.driving_side import left_hand_country
 from sumo_nets.maps.ground_file import GROUND_FILE, drawn_ground, write_ground
 from sumo_nets.maps.net_steps import start_net
-from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.net_file import read_net
+from sumo_nets.net.netconvert import netconvert
 
 CROWD_M: Final = 1.2
 """Clear width below which the crowd does not walk, in metres."""
@@ -136,7 +136,8 @@ def build_scan_net(
     start_net(path, str(path))
     names = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
     narrow = [name for name, edge in names.items() if edge.clear_m < CROWD_M]
-    write_ground(drawn_ground(street_map, ground, tuple(narrow)), folder / GROUND_FILE)
+    widths_m = {name: round(edge.clear_m, 3) for name, edge in names.items()}
+    write_ground(drawn_ground(street_map, ground, widths_m, tuple(narrow)), folder / GROUND_FILE)
     if narrow:
         at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
         findings.append(
@@ -163,8 +164,7 @@ def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
     over = [
         area.polygon
         for area in areas
-        if area.kind == "crossing"
-        and shapely.intersection(area.polygon, roads).area > _ON_ROAD_M2
+        if area.kind == "crossing" and shapely.intersection(area.polygon, roads).area > _ON_ROAD_M2
     ]
     off_road = overlay.difference(
         ground, overlay.union_all([overlay.difference(one, walks) for one in over])
@@ -261,11 +261,12 @@ def _nearest(plan: _Plan, point: shapely.Point, *, drive: bool) -> tuple[_Edge |
 def _joint(plan: _Plan, end: Floats, outward: Floats) -> tuple[_Edge, Floats] | None:
     """Return the walk that a crossing joins straight on, else the nearest one, and the place."""
     ray = LineString([end, end + _JOIN_M * outward])
-    hits = []
-    for i, edge in enumerate(plan.edges):
-        if not edge.drive:
-            for xy in shapely.get_coordinates(shapely.intersection(ray, LineString(edge.line))):
-                hits.append((float(np.hypot(*(xy - end))), i, xy))
+    hits = [
+        (float(np.hypot(*(xy - end))), i, xy)
+        for i, edge in enumerate(plan.edges)
+        if not edge.drive
+        for xy in shapely.get_coordinates(shapely.intersection(ray, LineString(edge.line)))
+    ]
     if hits:
         _, i, xy = min(hits, key=lambda hit: hit[:2])
         return plan.edges[i], xy
@@ -307,7 +308,9 @@ def _converted(
     edges = [row for i, edge in enumerate(plan.edges) for row in _rows(i, edge)]
     zebras = []
     for zebra in plan.zebras:
-        arm = next(i for i, e in enumerate(plan.edges) if e.drive and zebra.node in (e.start, e.end))
+        arm = next(
+            i for i, e in enumerate(plan.edges) if e.drive and zebra.node in (e.start, e.end)
+        )
         both = [f"r{arm}"] + ([f"-r{arm}"] if _two_way(plan.edges[arm]) else [])
         zebras.append(
             f'<crossing node="n{zebra.node}" edges="{" ".join(both)}" '
@@ -341,9 +344,7 @@ def _clockwise(zebra: _Zebra, road: _Edge, left: bool) -> Floats:
     return zebra.line if from_right != left else zebra.line[::-1]
 
 
-def _built(
-    plan: _Plan, georeference: Georeference | None, folder: Path
-) -> tuple[Path, StreetMap]:
+def _built(plan: _Plan, georeference: Georeference | None, folder: Path) -> tuple[Path, StreetMap]:
     """Build the net with the first radius of junctions that keeps all crossings."""
     for radius_m in _RADII_M:
         path = _converted(plan, georeference, folder, radius_m)
@@ -407,7 +408,13 @@ def _rows(number: int, edge: _Edge) -> list[str]:
 
 
 def _row(
-    name: str, start: int, end: int, line: Floats, lane_m: float, allowed: str, spread: str = "center"
+    name: str,
+    start: int,
+    end: int,
+    line: Floats,
+    lane_m: float,
+    allowed: str,
+    spread: str = "center",
 ) -> str:
     speed_mps = _WALK_MPS if allowed == "pedestrian" else _LANE_MPS
     return (
