@@ -139,7 +139,10 @@ def write_generated_scan(
 
 
 def street_areas(surface: StreetSurface, box: Box) -> list[ScanArea]:
-    """Return the walkable ground, roads, verges and obstacles of a street within a box."""
+    """Return the walkable ground, roads, verges and obstacles of a street within a box.
+
+    Crossings lie on roads; no other two kinds of ground overlap.
+    """
     inside = shapely.box(*box)
     street_map = surface.street_map
     ground: dict[AreaKind, list[shapely.Geometry]] = {
@@ -159,7 +162,7 @@ def street_areas(surface: StreetSurface, box: Box) -> list[ScanArea]:
     areas = []
     for kind, shapes in ground.items():
         shape = overlay.intersection(overlay.union_all(shapes), inside)
-        if kind != "obstacle":
+        if kind not in ("crossing", "obstacle"):
             shape, taken = overlay.difference(shape, taken), overlay.union_all([taken, shape])
         areas += [ScanArea(kind, part) for part in _polygons(shape)]
     return areas

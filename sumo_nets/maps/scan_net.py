@@ -70,7 +70,11 @@ _RADII_M: Final = (0.5, 1.5, 3.0)
 
 @dataclass(slots=True)
 class _Edge:
-    """Edge of the net. drive: whether it is a road."""
+    """Edge of the net.
+
+    drive: whether it is a road.
+    cars: whether cars use the road.
+    """
 
     start: int
     end: int
@@ -78,6 +82,7 @@ class _Edge:
     clear_m: float
     lane_m: float
     drive: bool = False
+    cars: bool = True
 
 
 @dataclass(slots=True)
@@ -179,7 +184,7 @@ def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
     if not roads.is_empty:
         _add_roads(plan, medial_axis(roads, whole=True))
     for crossing in over:
-        _add_crossing(plan, crossing, roads)
+        _add_crossing(plan, crossing, roads, walks)
     return plan
 
 
@@ -196,53 +201,93 @@ def _inner(clear_m: float) -> float:
     return max(clear_m - INNER_M, _LEAST_LANE_M)
 
 
-def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> None:
+def _add_crossing(
+    plan: _Plan, crossing: Polygon, roads: shapely.Geometry, walks: shapely.Geometry
+) -> None:
     """Add a crossing, with links to the sidewalks on both sides.
 
-    Raises MapError if it joins no road or no sidewalk.
+    Where no drawn road leads straight over it, such as next to a junction, it gets a piece of road
+    of its own without cars. Raises MapError if it does not lead from sidewalk to sidewalk.
     """
     where = f"the crossing near ({crossing.centroid.x:.1f}, {crossing.centroid.y:.1f})"
-    road, _ = _nearest(plan, crossing.centroid, drive=True)
-    if road is None:
-        raise MapError(f"{where} leads over a road that is too narrow for cars: widen the road")
-    on_road = shapely.intersection(crossing, roads)
-    middle, along, width_m = _direction(on_road, road)
-    half = crossing.length * along
-    kerbs = shapely.get_coordinates(
-        shapely.intersection(LineString([middle - half, middle + half]), roads)
-    )
-    reach = (kerbs - middle) @ along
-    low, high = float(reach[reach < 0].max(initial=-1e9)), float(reach[reach > 0].min(initial=1e9))
-    if not (-_JOIN_M < low < 0.0 < high < _JOIN_M):
+    span = _span(crossing, roads, walks)
+    if span is None:
         raise MapError(f"{where} does not lead from one side of its road to the other: redraw it")
-    node = _split(plan, road, middle, _ROAD_END_M, where)
-    ends = np.array([middle + low * along, middle + high * along])
-    lane_m = _inner(width_m - INNER_M)
-    plan.zebras.append(_Zebra(node, ends, lane_m))
-    for end, outward in ((ends[0], -along), (ends[1], along)):
+    road = _road_over(plan, span)
+    if road is None:
+        across = np.array([-span.along[1], span.along[0]]) * _ROAD_END_M
+        road = _stub(plan, np.array([span.middle - across, span.middle + across]), span)
+    node = _split(plan, road, span.middle, _ROAD_END_M)
+    lane_m = _inner(span.width_m - INNER_M)
+    plan.zebras.append(_Zebra(node, span.ends, lane_m))
+    for end, outward in ((span.ends[0], -span.along), (span.ends[1], span.along)):
         meets = _joint(plan, end, outward)
         if meets is None:
             raise MapError(f"{where} joins no sidewalk at one end: draw one there")
         piece, at = meets
-        joint = _split(plan, piece, at, _NEAR_END_M, where)
-        line = np.vstack([plan.nodes[joint], end + _KERB_M * outward, middle])
-        plan.edges.append(_Edge(joint, node, line, width_m, lane_m))
+        joint = _split(plan, piece, at, _NEAR_END_M)
+        line = np.vstack([plan.nodes[joint], end + _KERB_M * outward, span.middle])
+        plan.edges.append(_Edge(joint, node, line, span.width_m, lane_m))
 
 
-def _direction(on_road: shapely.Geometry, road: _Edge) -> tuple[Floats, Floats, float]:
-    """Return the middle of a crossing, its direction across the road, and its width in metres."""
-    box = shapely.minimum_rotated_rectangle(on_road)
-    corners = shapely.get_coordinates(box)[:4]
+class _Span(NamedTuple):
+    """Crossing of a road.
+
+    middle: (2,) metres.
+    along: (2,) unit vector across the road.
+    ends: (2, 2) from curb to curb, metres.
+    """
+
+    middle: Floats
+    along: Floats
+    ends: Floats
+    width_m: float
+
+
+def _span(crossing: Polygon, roads: shapely.Geometry, walks: shapely.Geometry) -> _Span | None:
+    """Return the span of a crossing, along that of its axes whose ends are nearest to sidewalks."""
+    corners = shapely.get_coordinates(
+        shapely.minimum_rotated_rectangle(shapely.intersection(crossing, roads))
+    )[:4]
     middle = corners.mean(axis=0)
     sides = [corners[1] - corners[0], corners[2] - corners[1]]
+    lengths_m = [float(np.hypot(*side)) for side in sides]
+    found = []
+    for k, side in enumerate(sides):
+        along = side / lengths_m[k]
+        ray = LineString([middle - _JOIN_M * along, middle + _JOIN_M * along])
+        kerbs = shapely.get_coordinates(shapely.intersection(ray, shapely.boundary(roads)))
+        reach = (kerbs - middle) @ along
+        low = float(reach[reach < 0.0].max(initial=-math.inf))
+        high = float(reach[reach > 0.0].min(initial=math.inf))
+        if not (math.isfinite(low) and math.isfinite(high)):
+            continue
+        ends = np.array([middle + low * along, middle + high * along])
+        gap_m = sum(float(walks.distance(shapely.Point(end))) for end in ends)
+        found.append((gap_m, k, _Span(middle, along, ends, lengths_m[1 - k])))
+    return min(found, key=lambda one: one[:2])[2] if found else None
+
+
+def _road_over(plan: _Plan, span: _Span) -> _Edge | None:
+    """Return the road that leads straight over a crossing, if one is long enough."""
+    road, gap_m = _nearest(plan, shapely.Point(span.middle), drive=True)
+    if road is None or gap_m > 0.5 * float(np.hypot(*(span.ends[1] - span.ends[0]))):
+        return None
     line = Polyline(road.line)
-    pose = line.at(line.project(*middle.tolist())[0])
-    across = np.array([-math.sin(pose.heading_rad), math.cos(pose.heading_rad)])
-    lengths = [float(np.hypot(*side)) for side in sides]
-    units = [side / length for side, length in zip(sides, lengths, strict=True)]
-    k = int(np.argmax([abs(float(unit @ across)) for unit in units]))
-    along = units[k] * (1.0 if float(units[k] @ across) > 0.0 else -1.0)
-    return middle, along, lengths[1 - k]
+    s_m = line.project(*span.middle.tolist())[0]
+    heading_rad = line.at(s_m).heading_rad
+    aligned = abs(math.cos(heading_rad) * span.along[0] + math.sin(heading_rad) * span.along[1])
+    fits = _ROAD_END_M <= s_m <= line.length_m - _ROAD_END_M
+    return road if fits and aligned < math.sqrt(0.5) else None
+
+
+def _stub(plan: _Plan, line: Floats, span: _Span) -> _Edge:
+    """Add a piece of road without cars."""
+    start, end = (plan.node(xy) for xy in line)
+    clear_m = float(np.hypot(*(span.ends[1] - span.ends[0])))
+    edge = _Edge(start, end, line, clear_m, clear_m - INNER_M, drive=True, cars=False)
+    plan.edges.append(edge)
+    return edge
 
 
 def _nearest(plan: _Plan, point: shapely.Point, *, drive: bool) -> tuple[_Edge | None, float]:
@@ -277,12 +322,10 @@ def _joint(plan: _Plan, end: Floats, outward: Floats) -> tuple[_Edge, Floats] | 
     return edge, line.at(line.project(*(end + outward).tolist())[0]).xy
 
 
-def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float, where: str) -> int:
+def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float) -> int:
     """Return the node of an edge at a place: one of its ends if near, else a new one."""
     line = Polyline(edge.line)
     s_m = line.project(*np.asarray(at).tolist())[0]
-    if edge.drive and line.length_m < 2.0 * near_m:
-        raise MapError(f"{where}: its road is shorter than {2.0 * near_m:g} m: draw it longer")
     if edge.drive:
         s_m = min(max(s_m, near_m), line.length_m - near_m)
     elif s_m < near_m or s_m > line.length_m - near_m:
@@ -398,12 +441,13 @@ def _rows(number: int, edge: _Edge) -> list[str]:
     """Return the XML of an edge: a walk, or a road with a lane in one or both directions."""
     if not edge.drive:
         return [_row(f"w{number}", edge.start, edge.end, edge.line, edge.lane_m, "pedestrian")]
+    allowed = "passenger" if edge.cars else "custom1"
     if not _two_way(edge):
-        return [_row(f"r{number}", edge.start, edge.end, edge.line, edge.lane_m, "passenger")]
+        return [_row(f"r{number}", edge.start, edge.end, edge.line, edge.lane_m, allowed)]
     half_m = 0.5 * edge.lane_m
     return [
-        _row(f"r{number}", edge.start, edge.end, edge.line, half_m, "passenger", "right"),
-        _row(f"-r{number}", edge.end, edge.start, edge.line[::-1], half_m, "passenger", "right"),
+        _row(f"r{number}", edge.start, edge.end, edge.line, half_m, allowed, "right"),
+        _row(f"-r{number}", edge.end, edge.start, edge.line[::-1], half_m, allowed, "right"),
     ]
 
 
