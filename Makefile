@@ -3,6 +3,8 @@
 
 PYTHON ?= python3.11
 JOBS ?= 2
+# Tests often wait for other processes: three of pytest keep two cores busy.
+WORKERS ?= 3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
@@ -20,9 +22,10 @@ help:
 run: .venv/run.stamp | machine
 	@$(BIN)/cosim run long-horizon --policy orca --episodes 2 --jobs $(JOBS)
 
+PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 test: .venv/dev.stamp | machine
-	@$(BIN)/python -m pytest -m "not engine" -n $(JOBS) --dist loadfile
-	@$(BIN)/python -m pytest -m engine -n $(JOBS) --dist loadfile
+	@$(BIN)/python -m pytest -m "not engine" $(PARALLEL)
+	@$(BIN)/python -m pytest -m engine $(PARALLEL)
 
 check: .venv/dev.stamp | machine
 	@$(BIN)/ruff check .

@@ -54,7 +54,7 @@ def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim
     """In each shard pairs alone, which merged have D; one alone by its id, none with --no-decoys; a
     run is resumed with its own choice; `cosim score` and `cosim list` know decoys."""
 
-    always = ("run", few.name, "--policy", "stop", "--seed", "7")
+    always = ("run", few.name, "--policy", "schedule:stand", "--seed", "7")
 
     def run(name: str, *words: str) -> set[str]:
         said = cosim(*always, "--out", name, *words, cwd=tmp_path)
