@@ -9,37 +9,16 @@ import pandas as pd
 import pytest
 
 from cosim.spec.scenario import Suite, write_suite
-from scenarios.suites.user_scenarios.build import suite_of_own
-from scenarios.suites.user_scenarios.read import read_own
 from tests.conftest import Cosim
-
-
-WAY = """
-name = "{kind}-001"
-[place]
-city = 1
-size_m = 500
-[way]
-kind = "straight"
-length_m = 20
-[[events]]
-kind = "{kind}"
-at_m = 10
-[limits]
-time_s = 1
-ends_at = "goal"
-"""
+from tests.support.event_ways import event_way
 
 
 @pytest.fixture
 def few(tmp_path: Path) -> Path:
     """Two scenarios in a small city that are over after a second, and their decoys at the end."""
-    own = tmp_path / "own.toml"
-    events = []
-    for kind in ("lateral", "overtaking"):
-        own.write_text(WAY.format(kind=kind))
-        (event,) = suite_of_own(read_own(own)).scenarios
-        events.append(msgspec.structs.replace(event, id=f"{kind}-001", structure=kind))
+    events = [
+        event_way(kind, f"{kind}-001", at_m=10.0, time_s=1.0) for kind in ("lateral", "overtaking")
+    ]
     decoys = [
         msgspec.structs.replace(one, id=f"{one.id}-decoy", decoy_of=one.id, go_on_mps=0.6)
         for one in events
