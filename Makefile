@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 help:
 	@echo "make run    run two long-horizon episodes and print their table"
-	@echo "make test   run every test, the fast ones first"
+	@echo "make test   run every test, the longest first; the fast ones alone: pytest -m 'not engine'"
 	@echo "make check  ruff, mypy, import-linter"
 	@echo "make docs   the documentation as a site in build/docs, every warning an error"
 	@echo "make bench  speed and memory, with ratios"
@@ -22,10 +22,8 @@ help:
 run: .venv/run.stamp | machine
 	@$(BIN)/cosim run long-horizon --policy orca --episodes 2 --jobs $(JOBS)
 
-PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 test: .venv/dev.stamp | machine
-	@$(BIN)/python -m pytest -m "not engine" $(PARALLEL)
-	@$(BIN)/python -m pytest -m engine $(PARALLEL)
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 check: .venv/dev.stamp | machine
 	@$(BIN)/ruff check .

@@ -182,7 +182,9 @@ def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
         os.chdir(before[0])
         sys.argv = before[1]
         sys.path[:] = before[2]
-        for name in {*sys.modules} - before[3]:
+        # Modules of the project and of its environment stay, also where the folder is the project's.
+        others = () if folder == ROOT else {*sys.modules} - before[3]
+        for name in others:
             source = getattr(sys.modules[name], "__file__", None)
             if source and Path(source).is_relative_to(folder):
                 del sys.modules[name]

@@ -331,9 +331,7 @@ def test_a_full_disk_ends_the_run_with_the_reason(
         "run",
         "tiny.json",
         "--policy",
-        "straight",
-        "--camera",
-        "bullet",
+        "schedule:stand",
         "--seed",
         SEED,
         "--out",
@@ -480,7 +478,7 @@ def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(
 ) -> None:
     """A drawn seed is printed and is in run.json and every row; --resume takes it and refuses
     another."""
-    words = ("run", "tiny.json", "--policy", "stop", "--episodes", "1", "--out", "one")
+    words = ("run", "tiny.json", "--policy", "schedule:stand", "--episodes", "1", "--out", "one")
     run = cosim(*words, cwd=desk)
     seed = json.loads((desk / "one/run.json").read_text())["seed"]
     assert run.returncode == 0 and f"Seed {seed}: " in run.stderr
