@@ -159,7 +159,15 @@ def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -
 def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
     """From a file to a table by density, and files beside the run; it is resumed, but not once the
     file is edited."""
-    words = ("scenario", "run", "density-sweep.toml", "--policy", "schedule:stand", "--out", "swept")
+    words = (
+        "scenario",
+        "run",
+        "density-sweep.toml",
+        "--policy",
+        "schedule:stand",
+        "--out",
+        "swept",
+    )
     ran = cosim(*words, cwd=examples)
     assert ran.returncode == 0, ran.stderr
     head, *_ = (line for line in ran.stdout.splitlines() if "SR" in line)
