@@ -27,6 +27,7 @@ from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.episode_id import episode_id_of
 from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.scenario import CrowdSpec, Scenario, Suite, write_suite
+from physics.cameras.choice import renderer_of
 from scenarios.ipc.sandbox import KINDS
 from scenarios.runs import run as suite_run
 from scenarios.runs.isolated_policy import isolated_driver
@@ -259,9 +260,11 @@ def test_nobody_pays_for_what_another_did_to_the_process(hosting: str, wars: War
 
 @pytest.mark.engine
 def test_pictures_are_kept_as_they_were_drawn(hosting: str, wars: Wars) -> None:
-    """A policy that blackens the picture it is given does not blacken the one that is kept."""
+    """A policy that blackens the picture it is given does not blacken the one that is kept; the
+    record names the renderer."""
     if hosting == "isolated":
         return
+    assert wars.others.records["honest"].setup.renderer == renderer_of("bullet")
     episodes = wars.others.folder / "episodes"
     honest, blackened = (
         [path.read_bytes() for path in sorted((episodes / name / "frames").glob("*.png"))]
