@@ -56,7 +56,8 @@ def test_a_cheat_solves_no_event(cheat: str, request: pytest.FixtureRequest) -> 
 def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: Cosim) -> None:
     """It has failed, hit nobody, and covered nothing of its route; its run has no rates and ends
     with 1."""
-    suite = Suite(name="one", version="1", scenarios=(event_way("frontal", "one", at_m=12.0),))
+    way = event_way("obstructing", "one", at_m=11.0)
+    suite = Suite(name="one", version="1", scenarios=(way,))
     write_suite(suite, tmp_path / "one.json")
     words = ("run", "one.json", "--policy", "tests.support.cheats:Quitter", "--out", "r")
     ran = cosim(*words, cwd=tmp_path)
