@@ -36,13 +36,15 @@ def suite_on_map(
     """Draw a suite on a place; the same arguments and net give the same suite.
 
     count: of long-horizon scenarios, 1 by default; of reactive and unit ones, whose events and
-    structures take turns, one of each by default. events: which of them; those for which the place has no room are left out,
-    and the description says so, unless they were asked for. Where sidewalks are few or narrow,
-    fewer people walk, and none in groups; long routes prefer wide sidewalks: see `passable` and
-    `build_long_horizon`. roughness: of the ground, from 0 (flat) to 1. kinds: the table of events
-    that there are. robot: which one the ways are wide enough for.
+        structures take turns, one of each by default.
+    events: which of them. Those for which the place has no room are left out, and the description
+        says so, unless they were asked for.
+    roughness: of the ground, from 0 (flat) to 1.
+    kinds: table of events.
+    robot: robot for which the ways are wide enough.
 
     Fewer people walk where sidewalks are few or narrow, and none in groups: a robot could not pass.
+    Long routes prefer wide sidewalks: see `passable` and `build_long_horizon`.
 
     Raises UsageError for another kind of suite, and the errors of the place and the builder.
     """
