@@ -203,7 +203,7 @@ def _labelled_points(street_map: StreetMap) -> tuple[Floats, NDArray[np.int64]]:
         found.append(points)
         owners += [number] * len(points)
     xy, first = np.unique(np.round(np.concatenate(found), 6), axis=0, return_index=True)
-    return xy, np.array(owners, dtype=np.int64)[first]
+    return np.asarray(xy, dtype=float), np.array(owners, dtype=np.int64)[first]
 
 
 def _corner_points(street_map: StreetMap, corner: Corner) -> Floats:
