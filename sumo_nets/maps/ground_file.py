@@ -272,7 +272,7 @@ def _whole(parts: list[Polygon]) -> Polygon:
 def _several(parts: list[Polygon], corner: Corner) -> Polygon | MultiPolygon:
     if not parts:  # between two pieces that touch
         return shapely.Point(corner.polygon.centroid).buffer(_END_M)
-    return parts[0] if len(parts) == 1 else MultiPolygon(parts)
+    return overlay.union_all(parts)
 
 
 def _rings(shape: Polygon | MultiPolygon) -> list[_Rings]:

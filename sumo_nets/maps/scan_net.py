@@ -243,7 +243,7 @@ def _inner(clear_m: float) -> float:
 
 
 def _add_crossing(
-    plan: _Plan, number: int, on_road: shapely.Geometry, roads: shapely.Geometry
+    plan: _Plan, number: int, on_road: Polygon | MultiPolygon, roads: shapely.Geometry
 ) -> None:
     """Add a crossing, with links to the sidewalks on both sides.
 
