@@ -252,8 +252,8 @@ BAD: dict[str, tuple[Spoil, str]] = {
         "'EPSG:1' is no coordinate system: give one such as EPSG:25833",
     ),
     "beside": (
-        _cloud(_move((1.0, 0.0, 0.0))),
-        r"splats lie 1\.\d m beside the mesh: \d+% .* after a shift by \(-1\.0, .*--splat-trans",
+        _cloud(_move((0.0, 1.0, 0.0))),
+        r"splats lie 1\.\d m beside the mesh: \d+% .* after a shift by \(.*, -1\.0, .*--splat-trans",
     ),
     "above": (_cloud(_move((0.0, 0.0, 0.5))), r"lie 0\.[45] m beside the mesh"),
     "slightly-above": (
