@@ -98,7 +98,7 @@ def check_similarity(transform: Sequence[Sequence[float]]) -> None:
 
 def scale_of(matrix: Sequence[Sequence[float]]) -> float:
     """Return the metres per unit of a matrix."""
-    return abs(_determinant(matrix)) ** (1.0 / 3.0)
+    return float(abs(_determinant(matrix)) ** (1.0 / 3.0))
 
 
 def combine(second: Matrix, first: Matrix) -> Matrix:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,15 +15,17 @@ import pytest
 import shapely
 import trimesh
 
+from cosim.cli.scan import ScanChoices
 from cosim.core.errors import CosimError
 from cosim.core.state import LABELS
 from cosim.place.scan import read_scan
-from physics.scans.check import check_rotations
+from physics.scans.frame import Placing
 from scenarios.places import scan_sources
 from scenarios.places.scan_import import CheckedScan, check_scan, import_scan
-from scenarios.places.scan_options import read_options
+from scenarios.places.scan_options import ScanOptions, read_options
 from sumo_nets.maps.map_store import maps_folder, read_map
 from tests.conftest import Cosim
+from tests.support.documents import blocks, text_of
 from tests.support.scans import (
     LENGTH_M,
     Street,
@@ -202,6 +206,10 @@ def _nan_mesh(folder: Path) -> None:
     (folder / "scan.json").write_text('{"files": ["mesh.obj"], "scale": 1, "up": "+z"}')
 
 
+def _system(crs: str) -> Placing:
+    return Placing(crs=crs)
+
+
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 14990961\n"
 SHEARED = [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -247,7 +255,7 @@ BAD: dict[str, tuple[Spoil, str]] = {
     ),
     "crs": (
         lambda folder: {
-            "georeference": scan_sources_placing("EPSG:1"),
+            "georeference": _system("EPSG:1"),
         },
         "'EPSG:1' is no coordinate system: give one such as EPSG:25833",
     ),
@@ -296,17 +304,9 @@ BAD: dict[str, tuple[Spoil, str]] = {
 }
 
 
-def scan_sources_placing(crs: str) -> Any:
-    from physics.scans.frame import Placing
-
-    return Placing(crs=crs)
-
-
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_scan_is_described_in_one_line(scan: Path, name: str) -> None:
     """Each fault gives one line with the measured value and, where the scan is refused, a remedy."""
-    import re
-
     spoil, wanted = BAD[name]
     said = _words(scan, **(spoil(scan) or {}))
     found = [words for words in said if re.search(wanted, words)]
@@ -339,7 +339,6 @@ def test_rotations_in_another_order_are_noticed(scan: Path) -> None:
     (scan / "splats.ply").write_bytes(gaussian_ply(cloud, order="xyzw"))
     assert any("try --quaternions xyzw" in words for words in _words(scan))
     assert not any("--quaternions" in words for words in _words(scan, quaternions="xyzw"))
-    assert check_rotations is not None
 
 
 def test_mirrored_and_flipped_meshes_are_mended_by_option(scan: Path) -> None:
@@ -375,8 +374,6 @@ def test_the_order_of_rows_changes_no_bit_of_what_is_stored(scan: Path, tmp_path
     for k in range(2):
         part = Street(place.vertices[rows], triangles[k::2], place.colours[rows])
         (other / f"{k}.glb").write_bytes(glb(part))
-        some = cloud.taken(random.permutation(12_000)[:0])
-        assert len(some.centres) == 0
     order = random.permutation(12_000)
     (other / "b.ply").write_bytes(gaussian_ply(cloud.taken(order[:5000])))
     (other / "c.ply").write_bytes(gaussian_ply(cloud.taken(order[5000:])))
@@ -419,7 +416,7 @@ def test_a_scan_is_recovered_from_a_corrupted_export(tmp_path: Path, made: Path)
     )
     wanted = shapely.box(1, -4, LENGTH_M - 1, -1)
     options = read_options(
-        folder, {"scale": 0.01, "up": "+z", "georeference": scan_sources_placing("EPSG:25833")}
+        folder, {"scale": 0.01, "up": "+z", "georeference": _system("EPSG:25833")}
     )
     loaded, _ = scan_sources.load_mesh(folder, options)
     matrix = np.array(loaded.matrix)
@@ -444,7 +441,7 @@ def test_a_scan_is_recovered_from_a_corrupted_export(tmp_path: Path, made: Path)
         {
             "scale": 0.01,
             "up": "+z",
-            "georeference": scan_sources_placing("EPSG:25833"),
+            "georeference": _system("EPSG:25833"),
             "areas": str(drawn),
             "name": "scan-spoiled",
         },
@@ -455,7 +452,7 @@ def test_a_scan_is_recovered_from_a_corrupted_export(tmp_path: Path, made: Path)
     x, y = np.meshgrid(np.arange(2, 28, 0.5), np.arange(-3.8, -1.2, 0.2))
     at = to_net(np.column_stack([x.ravel(), y.ravel()]))
     cell = np.rint((at - heights.origin) / heights.step_m).astype(int)
-    found = heights.heights[cell[:, 1], cell[:, 0]] + matrix[2, 3] * 0
+    found = heights.heights[cell[:, 1], cell[:, 0]]
     level = 34.0 + matrix[2, 3]
     assert np.abs(found - level).max() < 0.03
     walkable = shapely.union_all(
@@ -518,6 +515,19 @@ def test_a_street_in_lund_is_imported(tmp_path: Path) -> None:
     assert checked.scan is not None
     assert len(checked.scan.mesh.triangles) == 136_904
     assert read_map(about.name).strips
+
+
+def test_the_documented_options_are_those_of_the_import(tmp_path: Path) -> None:
+    """The scan.json of the page is read, and its table names every key and option."""
+    (block,) = blocks("json", "docs/scans.md")
+    (tmp_path / "scan.json").write_text(block.text)
+    assert read_options(tmp_path, {}).splat_up == "+z"
+    text = text_of("docs/scans.md")
+    for name in ScanOptions.__struct_fields__:
+        assert f"`{name}`" in text, name
+    for name in (field.name for field in dataclasses.fields(ScanChoices)):
+        flag = f"--{name.replace('_', '-')}"
+        assert flag in text or name.startswith("splat_"), flag
 
 
 def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
