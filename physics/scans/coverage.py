@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats
 from cosim.place.scan import HeightGrid, Splats
@@ -31,7 +31,7 @@ _SOFTNESS: Final = 0.1
 """Variance in square pixels that is added, so that small splats are not lost between pixels."""
 
 
-def view_points(walkable: shapely.Geometry, heights: HeightGrid, most: int = VIEWS) -> Floats:
+def view_points(walkable: BaseGeometry, heights: HeightGrid, most: int = VIEWS) -> Floats:
     """Return eyes spread over the walkable area, (K, 3) m."""
     points = lattice_points(walkable, 0.5)
     if not len(points):

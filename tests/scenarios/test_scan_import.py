@@ -1,0 +1,545 @@
+"""Importing scans: bad inputs, the order of files, real scans, the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+
+from cosim.cli.scan import ScanChoices
+from cosim.core.errors import CosimError
+from cosim.core.state import LABELS
+from cosim.place.scan import read_scan
+from physics.scans.frame import Placing
+from scenarios.places import scan_sources
+from scenarios.places.scan_import import CheckedScan, check_scan, import_scan
+from scenarios.places.scan_options import ScanOptions, read_options
+from sumo_nets.maps.map_store import maps_folder, read_map
+from tests.conftest import Cosim
+from tests.support.documents import blocks, text_of
+from tests.support.scans import (
+    LENGTH_M,
+    Street,
+    gaussian_ply,
+    glb,
+    splats_of,
+    street,
+    write_street,
+)
+
+SHARED = Path(__file__).parents[3] / "shared" / "scans"
+GIVEN: dict[str, Any] = {"splat_scale": 1.0, "splat_up": "+z"}
+Spoil = Callable[[Path], dict[str, Any] | None]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good scan, to be copied."""
+    folder = write_street(tmp_path_factory.mktemp("scans") / "street")
+    _draw(folder, [("sidewalk", (1, -4, LENGTH_M - 1, -1))])
+    return folder
+
+
+@pytest.fixture
+def scan(made: Path, tmp_path: Path) -> Path:
+    """A copy of the good scan."""
+    return Path(shutil.copytree(made, tmp_path / "street"))
+
+
+def _draw(folder: Path, areas: list[tuple[str, tuple[float, ...]]]) -> None:
+    """Write areas.geojson with boxes, in metres."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"kind": kind},
+            "geometry": shapely.geometry.mapping(shapely.box(*box)),
+        }
+        for kind, box in areas
+    ]
+    whole = {"type": "FeatureCollection", "frame": "local", "features": features}
+    (folder / "areas.geojson").write_text(json.dumps(whole))
+
+
+def _check(folder: Path, **given: Any) -> CheckedScan:
+    given = {"areas": str(folder / "areas.geojson"), **GIVEN, **given}
+    return check_scan(folder, read_options(folder, given))
+
+
+def _words(folder: Path, **given: Any) -> list[str]:
+    """What is said about a scan: its findings, or the error."""
+    try:
+        return [str(one) for one in _check(folder, **given).findings]
+    except CosimError as error:
+        return [f"refused: {error}"]
+
+
+def test_a_good_scan_passes_all_checks(scan: Path) -> None:
+    """Nothing is warned of but the coverage, of which a lone street has little; no good splat is removed."""
+    checked = _check(scan)
+    levels = {one.level for one in checked.findings if "coverage" not in one.words}
+    assert levels == {"note"}
+    assert checked.scan is not None
+    assert checked.scan.splats is not None
+    assert len(checked.scan.splats) == 12_000
+    assert checked.scan.floaters is not None
+    assert len(checked.scan.floaters) == 0
+    share = checked.scan.splats.ground.mean()
+    assert share == pytest.approx(LENGTH_M * 12 / (LENGTH_M * 15 + 13.6), abs=0.05)
+    labels = set(checked.scan.mesh.labels.tolist())
+    assert {LABELS[name] for name in ("sidewalk", "ground", "building", "prop")} == labels
+
+
+def _bytes(name: str, data: bytes) -> Spoil:
+    def spoil(folder: Path) -> None:
+        (folder / name).write_bytes(data)
+
+    return spoil
+
+
+def _cut(name: str, share: float) -> Spoil:
+    def spoil(folder: Path) -> None:
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: int(share * len(data))])
+
+    return spoil
+
+
+def _mesh(change: Callable[[Street], Street], **given: Any) -> Spoil:
+    def spoil(folder: Path) -> dict[str, Any]:
+        (folder / "mesh.glb").write_bytes(glb(change(street())))
+        (folder / "splats.ply").unlink()
+        return {"splat_scale": None, "splat_up": None, **given}
+
+    return spoil
+
+
+def _cloud(change: Callable[[Any], None], **given: Any) -> Spoil:
+    def spoil(folder: Path) -> dict[str, Any]:
+        cloud = splats_of(street())
+        change(cloud)
+        (folder / "splats.ply").write_bytes(gaussian_ply(cloud))
+        return given
+
+    return spoil
+
+
+def _turned(degrees: float) -> Callable[[Street], Street]:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return lambda place: place.moved(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]))
+
+
+def _set(field: str, rows: Any, value: Any) -> Callable[[Any], None]:
+    def change(cloud: Any) -> None:
+        getattr(cloud, field)[rows] = value
+
+    return change
+
+
+def _move(offset: tuple[float, ...], scale: float = 1.0) -> Callable[[Any], None]:
+    def change(cloud: Any) -> None:
+        cloud.centres = cloud.centres * scale + offset
+
+    return change
+
+
+def _without(name: str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        (folder / name).unlink()
+
+    return spoil
+
+
+def _as_ply(folder: Path) -> dict[str, Any]:
+    """The mesh as .ply, which states neither unit nor axes, in centimetres."""
+    street().moved(100.0 * np.eye(3)).mesh().export(folder / "mesh.ply")
+    (folder / "mesh.glb").unlink()
+    return {}
+
+
+def _drawn(*areas: tuple[str, tuple[float, ...]]) -> Spoil:
+    def spoil(folder: Path) -> None:
+        _draw(folder, list(areas))
+
+    return spoil
+
+
+def _punched(folder: Path) -> dict[str, Any]:
+    """A mesh without ground at x from 10 to 14."""
+    place = street()
+    middle = place.vertices[place.triangles].mean(axis=1)
+    hole = (np.abs(middle[:, 0] - 12) < 2) & (middle[:, 2] < 0.01)
+    place.triangles = place.triangles[~hole]
+    (folder / "mesh.glb").write_bytes(glb(place))
+    return {}
+
+
+def _wrong_way(folder: Path) -> dict[str, Any]:
+    way = [[x, -2.5, 10.0] for x in range(2, 28)]
+    (folder / "way.json").write_text(json.dumps({"route": way}))
+    return {"areas": None, "way": str(folder / "way.json"), "width_m": 2.0}
+
+
+def _given(**given: Any) -> Spoil:
+    return lambda folder: given
+
+
+def _transform(rows: list[list[float]]) -> Spoil:
+    return _given(transform=tuple(map(tuple, rows)))
+
+
+def _nan_mesh(folder: Path) -> None:
+    place = street()
+    place.vertices[::20, 1] = np.nan
+    (folder / "mesh.obj").write_text(
+        "".join(f"v {x} {y} {z}\n" for x, y, z in place.vertices)
+        + "".join(f"f {a} {b} {c}\n" for a, b, c in place.triangles + 1)
+    )
+    (folder / "scan.json").write_text('{"files": ["mesh.obj"], "scale": 1, "up": "+z"}')
+
+
+def _system(crs: str) -> Placing:
+    return Placing(crs=crs)
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 14990961\n"
+SHEARED = [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+BAD: dict[str, tuple[Spoil, str]] = {
+    "lfs": (_bytes("mesh.glb", POINTER), r"Git LFS pointer of \d+ bytes.*git lfs pull"),
+    "lfs-splats": (_bytes("splats.ply", POINTER), "Git LFS pointer.*git lfs pull"),
+    "html": (_bytes("mesh.glb", b"<!DOCTYPE html><p>"), "a web page of 18 bytes.*browser"),
+    "empty": (_bytes("splats.ply", b""), "an empty file: export"),
+    "cut-mesh": (_cut("mesh.glb", 0.7), r"cut off: \d+ of \d+ bytes.*download"),
+    "cut-splats": (_cut("splats.ply", 0.7), r"promises 12000 splats.*enough for 83\d\d"),
+    "no-mesh": (_without("mesh.glb"), "1 files of splats and 0 meshes: export the scan also"),
+    "nan-mesh": (_nan_mesh, r"triangles \(\d+\.\d%\) have NaN.*at most 1%"),
+    "nan-splats": (
+        _cloud(_set("centres", slice(0, None, 50), np.nan)),
+        r"240 of 12000 splats \(2\.0%\) have NaN.*at most 1%.*train or export again",
+    ),
+    "few-nan": (
+        _cloud(_set("centres", slice(0, 7), np.inf)),
+        "warning: .*7 of 12000 splats with NaN, infinite or zero numbers dropped",
+    ),
+    "up": (_given(up="-y"), r"up: the ground's normal is 180 degrees off.*try --up \+y"),
+    "up-z": (_given(up="+z"), r"is 90 degrees off the stated up axis \+z.*try --up \+y"),
+    "tilt": (_mesh(_turned(12.0)), r"is 12 degrees off.*at most 5.*level the scan"),
+    "unstated": (_as_ply, r"scale and up must be given.*likely: --up \+z.*3000 m long"),
+    "small": (
+        _given(scale=0.01),
+        r"scale: the scan is 0\.3 m long.*5 to 3000 m.*--scale 100 .*would fit",
+    ),
+    "large": (
+        _mesh(lambda p: p.moved(1000 * np.eye(3))),
+        r"scale: the scan is 3e\+04 m long.*--scale 0\.01 or --scale 0\.001 would fit",
+    ),
+    "mirrored": (
+        _mesh(lambda p: p.moved(np.diag([1.0, -1.0, 1.0]))),
+        "mirrored: the fronts of 100% of the ground's triangles face down.*--mirror x.*--flip",
+    ),
+    "mirror-matrix": (_transform(MIRRORED), "it mirrors: its determinant is -1"),
+    "shear": (_transform(SHEARED), r"columns 1 and 2 have the product 0\.500.*shears"),
+    "both": (
+        _given(transform=tuple(map(tuple, np.eye(4).tolist())), scale=2.0),
+        "transform replaces scale, up and mirror",
+    ),
+    "crs": (
+        lambda folder: {
+            "georeference": _system("EPSG:1"),
+        },
+        "'EPSG:1' is no coordinate system: give one such as EPSG:25833",
+    ),
+    "beside": (
+        _cloud(_move((0.0, 1.0, 0.0))),
+        r"splats lie 1\.\d m beside the mesh: \d+% .* after a shift by \(.*, -1\.0, .*--splat-trans",
+    ),
+    "above": (_cloud(_move((0.0, 0.0, 0.5))), r"lie 0\.[45] m beside the mesh"),
+    "slightly-above": (
+        _cloud(_move((0.0, 0.0, 0.07))),
+        r"warning: ground splats are \+0\.070 m over the mesh's ground",
+    ),
+    "other-scale": (_cloud(_move((0.0, 0.0, 0.0), 10.0)), "splats.*give --splat-scale"),
+    "splat-up": (
+        _given(splat_up="-y"),
+        r"different frames.*--splat-scale 1 --splat-up \+z fits: \d+% within 0\.15 m",
+    ),
+    "splat-unstated": (
+        _given(splat_scale=None, splat_up=None),
+        r"splat_scale and splat_up must be given.*--splat-scale 1 --splat-up \+z fits",
+    ),
+    "floaters": (
+        _cloud(_set("centres", slice(0, 40), [15.0, -2.5, 1.0])),
+        r"removed 40 splats: 0\.15 to 2 m above free walkable ground",
+    ),
+    "faint": (_cloud(_set("rgba", (slice(0, 30), 3), 0.01)), "removed 30 splats: opacity under"),
+    "huge": (_cloud(_set("scales", slice(0, 3), 5.0)), "removed 3 splats: over 2 m in size"),
+    "alone": (_cloud(_set("centres", 0, [15, 0, 9])), "removed 1 splats: fewer than 3 neighb"),
+    "below": (_cloud(_set("centres", slice(0, 9), [15, 0, -1])), r"removed 9 .* below the ground"),
+    "sky": (
+        _cloud(_set("centres", slice(0, 9), [900, 0, 99])),
+        "removed 9 splats: over 300 m from the mesh: sky",
+    ),
+    "thin": (
+        _cloud(_set("rgba", (slice(0, None, 2), 3), 0.2)),
+        r"warning: coverage: \d+% of the view below the horizon is opaque.*98% should be",
+    ),
+    "holes": (_punched, r"warning: holes: 8\d\.\d% of the walkable area has measured ground"),
+    "no-area": (_drawn(("road", (1, -4, 20, -1))), "no walkable area among 1 areas: draw"),
+    "no-ground": (
+        lambda folder: (_punched(folder), _draw(folder, [("sidewalk", (10.2, -4, 13.8, -1))]))[0],
+        r"only \d+% of area 0 \(sidewalk\) has ground in the scan; at least 50%",
+    ),
+    "far-area": (_drawn(("sidewalk", (90, 0, 99, 3))), "outside of the scan"),
+    "way": (_wrong_way, r"way: it is 10\.00 m over the ground \(median\).*-0\.3 to 3 m"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_scan_is_described_in_one_line(scan: Path, name: str) -> None:
+    """Each fault gives one line with the measured value and, where the scan is refused, a remedy."""
+    spoil, wanted = BAD[name]
+    said = _words(scan, **(spoil(scan) or {}))
+    found = [words for words in said if re.search(wanted, words)]
+    assert len(found) == 1, said
+    assert "\n" not in found[0]
+    if not found[0].startswith(("warning", "removed")):
+        assert found[0].startswith("refused: ")
+
+
+def test_too_many_splats_are_refused_and_reduced_by_option(
+    scan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The budget is told with the option that reduces; the least visible splats go."""
+    monkeypatch.setattr(scan_sources, "BUDGET", 10_000)
+    (words,) = _words(scan)
+    assert "12000 splats; at most 10000 are imported: reduce them with --most-splats 5000" in words
+    cloud = splats_of(street())
+    cloud.rgba[:7000, 3] = 0.6
+    (scan / "splats.ply").write_bytes(gaussian_ply(cloud))
+    checked = _check(scan, most_splats=5000)
+    assert checked.scan is not None
+    assert checked.scan.splats is not None
+    assert len(checked.scan.splats) == 5000
+    assert checked.scan.splats.rgba[:, 3].min() == round(0.9 * 255)
+
+
+def test_rotations_in_another_order_are_noticed(scan: Path) -> None:
+    """Flat splats that were read in the wrong order do not lie along the mesh."""
+    cloud = splats_of(street())
+    (scan / "splats.ply").write_bytes(gaussian_ply(cloud, order="xyzw"))
+    assert any("try --quaternions xyzw" in words for words in _words(scan))
+    assert not any("--quaternions" in words for words in _words(scan, quaternions="xyzw"))
+
+
+def test_mirrored_and_flipped_meshes_are_mended_by_option(scan: Path) -> None:
+    """--mirror gives the mesh of the unmirrored file; --flip turns its triangles alone."""
+    wanted = _check(scan).scan
+    assert wanted is not None
+    mirrored = street().moved(np.diag([-1.0, 1.0, 1.0]))
+    (scan / "mesh.glb").write_bytes(glb(mirrored))
+    found = _check(scan, mirror="x").scan
+    assert found is not None
+    assert np.array_equal(found.mesh.vertices, wanted.mesh.vertices)
+    assert np.array_equal(found.mesh.triangles, wanted.mesh.triangles)
+    place = street()
+    place.triangles = place.triangles[:, ::-1]
+    (scan / "mesh.glb").write_bytes(glb(place))
+    flipped = _check(scan, flip=True).scan
+    assert flipped is not None
+    assert np.array_equal(flipped.mesh.triangles, wanted.mesh.triangles)
+
+
+@pytest.mark.engine
+def test_the_order_of_rows_changes_no_bit_of_what_is_stored(scan: Path, tmp_path: Path) -> None:
+    """Shuffled triangles, vertices and splats, split over several files: the same hashes. One splat
+    changed: another hash of the splats, the same map."""
+    options = read_options(scan, {"areas": str(scan / "areas.geojson"), **GIVEN, "name": "scan-a"})
+    import_scan(scan, options)
+    random = np.random.default_rng(3)
+    place, cloud = street(), splats_of(street())
+    other = tmp_path / "other"
+    other.mkdir()
+    rows = random.permutation(len(place.vertices))
+    triangles = np.argsort(rows)[place.triangles[random.permutation(len(place.triangles))]]
+    for k in range(2):
+        part = Street(place.vertices[rows], triangles[k::2], place.colours[rows])
+        (other / f"{k}.glb").write_bytes(glb(part))
+    order = random.permutation(12_000)
+    (other / "b.ply").write_bytes(gaussian_ply(cloud.taken(order[:5000])))
+    (other / "c.ply").write_bytes(gaussian_ply(cloud.taken(order[5000:])))
+    import_scan(other, read_options(other, {**_given_of(options), "name": "scan-b"}))
+    one, two = (read_scan(maps_folder() / name).facts for name in ("scan-a", "scan-b"))
+    for name in ("mesh_hash", "splats_hash", "heights_hash", "areas_hash"):
+        assert getattr(one, name) == getattr(two, name)
+    assert read_map("scan-a").net_hash == read_map("scan-b").net_hash
+    cloud.rgba[17, 0] += 0.1
+    (scan / "splats.ply").write_bytes(gaussian_ply(cloud))
+    import_scan(scan, options)
+    changed = read_scan(maps_folder() / "scan-a").facts
+    assert changed.splats_hash != one.splats_hash
+    assert read_map("scan-a").net_hash == read_map("scan-b").net_hash
+
+
+def _given_of(options: Any) -> dict[str, Any]:
+    return {"areas": options.areas, **GIVEN}
+
+
+@pytest.mark.engine
+def test_a_scan_is_recovered_from_a_corrupted_export(tmp_path: Path, made: Path) -> None:
+    """Scaled by 0.01, turned by 33 degrees, at UTM coordinates, with holes and 1 cm of noise: heights
+    to 3 cm, the walkable area to 95 %."""
+    place = street()
+    random = np.random.default_rng(5)
+    place.vertices = place.vertices + random.normal(0, 0.01, place.vertices.shape)
+    place.triangles = place.triangles[random.random(len(place.triangles)) > 0.05]
+    angle = np.radians(33)
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
+    offset = np.array([391_000.0, 5_820_000.0, 34.0])
+    spoiled = Street((place.vertices @ turn.T + offset) * 100.0, place.triangles, place.colours)
+    folder = tmp_path / "spoiled"
+    folder.mkdir()
+    (folder / "mesh.obj").write_text(
+        "".join(f"v {x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in spoiled.vertices)
+        + "".join(f"f {a} {b} {c}\n" for a, b, c in spoiled.triangles + 1)
+    )
+    wanted = shapely.box(1, -4, LENGTH_M - 1, -1)
+    options = read_options(
+        folder, {"scale": 0.01, "up": "+z", "georeference": _system("EPSG:25833")}
+    )
+    loaded, _ = scan_sources.load_mesh(folder, options)
+    matrix = np.array(loaded.matrix)
+
+    def to_net(xy: np.ndarray) -> np.ndarray:
+        world = np.column_stack([xy, np.zeros(len(xy))]) @ turn.T + offset
+        return (np.column_stack([world * 100.0, np.ones(len(xy))]) @ matrix.T)[:, :2]
+
+    area = shapely.transform(wanted, to_net)
+    assert area.area == pytest.approx(wanted.area, rel=2e-3)
+    features = {
+        "type": "Feature",
+        "properties": {"kind": "sidewalk"},
+        "geometry": shapely.geometry.mapping(area),
+    }
+    drawn = tmp_path / "areas.geojson"
+    drawn.write_text(
+        json.dumps({"type": "FeatureCollection", "frame": "local", "features": [features]})
+    )
+    options = read_options(
+        folder,
+        {
+            "scale": 0.01,
+            "up": "+z",
+            "georeference": _system("EPSG:25833"),
+            "areas": str(drawn),
+            "name": "scan-spoiled",
+        },
+    )
+    _, checked = import_scan(folder, options)
+    assert checked.scan is not None
+    heights = checked.scan.heights
+    x, y = np.meshgrid(np.arange(2, 28, 0.5), np.arange(-3.8, -1.2, 0.2))
+    at = to_net(np.column_stack([x.ravel(), y.ravel()]))
+    cell = np.rint((at - heights.origin) / heights.step_m).astype(int)
+    found = heights.heights[cell[:, 1], cell[:, 0]]
+    level = 34.0 + matrix[2, 3]
+    assert np.abs(found - level).max() < 0.03
+    walkable = shapely.union_all(
+        [
+            *(strip.polygon for strip in read_map("scan-spoiled").strips.values()),
+            *(corner.polygon for corner in read_map("scan-spoiled").corners.values()),
+        ]
+    )
+    both = shapely.intersection(walkable, area).area
+    assert both / shapely.union(walkable, area).area > 0.95
+
+
+@pytest.mark.engine
+def test_the_command_line_imports_checks_and_shows(
+    cosim: Cosim, scan: Path, tmp_path: Path
+) -> None:
+    """Options come from scan.json, and the picture shows the areas; wrong input ends with 2."""
+    (scan / "scan.json").write_text(
+        json.dumps(
+            {"splat_scale": 1.0, "splat_up": "+z", "areas": "areas.geojson", "licence": "CC0"}
+        )
+    )
+    done = cosim("scan", "import", str(scan), "--name", "scan-cli")
+    assert done.returncode == 0, done.stderr
+    assert "Stored as 'scan-cli'" in done.stdout
+    assert "12000 splats" in done.stdout
+    picture = tmp_path / "scan.png"
+    shown = cosim("scan", "show", "scan-cli", "-o", str(picture))
+    assert shown.returncode == 0, shown.stderr
+    assert picture.stat().st_size > 5000
+    written = cosim("scan", "areas", "scan-cli", "-o", str(tmp_path / "out.geojson"))
+    assert written.returncode == 0, written.stderr
+    assert json.loads((tmp_path / "out.geojson").read_text())["features"]
+    listed = cosim("map", "check", "scan-cli")
+    assert "CC0" in listed.stdout + listed.stderr
+    refused = cosim("scan", "check", str(scan), "--up", "-y", "--json")
+    assert refused.returncode == 2
+    assert [row["level"] for row in json.loads(refused.stdout)].count("refused") == 1
+    (scan / "scan.json").write_text('{"scale": -1, "upp": "+z"}')
+    wrong = cosim("scan", "check", str(scan))
+    assert wrong.returncode == 2
+    assert "scale" in wrong.stderr
+    assert "upp" in wrong.stderr
+    assert cosim("scan", "show", "nowhere").returncode == 2
+
+
+@pytest.mark.engine
+@pytest.mark.skipif(not SHARED.is_dir(), reason="no shared scans beside the repository")
+def test_a_street_in_lund_is_imported(tmp_path: Path) -> None:
+    """Its way lies on its ground; its splats agree with its mesh, and lack coverage."""
+    for name in ("lund_street_ground.glb", "lund_street_obstacles.glb"):
+        shutil.copy(SHARED / "lund-street" / name, tmp_path)
+    shutil.copy(SHARED / "lund-street-splats" / "lund_street.ply", tmp_path)
+    way = SHARED / "lund-street" / "lund_street_route.json"
+    options = read_options(tmp_path, {**GIVEN, "way": str(way), "width_m": 3.0, "name": "lund"})
+    about, checked = import_scan(tmp_path, options)
+    words = " ".join(str(one) for one in checked.findings)
+    assert "way: it is 0.00 m over the ground" in words
+    assert "warning: coverage" in words
+    assert checked.scan is not None
+    assert len(checked.scan.mesh.triangles) == 136_904
+    assert read_map(about.name).strips
+
+
+def test_the_documented_options_are_those_of_the_import(tmp_path: Path) -> None:
+    """The scan.json of the page is read, and its table names every key and option."""
+    (block,) = blocks("json", "docs/scans.md")
+    (tmp_path / "scan.json").write_text(block.text)
+    assert read_options(tmp_path, {}).splat_up == "+z"
+    text = text_of("docs/scans.md")
+    for name in ScanOptions.__struct_fields__:
+        assert f"`{name}`" in text, name
+    for name in (field.name for field in dataclasses.fields(ScanChoices)):
+        flag = f"--{name.replace('_', '-')}"
+        assert flag in text or name.startswith("splat_"), flag
+
+
+def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
+    """An .obj with its texture in another file is read from a folder, with the texture's colour."""
+    from PIL import Image
+
+    mesh = street().mesh()
+    uv = np.column_stack([mesh.vertices[:, 0] / LENGTH_M, np.zeros(len(mesh.vertices))])
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv=uv, image=Image.new("RGB", (8, 8), (200, 40, 10))
+    )
+    mesh.export(tmp_path / "mesh.obj")
+    options = read_options(tmp_path, {"scale": 1.0, "up": "+z"})
+    loaded, _ = scan_sources.load_mesh(tmp_path, options)
+    assert (np.abs(loaded.mesh.colours.astype(int) - [200, 40, 10]) <= 1).all()
