@@ -163,7 +163,7 @@ def build_scan_net(
     if narrow:
         at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
         findings.append(
-            f"{len(narrow)} of {len(names)} pieces of the walking net are narrower than "
+            f"net: {len(narrow)} of {len(names)} pieces of the walking net are narrower than "
             f"{CROWD_M:g} m, one of them at ({at[0]:.1f}, {at[1]:.1f}): robots may use them, the "
             "crowd does not"
         )
@@ -175,8 +175,8 @@ def build_scan_net(
     iou = both / (inner.area + ground.area - both)
     outside = max(0.0, 1.0 - both / inner.area)
     findings.append(
-        f"{ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by {iou:.0%} "
-        f"(intersection over union), {outside:.1%} of the lanes are outside"
+        f"net: {ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by "
+        f"{iou:.0%} (intersection over union), {outside:.1%} of the lanes are outside"
     )
     return ScanNet(path, tuple(findings), float(iou))
 
@@ -224,7 +224,7 @@ def _plan(
     for number, reason in plain.items():
         at = areas[number].polygon.centroid
         plan.findings.append(
-            f"crossing near ({at.x:.1f}, {at.y:.1f}): cars do not stop there: {reason}"
+            f"net: crossing near ({at.x:.1f}, {at.y:.1f}): cars do not stop there: {reason}"
         )
     return plan
 
@@ -486,4 +486,4 @@ def _checked(plan: _Plan, street_map: StreetMap) -> list[str]:
     parts = len(set(WalkGraph(street_map).component.tolist()))
     if parts == 1:
         return []
-    return [f"the walkable ground is in {parts} separate parts: scenarios use the largest"]
+    return [f"net: the walkable ground is in {parts} separate parts: scenarios use the largest"]
