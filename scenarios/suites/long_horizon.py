@@ -67,6 +67,14 @@ LENGTH_SLACK_M = 3.0
 """Largest deviation of a way from its wanted length, in metres."""
 _END_M = 8.0
 """Least distance of a goal from the ends of its sidewalk, in metres."""
+_SHARES = (0.4, 0.7)
+"""Range of the shares of the first and last sidewalk that a route uses."""
+_SCAN_END_M = 1.5
+"""The same as _END_M on a scan, where streets are short."""
+_SCAN_SHARES = (0.4, 0.95)
+"""The same as _SHARES on a scan."""
+_SCAN_START_M = 5.0
+"""Minimum length of the first and last sidewalk of a route on a scan, in metres."""
 
 SEARCHES = 150
 """Number of ways that are searched if no draw fits."""
@@ -181,11 +189,12 @@ def _on_wide_sidewalks(draft: _Draft, candidates: Sequence[str]) -> Scenario | N
 
 def starts(street_map: StreetMap, graph: WalkGraph) -> list[str]:
     """Return the sidewalks on which long ways start and end."""
+    least_m = _SCAN_START_M if street_map.scanned else START_M
     return sorted(
         strip_id
         for strip_id in graph.main_strips
         if street_map.strips[strip_id].kind == "sidewalk"
-        and street_map.strips[strip_id].length_m >= START_M
+        and street_map.strips[strip_id].length_m >= least_m
         if strip_id not in street_map.steep
     )
 
@@ -240,7 +249,8 @@ def lone_route(
     if length_m is not None:
         # Corners are cut; the last sidewalk is walked farther by the distance saved.
         ends_m[1] += length_m - route.length_m
-        if not _END_M <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - _END_M:
+        end_m = _SCAN_END_M if street_map.scanned else _END_M
+        if not end_m <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - end_m:
             raise SpecError("no goal at the wanted distance")
         route = _line(street_map, way, *ends_m)
         if abs(route.length_m - length_m) > LENGTH_SLACK_M:
@@ -343,7 +353,7 @@ def draw_way(
     target_m = rng.uniform(*_lengths_m(street_map)) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
-    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
+    start_m = float(rng.uniform(*_shares(street_map))) * strip.length_m
     closed = street_map.too_steep | {leave.other} | ports_of(avoided)
     reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
     goals = [
@@ -365,7 +375,7 @@ def draw_way(
     goal_strip = street_map.strips[goal.strip]
     if length_m is not None:
         return way, start_m, length_m - start_m - reach.to(goal)
-    return way, start_m, float(rng.uniform(0.4, 0.7)) * goal_strip.length_m
+    return way, start_m, float(rng.uniform(*_shares(street_map))) * goal_strip.length_m
 
 
 def search_way(
@@ -382,7 +392,7 @@ def search_way(
     target_m = rng.uniform(*_lengths_m(street_map)) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
-    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
+    start_m = float(rng.uniform(*_shares(street_map))) * strip.length_m
     closed = street_map.too_steep | {leave.other} | ports_of(avoided)
     reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
     ends = set(candidates)
@@ -402,7 +412,8 @@ def search_way(
             return (
                 way,
                 start_m,
-                float(rng.uniform(0.4, 0.7)) * street_map.strips[goals[i].strip].length_m,
+                float(rng.uniform(*_shares(street_map)))
+                * street_map.strips[goals[i].strip].length_m,
             )
     raise SpecError("no way of the drawn length crosses a street every 160 m")
 
@@ -414,6 +425,10 @@ def _lengths_m(street_map: StreetMap) -> tuple[float, float]:
     low_m, high_m = SCAN_ROUTE_M
     whole_m = sum(strip.length_m for strip in street_map.strips.values())
     return low_m, min(max(whole_m, low_m), high_m)
+
+
+def _shares(street_map: StreetMap) -> tuple[float, float]:
+    return _SCAN_SHARES if street_map.scanned else _SHARES
 
 
 def _least_crossings(street_map: StreetMap, length_m: float) -> int:

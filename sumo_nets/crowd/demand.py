@@ -252,7 +252,6 @@ class Pedestrians:
         self._entrances.people[self._engine.simulation.getTime()].append(entry)
         entry.enter(self._engine)
 
-
     def _dead_end(self, edge: str) -> int | None:
         """Return the end of a walk's last edge at the edge of a scan; None elsewhere."""
         strip = self._graph.street_map.strips.get(edge)

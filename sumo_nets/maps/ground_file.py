@@ -36,10 +36,15 @@ _Rings = list[list[tuple[float, float]]]
 
 
 class DrawnGround(msgspec.Struct, frozen=True):
-    """Shares of the drawn ground, by the ids of strips and corners; see `StreetMap.uncrowded`."""
+    """Shares of the drawn ground, by the ids of strips and corners.
+
+    widths_m: clear width of each strip, which is more than that of SUMO's lane.
+    uncrowded: see `StreetMap`.
+    """
 
     strips: dict[str, Polygon]
     corners: dict[str, Polygon | MultiPolygon]
+    widths_m: dict[str, float]
     uncrowded: tuple[str, ...] = ()
 
 
@@ -47,6 +52,7 @@ class _Stored(msgspec.Struct, frozen=True):
     schema: int
     strips: dict[str, list[_Rings]]
     corners: dict[str, list[_Rings]]
+    widths_m: dict[str, float]
     uncrowded: tuple[str, ...]
 
 
@@ -56,6 +62,7 @@ def write_ground(ground: DrawnGround, path: Path) -> None:
         _SCHEMA,
         {name: _rings(polygon) for name, polygon in ground.strips.items()},
         {name: _rings(polygon) for name, polygon in ground.corners.items()},
+        ground.widths_m,
         ground.uncrowded,
     )
     path.write_bytes(msgspec.json.encode(stored))
@@ -70,7 +77,7 @@ def with_drawn_ground(street_map: StreetMap, path: Path) -> StreetMap:
         stored = msgspec.json.decode(path.read_bytes(), type=_Stored)
         if stored.schema != _SCHEMA:
             raise ValueError(f"schema {stored.schema}; this version reads {_SCHEMA}")
-        if stored.strips.keys() != street_map.strips.keys():
+        if not stored.strips.keys() == stored.widths_m.keys() == street_map.strips.keys():
             raise ValueError("its strips are not those of the net")
         if stored.corners.keys() != street_map.corners.keys():
             raise ValueError("its corners are not those of the net")
@@ -80,7 +87,7 @@ def with_drawn_ground(street_map: StreetMap, path: Path) -> StreetMap:
         return street_map
     except (OSError, ValueError, IndexError, shapely.errors.GEOSException) as error:
         raise MapError(f"{path}: cannot be read: {error}: import the scan again") from error
-    return _with(street_map, DrawnGround(strips, corners, stored.uncrowded))
+    return _with(street_map, DrawnGround(strips, corners, stored.widths_m, stored.uncrowded))
 
 
 def with_scan(net_hash: str, folder: Path) -> str:
@@ -103,9 +110,14 @@ def with_scan(net_hash: str, folder: Path) -> str:
 
 
 def drawn_ground(
-    street_map: StreetMap, ground: Polygon | MultiPolygon, uncrowded: tuple[str, ...] = ()
+    street_map: StreetMap,
+    ground: Polygon | MultiPolygon,
+    widths_m: Mapping[str, float],
+    uncrowded: tuple[str, ...] = (),
 ) -> DrawnGround:
     """Divide ground among the strips and corners of a map: each point goes to the nearest piece.
+
+    widths_m: clear widths of strips; those of SUMO's lanes by default.
 
     Raises MapError if a strip has no share.
     """
@@ -134,6 +146,7 @@ def drawn_ground(
     return DrawnGround(
         {name: _whole(shares[name]) for name in street_map.strips},
         {name: _several(shares[name], corner) for name, corner in street_map.corners.items()},
+        {name: widths_m.get(name, strip.width_m) for name, strip in street_map.strips.items()},
         uncrowded,
     )
 
@@ -167,7 +180,9 @@ def _joined(one: Polygon, other: Polygon) -> list[Polygon]:
     both = shapely.union(one, other)
     if isinstance(both, Polygon):
         return [both]
-    closed = shapely.buffer(shapely.buffer(both, 1e-4, join_style="mitre"), -1e-4, join_style="mitre")
+    closed = shapely.buffer(
+        shapely.buffer(both, 1e-4, join_style="mitre"), -1e-4, join_style="mitre"
+    )
     return [closed] if isinstance(closed, Polygon) else [one]
 
 
@@ -188,7 +203,7 @@ def _labelled_points(street_map: StreetMap) -> tuple[Floats, NDArray[np.int64]]:
         found.append(points)
         owners += [number] * len(points)
     xy, first = np.unique(np.round(np.concatenate(found), 6), axis=0, return_index=True)
-    return xy, np.array(owners, dtype=np.int64)[first]
+    return np.asarray(xy, dtype=float), np.array(owners, dtype=np.int64)[first]
 
 
 def _corner_points(street_map: StreetMap, corner: Corner) -> Floats:
@@ -218,7 +233,9 @@ def _corner_points(street_map: StreetMap, corner: Corner) -> Floats:
 
 def _with(street_map: StreetMap, ground: DrawnGround) -> StreetMap:
     strips: Mapping[str, Strip] = {
-        name: dataclasses.replace(strip, polygon=ground.strips[name], frontage_m=0.0)
+        name: dataclasses.replace(
+            strip, polygon=ground.strips[name], width_m=ground.widths_m[name], frontage_m=0.0
+        )
         for name, strip in street_map.strips.items()
     }
     corners = {
@@ -255,7 +272,7 @@ def _whole(parts: list[Polygon]) -> Polygon:
 def _several(parts: list[Polygon], corner: Corner) -> Polygon | MultiPolygon:
     if not parts:  # between two pieces that touch
         return shapely.Point(corner.polygon.centroid).buffer(_END_M)
-    return parts[0] if len(parts) == 1 else MultiPolygon(parts)
+    return overlay.union_all(parts)
 
 
 def _rings(shape: Polygon | MultiPolygon) -> list[_Rings]:

@@ -8,7 +8,7 @@ over them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -31,8 +31,8 @@ from cosim.place.walk_graph import WalkGraph
 from sumo_nets.maps.driving_side import left_hand_country
 from sumo_nets.maps.ground_file import GROUND_FILE, drawn_ground, write_ground
 from sumo_nets.maps.net_steps import start_net
-from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.net_file import read_net
+from sumo_nets.net.netconvert import netconvert
 
 CROWD_M: Final = 1.2
 """Clear width below which the crowd does not walk, in metres."""
@@ -50,6 +50,8 @@ _NEAR_END_M: Final = 3.0
 _ROAD_END_M: Final = 6.0
 """Least distance of a crossing from the end of a road, in metres."""
 _ON_ROAD_M2: Final = 0.5
+_BESIDE_M: Final = 0.3
+"""Gap between a crossing and its road that is closed, in metres."""
 _KERB_M: Final = 0.3
 """Distance before the curb from which the link to a crossing runs straight, in metres."""
 _OPTIONS: Final = (
@@ -82,11 +84,24 @@ class _Edge:
 
 @dataclass(slots=True)
 class _Zebra:
-    """Crossing at a node. line: from curb to curb, (2, 2) metres."""
+    """Crossing at a node. number: of its area; line: from curb to curb, (2, 2) metres."""
 
+    number: int
     node: int
     line: Floats
     lane_m: float
+
+    @property
+    def id(self) -> str:
+        return f":n{self.node}_c0"
+
+
+class _NoCrossing(Exception):
+    """A crossing that does not fit on its road. number: of its area."""
+
+    def __init__(self, number: int, reason: str) -> None:
+        super().__init__(reason)
+        self.number = number
 
 
 @dataclass(slots=True)
@@ -94,6 +109,7 @@ class _Plan:
     nodes: list[Floats] = field(default_factory=list)
     edges: list[_Edge] = field(default_factory=list)
     zebras: list[_Zebra] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
 
     def node(self, xy: Floats) -> int:
         self.nodes.append(np.asarray(xy, dtype=float))
@@ -124,23 +140,30 @@ def build_scan_net(
     progress("finding the walkable ground")
     ground = walkable_ground(areas, heights)
     progress("finding the axis of the walkable ground")
-    plan = _plan(areas, ground)
     progress("building the net")
-    path, street_map = _built(plan, georeference, folder)
+    plain: dict[int, str] = {}
+    while True:
+        plan = _planned(areas, ground, plain)
+        path, street_map = _built(plan, georeference, folder)
+        lacking = [zebra for zebra in plan.zebras if zebra.id not in street_map.strips]
+        if not lacking:
+            break
+        plain |= {zebra.number: "netconvert refuses it" for zebra in lacking}
     for _ in range(_ROUNDS):
         if not _narrowed(plan, street_map, ground):
             break
         path, street_map = _built(plan, georeference, folder)
-    findings = _checked(plan, street_map)
+    findings = [*plan.findings, *_checked(plan, street_map)]
     progress("starting SUMO on the net")
     start_net(path, str(path))
     names = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
     narrow = [name for name, edge in names.items() if edge.clear_m < CROWD_M]
-    write_ground(drawn_ground(street_map, ground, tuple(narrow)), folder / GROUND_FILE)
+    widths_m = {name: round(edge.clear_m, 3) for name, edge in names.items()}
+    write_ground(drawn_ground(street_map, ground, widths_m, tuple(narrow)), folder / GROUND_FILE)
     if narrow:
         at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
         findings.append(
-            f"{len(narrow)} of {len(names)} pieces of the walking net are narrower than "
+            f"net: {len(narrow)} of {len(names)} pieces of the walking net are narrower than "
             f"{CROWD_M:g} m, one of them at ({at[0]:.1f}, {at[1]:.1f}): robots may use them, the "
             "crowd does not"
         )
@@ -150,26 +173,41 @@ def build_scan_net(
     )
     both = shapely.intersection(inner, ground).area
     iou = both / (inner.area + ground.area - both)
+    outside = max(0.0, 1.0 - both / inner.area)
     findings.append(
-        f"{ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by {iou:.0%} "
-        f"(intersection over union), {1.0 - both / inner.area:.1%} of the lanes are outside"
+        f"net: {ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by "
+        f"{iou:.0%} (intersection over union), {outside:.1%} of the lanes are outside"
     )
     return ScanNet(path, tuple(findings), float(iou))
 
 
-def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
+def _planned(
+    areas: Sequence[ScanArea], ground: Polygon | MultiPolygon, plain: dict[int, str]
+) -> _Plan:
+    """Return the plan of a net. Crossings that do not fit are added to `plain`.
+
+    plain: reason for each crossing that is only walkable ground, by the number of its area.
+    """
+    while True:
+        try:
+            return _plan(areas, ground, plain)
+        except _NoCrossing as error:
+            plain[error.number] = str(error)
+
+
+def _plan(
+    areas: Sequence[ScanArea], ground: Polygon | MultiPolygon, plain: Mapping[int, str]
+) -> _Plan:
     roads = overlay.union_all([area.polygon for area in areas if area.kind == "road"])
     walks = overlay.union_all([a.polygon for a in areas if a.kind in WALKED - {"crossing"}])
-    over = [
-        area.polygon
-        for area in areas
+    over = {
+        number: overlay.difference(area.polygon, walks)
+        for number, area in enumerate(areas)
         if area.kind == "crossing"
-        and shapely.intersection(area.polygon, roads).area > _ON_ROAD_M2
-    ]
-    off_road = overlay.difference(
-        ground, overlay.union_all([overlay.difference(one, walks) for one in over])
-    )
-    axis = medial_axis(off_road)
+        and number not in plain
+        and shapely.intersection(area.polygon.buffer(_BESIDE_M), roads).area > _ON_ROAD_M2
+    }
+    axis = medial_axis(overlay.difference(ground, overlay.union_all([*over.values()])))
     if not axis.pieces:
         raise MapError("the walkable ground is nowhere wide enough to walk: draw wider areas")
     plan = _Plan(list(axis.nodes))
@@ -177,9 +215,17 @@ def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
         ends = (piece.start, piece.end)
         plan.edges.append(_Edge(*ends, piece.line, piece.clear_m, _inner(piece.clear_m)))
     if not roads.is_empty:
-        _add_roads(plan, medial_axis(roads, whole=True))
-    for crossing in over:
-        _add_crossing(plan, crossing, roads)
+        # Roads may be drawn up to a crossing, or below it.
+        joined = overlay.union_all([roads, *over.values()])
+        joined = shapely.buffer(overlay.grown(joined, _BESIDE_M), -_BESIDE_M, quad_segs=4)
+        _add_roads(plan, medial_axis(joined, whole=True))
+        for number, crossing in over.items():
+            _add_crossing(plan, number, crossing, joined)
+    for number, reason in plain.items():
+        at = areas[number].polygon.centroid
+        plan.findings.append(
+            f"net: crossing near ({at.x:.1f}, {at.y:.1f}): cars do not stop there: {reason}"
+        )
     return plan
 
 
@@ -196,35 +242,36 @@ def _inner(clear_m: float) -> float:
     return max(clear_m - INNER_M, _LEAST_LANE_M)
 
 
-def _add_crossing(plan: _Plan, crossing: Polygon, roads: shapely.Geometry) -> None:
+def _add_crossing(
+    plan: _Plan, number: int, on_road: Polygon | MultiPolygon, roads: shapely.Geometry
+) -> None:
     """Add a crossing, with links to the sidewalks on both sides.
 
-    Raises MapError if it joins no road or no sidewalk.
+    Raises _NoCrossing if it joins no road or no sidewalk.
     """
-    where = f"the crossing near ({crossing.centroid.x:.1f}, {crossing.centroid.y:.1f})"
-    road, _ = _nearest(plan, crossing.centroid, drive=True)
+    road, _ = _nearest(plan, on_road.centroid, drive=True)
     if road is None:
-        raise MapError(f"{where} leads over a road that is too narrow for cars: widen the road")
-    on_road = shapely.intersection(crossing, roads)
+        raise _NoCrossing(number, "its road is too narrow for cars: widen it")
     middle, along, width_m = _direction(on_road, road)
-    half = crossing.length * along
+    half = on_road.length * along
     kerbs = shapely.get_coordinates(
         shapely.intersection(LineString([middle - half, middle + half]), roads)
     )
     reach = (kerbs - middle) @ along
     low, high = float(reach[reach < 0].max(initial=-1e9)), float(reach[reach > 0].min(initial=1e9))
     if not (-_JOIN_M < low < 0.0 < high < _JOIN_M):
-        raise MapError(f"{where} does not lead from one side of its road to the other: redraw it")
-    node = _split(plan, road, middle, _ROAD_END_M, where)
+        raise _NoCrossing(number, "it does not lead from one side of its road to the other")
+    node = _split(plan, road, middle, _ROAD_END_M)
+    if node is None:
+        raise _NoCrossing(number, f"its road is shorter than {2.0 * _ROAD_END_M:g} m")
     ends = np.array([middle + low * along, middle + high * along])
     lane_m = _inner(width_m - INNER_M)
-    plan.zebras.append(_Zebra(node, ends, lane_m))
+    plan.zebras.append(_Zebra(number, node, ends, lane_m))
     for end, outward in ((ends[0], -along), (ends[1], along)):
         meets = _joint(plan, end, outward)
-        if meets is None:
-            raise MapError(f"{where} joins no sidewalk at one end: draw one there")
-        piece, at = meets
-        joint = _split(plan, piece, at, _NEAR_END_M, where)
+        joint = None if meets is None else _split(plan, *meets, _NEAR_END_M)
+        if joint is None:
+            raise _NoCrossing(number, "it joins no sidewalk at one end: draw one there")
         line = np.vstack([plan.nodes[joint], end + _KERB_M * outward, middle])
         plan.edges.append(_Edge(joint, node, line, width_m, lane_m))
 
@@ -261,11 +308,12 @@ def _nearest(plan: _Plan, point: shapely.Point, *, drive: bool) -> tuple[_Edge |
 def _joint(plan: _Plan, end: Floats, outward: Floats) -> tuple[_Edge, Floats] | None:
     """Return the walk that a crossing joins straight on, else the nearest one, and the place."""
     ray = LineString([end, end + _JOIN_M * outward])
-    hits = []
-    for i, edge in enumerate(plan.edges):
-        if not edge.drive:
-            for xy in shapely.get_coordinates(shapely.intersection(ray, LineString(edge.line))):
-                hits.append((float(np.hypot(*(xy - end))), i, xy))
+    hits = [
+        (float(np.hypot(*(xy - end))), i, xy)
+        for i, edge in enumerate(plan.edges)
+        if not edge.drive
+        for xy in shapely.get_coordinates(shapely.intersection(ray, LineString(edge.line)))
+    ]
     if hits:
         _, i, xy = min(hits, key=lambda hit: hit[:2])
         return plan.edges[i], xy
@@ -276,13 +324,16 @@ def _joint(plan: _Plan, end: Floats, outward: Floats) -> tuple[_Edge, Floats] | 
     return edge, line.at(line.project(*(end + outward).tolist())[0]).xy
 
 
-def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float, where: str) -> int:
-    """Return the node of an edge at a place: one of its ends if near, else a new one."""
+def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float) -> int | None:
+    """Return the node of an edge at a place: one of its ends if near, else a new one.
+
+    Roads are split at a distance from their ends; None if they are too short.
+    """
     line = Polyline(edge.line)
     s_m = line.project(*np.asarray(at).tolist())[0]
-    if edge.drive and line.length_m < 2.0 * near_m:
-        raise MapError(f"{where}: its road is shorter than {2.0 * near_m:g} m: draw it longer")
     if edge.drive:
+        if line.length_m < 2.0 * near_m:
+            return None
         s_m = min(max(s_m, near_m), line.length_m - near_m)
     elif s_m < near_m or s_m > line.length_m - near_m:
         return edge.start if s_m < 0.5 * line.length_m else edge.end
@@ -307,7 +358,9 @@ def _converted(
     edges = [row for i, edge in enumerate(plan.edges) for row in _rows(i, edge)]
     zebras = []
     for zebra in plan.zebras:
-        arm = next(i for i, e in enumerate(plan.edges) if e.drive and zebra.node in (e.start, e.end))
+        arm = next(
+            i for i, e in enumerate(plan.edges) if e.drive and zebra.node in (e.start, e.end)
+        )
         both = [f"r{arm}"] + ([f"-r{arm}"] if _two_way(plan.edges[arm]) else [])
         zebras.append(
             f'<crossing node="n{zebra.node}" edges="{" ".join(both)}" '
@@ -341,9 +394,7 @@ def _clockwise(zebra: _Zebra, road: _Edge, left: bool) -> Floats:
     return zebra.line if from_right != left else zebra.line[::-1]
 
 
-def _built(
-    plan: _Plan, georeference: Georeference | None, folder: Path
-) -> tuple[Path, StreetMap]:
+def _built(plan: _Plan, georeference: Georeference | None, folder: Path) -> tuple[Path, StreetMap]:
     """Build the net with the first radius of junctions that keeps all crossings."""
     for radius_m in _RADII_M:
         path = _converted(plan, georeference, folder, radius_m)
@@ -367,7 +418,7 @@ def _narrowed(plan: _Plan, street_map: StreetMap, ground: Polygon | MultiPolygon
     changed = False
     lanes: dict[str, _Edge | _Zebra] = {f"w{i}": edge for i, edge in enumerate(plan.edges)}
     for zebra in plan.zebras:
-        lanes |= {name: zebra for name in wide if name.startswith(f":n{zebra.node}_c")}
+        lanes[zebra.id] = zebra
     for name in sorted(wide):
         lane_m = max(_NARROWING * lanes[name].lane_m, min(_STRIPE_M, lanes[name].lane_m))
         changed |= lane_m < lanes[name].lane_m
@@ -407,7 +458,13 @@ def _rows(number: int, edge: _Edge) -> list[str]:
 
 
 def _row(
-    name: str, start: int, end: int, line: Floats, lane_m: float, allowed: str, spread: str = "center"
+    name: str,
+    start: int,
+    end: int,
+    line: Floats,
+    lane_m: float,
+    allowed: str,
+    spread: str = "center",
 ) -> str:
     speed_mps = _WALK_MPS if allowed == "pedestrian" else _LANE_MPS
     return (
@@ -426,10 +483,7 @@ def _checked(plan: _Plan, street_map: StreetMap) -> list[str]:
     wanted = [f"w{i}" for i, edge in enumerate(plan.edges) if not edge.drive]
     if missing := [name for name in wanted if name not in street_map.strips]:
         raise MapError(f"netconvert left out {len(missing)} walks of {len(wanted)}: {missing[0]}")
-    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing"]
-    if len(crossings) != len(plan.zebras):
-        raise MapError(f"netconvert made {len(crossings)} of {len(plan.zebras)} crossings")
     parts = len(set(WalkGraph(street_map).component.tolist()))
     if parts == 1:
         return []
-    return [f"the walkable ground is in {parts} separate parts: scenarios use the largest"]
+    return [f"net: the walkable ground is in {parts} separate parts: scenarios use the largest"]
