@@ -84,12 +84,18 @@ class _Edge:
 
 @dataclass(slots=True)
 class _Zebra:
-    """Crossing at a node. number: of its area; line: from curb to curb, (2, 2) metres."""
+    """Crossing at a node.
+
+    number: of its area.
+    line: from curb to curb, (2, 2) metres.
+    turned: whether netconvert takes the line the other way than most.
+    """
 
     number: int
     node: int
     line: Floats
     lane_m: float
+    turned: bool = False
 
     @property
     def id(self) -> str:
@@ -391,7 +397,7 @@ def _clockwise(zebra: _Zebra, road: _Edge, left: bool) -> Floats:
     out = at.xy - zebra.line.mean(axis=0)
     right = np.array([out[1], -out[0]])
     from_right = float((zebra.line[0] - zebra.line[1]) @ right) > 0.0
-    return zebra.line if from_right != left else zebra.line[::-1]
+    return zebra.line if from_right != (left != zebra.turned) else zebra.line[::-1]
 
 
 def _built(plan: _Plan, georeference: Georeference | None, folder: Path) -> tuple[Path, StreetMap]:
@@ -399,10 +405,31 @@ def _built(plan: _Plan, georeference: Georeference | None, folder: Path) -> tupl
     for radius_m in _RADII_M:
         path = _converted(plan, georeference, folder, radius_m)
         street_map = read_net(path)
-        crossings = sum(strip.kind == "crossing" for strip in street_map.strips.values())
-        if crossings == len(plan.zebras):
+        if backwards := [zebra for zebra in plan.zebras if _is_backwards(zebra, street_map)]:
+            for zebra in backwards:
+                zebra.turned = not zebra.turned
+            path = _converted(plan, georeference, folder, radius_m)
+            street_map = read_net(path)
+        if all(zebra.id in street_map.strips for zebra in plan.zebras):
             break
     return path, street_map
+
+
+def _is_backwards(zebra: _Zebra, street_map: StreetMap) -> bool:
+    """Return whether the first corner of a built crossing is at its far end."""
+    strip = street_map.strips.get(zebra.id)
+    if strip is None or strip.corners[0] is None:
+        return False
+    corner = street_map.corners[strip.corners[0]]
+    ends = [
+        street_map.strips[port.strip].line[0 if port.end == 0 else -1, :2]
+        for port in corner.ports
+        if port.strip != zebra.id
+    ]
+    if not ends:
+        return False
+    to_first, to_last = (np.hypot(*(np.array(ends) - strip.line[i, :2]).T).min() for i in (0, -1))
+    return bool(to_first > to_last)
 
 
 def _narrowed(plan: _Plan, street_map: StreetMap, ground: Polygon | MultiPolygon) -> bool:

@@ -76,9 +76,9 @@ def test_suites_that_cannot_be_drawn_are_refused() -> None:
     """Another kind of suite, or an event that does not exist, with the valid ones; before any map
     is looked for."""
     with pytest.raises(
-        UsageError, match=r"suite for --map 'unit'\. Valid choices: long-horizon, reactive"
+        UsageError, match=r"suite for --map 'units'\. Valid choices: long-horizon, reactive, unit"
     ):
-        suite_on_map("unit", "nowhere", 0, 1)
+        suite_on_map("units", "nowhere", 0, 1)
     with pytest.raises(UsageError, match=r"event 'ambush'\. Valid choices: .*frontal"):
         suite_on_map("reactive", "nowhere", 0, 1, events=["ambush"])
 

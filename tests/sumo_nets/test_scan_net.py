@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +24,11 @@ from sumo_nets.crowd.crowd import (
     sumo,  # the engine that runs
 )
 from sumo_nets.maps.ground_file import GROUND_FILE, with_drawn_ground
-from sumo_nets.maps.import_rules import IMPORTER_VERSION
-from sumo_nets.maps.map_store import About, map_hash, map_net, maps_folder, read_map, store_map
+from sumo_nets.maps.map_store import map_hash, map_net, maps_folder, read_map
 from sumo_nets.maps.scan_net import build_scan_net
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.snapshot import street_map_of
-from tests.support.flat_scans import STREET_GRID, flat_grid, street_areas
+from tests.support.flat_scans import STREET_GRID, flat_grid, store_flat, street_areas
 
 pytestmark = pytest.mark.engine
 
@@ -42,35 +40,10 @@ def reply(tick: int) -> EventReply:
     return EventReply(episode="test", tick=tick, states=(), actors=())
 
 
-def stored(name: str, areas: list[ScanArea]) -> tuple[str, ...]:
-    """Store a flat scan as a map. Returns the findings of its net."""
-    findings: list[str] = []
-
-    def fill(ready: Path) -> About:
-        findings.extend(build_scan_net(areas, STREET_GRID, None, ready).findings)
-        return About(
-            name=name,
-            source=name,
-            source_hash="0" * 16,
-            format="scan",
-            imported_at="",
-            bbox=None,
-            lefthand=None,
-            versions={"importer": str(IMPORTER_VERSION), "eclipse-sumo": version("eclipse-sumo")},
-            changes=tuple(findings),
-            guessed_share=None,
-            licences=(),
-            net_hash="",
-        )
-
-    store_map(name, fill)
-    return tuple(findings)
-
-
 @pytest.fixture(scope="module")
 def street(own_cache: None) -> Iterator[StreetMap]:
     """The map of the drawn street."""
-    findings = stored(NAME, street_areas())
+    findings = store_flat(NAME, street_areas())
     assert any("865 m2 are walkable" in words for words in findings)
     yield read_map(NAME)
 
@@ -171,7 +144,7 @@ def test_narrow_places_carry_the_robot_but_no_crowd(own_cache: None) -> None:
     box = shapely.box
     areas = [ScanArea("sidewalk", box(0, 0, 40, 3)), ScanArea("sidewalk", box(60, 0, 100, 3))]
     areas.append(ScanArea("sidewalk", box(40, 1, 60, 2)))
-    (words,) = (one for one in stored("narrow", areas) if "narrower than 1.2 m" in one)
+    (words,) = (one for one in store_flat("narrow", areas) if "narrower than 1.2 m" in one)
     assert "robots may use them, the crowd does not" in words
     street_map = read_map("narrow")
     (passage,) = (street_map.strips[name] for name in street_map.uncrowded)

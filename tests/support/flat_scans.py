@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
+from pathlib import Path
+
 import numpy as np
 import shapely
 
 from cosim.place.scan import HeightGrid, ScanArea
+from sumo_nets.maps.import_rules import IMPORTER_VERSION
+from sumo_nets.maps.map_store import About, store_map
+from sumo_nets.maps.scan_net import build_scan_net
 
 
 def flat_grid(
@@ -36,3 +42,28 @@ def street_areas() -> list[ScanArea]:
         ScanArea("crossing", box(48.0, 3.0, 52.0, 10.0)),
         ScanArea("obstacle", box(70.0, 1.5, 71.0, 2.2)),
     ]
+
+
+def store_flat(name: str, areas: list[ScanArea], grid: HeightGrid = STREET_GRID) -> tuple[str, ...]:
+    """Store a flat scan as a map, without a mesh. Returns the findings of its net."""
+    findings: list[str] = []
+
+    def fill(ready: Path) -> About:
+        findings.extend(build_scan_net(areas, grid, None, ready).findings)
+        return About(
+            name=name,
+            source=name,
+            source_hash="0" * 16,
+            format="scan",
+            imported_at="",
+            bbox=None,
+            lefthand=None,
+            versions={"importer": str(IMPORTER_VERSION), "eclipse-sumo": version("eclipse-sumo")},
+            changes=tuple(findings),
+            guessed_share=None,
+            licences=(),
+            net_hash="",
+        )
+
+    store_map(name, fill)
+    return tuple(findings)
