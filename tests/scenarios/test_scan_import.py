@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from scenarios.places import scan_sources
 from scenarios.places.nets import place
 from scenarios.places.scan_import import CheckedScan, check_scan, import_scan
 from scenarios.places.scan_make import crossing_box, make_scan
-from scenarios.places.scan_options import ScanOptions, read_options
+from scenarios.places.scan_options import ScanOptions, parse_georeference, read_options
 from sumo_nets.maps.map_store import maps_folder, read_map
 from tests.conftest import Cosim
 from tests.support.documents import blocks, text_of
@@ -368,8 +369,8 @@ def test_mirrored_and_flipped_meshes_are_mended_by_option(scan: Path) -> None:
 
 @pytest.mark.engine
 def test_the_order_of_rows_changes_no_bit_of_what_is_stored(scan: Path, tmp_path: Path) -> None:
-    """Shuffled triangles, vertices and splats, split over several files: the same hashes. One splat
-    changed: another hash of the splats, the same map."""
+    """Shuffled triangles, vertices and splats, split over several files, on one processor: the same
+    hashes. One splat changed: another hash of the splats, the same map."""
     options = read_options(scan, {"areas": str(scan / "areas.geojson"), **GIVEN, "name": "scan-a"})
     import_scan(scan, options)
     random = np.random.default_rng(3)
@@ -384,7 +385,12 @@ def test_the_order_of_rows_changes_no_bit_of_what_is_stored(scan: Path, tmp_path
     order = random.permutation(12_000)
     (other / "b.ply").write_bytes(gaussian_ply(cloud.taken(order[:5000])))
     (other / "c.ply").write_bytes(gaussian_ply(cloud.taken(order[5000:])))
-    import_scan(other, read_options(other, {**_given_of(options), "name": "scan-b"}))
+    cpus = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cpus)})
+    try:
+        import_scan(other, read_options(other, {**_given_of(options), "name": "scan-b"}))
+    finally:
+        os.sched_setaffinity(0, cpus)
     one, two = (read_scan(maps_folder() / name).facts for name in ("scan-a", "scan-b"))
     for name in ("mesh_hash", "splats_hash", "heights_hash", "areas_hash"):
         assert getattr(one, name) == getattr(two, name)
@@ -540,6 +546,63 @@ def test_the_documented_options_are_those_of_the_import(tmp_path: Path) -> None:
     for name in (field.name for field in dataclasses.fields(ScanChoices)):
         flag = f"--{name.replace('_', '-')}"
         assert flag in text or name.startswith("splat_"), flag
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="no shared scans beside the repository")
+def test_trained_splats_in_a_wrong_frame_are_refused(tmp_path: Path) -> None:
+    """The transform of Lund's photos is for the photos' frame; its trained splats are in metres."""
+    for name in ("lund_street_ground.glb", "lund_street_obstacles.glb"):
+        shutil.copy(SHARED / "lund-street" / name, tmp_path)
+    trained = SHARED / "lund-street-trained"
+    shutil.copy(trained / "splats.ply", tmp_path)
+    way = {"way": str(SHARED / "lund-street" / "lund_street_route.json")}
+    wrong = {**way, "splat_transform": str(trained / "transform.json")}
+    (words,) = (
+        one.words
+        for one in check_scan(tmp_path, read_options(tmp_path, wrong)).findings
+        if one.level == "refused"
+    )
+    assert "--splat-scale 1 --splat-up +z fits" in words
+    found = check_scan(tmp_path, read_options(tmp_path, {**GIVEN, **way}))
+    said = {one.level: [] for one in found.findings}
+    for one in found.findings:
+        said[one.level].append(one.words)
+    assert "refused" not in said
+    assert "removed 5109 splats: over 300 m from the mesh" in " ".join(said["note"])
+    warned = " ".join(said["warning"])
+    assert "splats to mesh: 0.0" in warned
+    assert "coverage" in warned
+
+
+@pytest.mark.engine
+def test_areas_come_from_openstreetmap_through_the_georeference(tmp_path: Path) -> None:
+    """Around a crossing of the village, roads and sidewalks are where its nodes are; the net is built."""
+    side = np.linspace(-45, 45, 181)
+    x, y = (one.ravel() for one in np.meshgrid(side, side, indexing="ij"))
+    at = (np.arange(180)[:, None] * 181 + np.arange(180)).ravel()
+    faces = np.concatenate(
+        [np.column_stack([at, at + 181, at + 182]), np.column_stack([at, at + 182, at + 1])]
+    )
+    ground = np.column_stack([x, y, np.zeros(len(x))])
+    (tmp_path / "mesh.glb").write_bytes(
+        glb(Street(ground, faces, np.full((len(x), 3), 120, np.uint8)))
+    )
+    village = files("scenarios") / "examples" / "village.osm"
+    given = {"georeference": parse_georeference("52.5011,13.4017"), "osm": str(village)}
+    _, checked = import_scan(tmp_path, read_options(tmp_path, {**given, "name": "scan-osm"}))
+    assert checked.scan is not None
+    of_kind = {
+        kind: shapely.union_all([a.polygon for a in checked.scan.areas if a.kind == kind])
+        for kind in ("road", "sidewalk", "crossing")
+    }
+    # Market Street runs along x = 0, Second Street along y = 0.
+    for point in ((0, 30), (0, -30), (30, 0), (-30, 0)):
+        assert of_kind["road"].buffer(0.5).contains(shapely.Point(point))
+    assert 4 * 60 < of_kind["sidewalk"].area < 2500
+    assert of_kind["crossing"].area > 20
+    kinds = {strip.kind for strip in read_map("scan-osm").strips.values()}
+    assert kinds == {"sidewalk", "crossing"}
+    assert "OpenStreetMap" in " ".join(str(one) for one in checked.findings)
 
 
 def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
