@@ -24,6 +24,8 @@ _PIXEL_RAD: Final = np.pi / 90.0
 _COLUMNS: Final = 180
 _ROWS: Final = 15
 """Size of a panorama: all around, and 30 degrees down from the horizon."""
+_FIRST_ROW: Final = 1
+"""First row that counts: ground 2 degrees below the horizon is 17 m away."""
 _REACH_M: Final = 60.0
 _RADII_PX: Final = (1, 2, 4, 8, 16)
 """Radii of the windows in which splats are drawn; larger ones are cut off."""
@@ -45,7 +47,8 @@ def view_points(walkable: BaseGeometry, heights: HeightGrid, most: int = VIEWS) 
 
 def coverage(splats: Splats, eyes: Floats) -> Floats:
     """Return the covered share of the view below the horizon from each of (K, 3) eyes."""
-    return np.array([float((_panorama(splats, eye) > OPAQUE).mean()) for eye in eyes])
+    panoramas = (_panorama(splats, eye)[_FIRST_ROW:] for eye in eyes)
+    return np.array([float((found > OPAQUE).mean()) for found in panoramas])
 
 
 def check_coverage(splats: Splats, eyes: Floats) -> list[Finding]:
