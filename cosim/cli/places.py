@@ -402,7 +402,8 @@ def print_check(check: MapCheck, about: About | None, capacity: Capacity | None)
     ]
     if about is not None:
         remarks += [("note", _OUTDATED)] if outdated(about) else []
-        remarks += [("changed", change) for change in about.changes]
+        head = "scan" if about.format == "scan" else "changed"
+        remarks += [(head, change) for change in about.changes]
         remarks += [
             ("licence", licence)
             for licence in about.licences or ("none found: ask where the file comes from",)

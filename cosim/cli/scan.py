@@ -225,24 +225,68 @@ def show(
 
 @scan_app.command(
     "areas",
-    epilog="Example:  \n`cosim scan areas my-street -o areas.geojson`",
+    epilog="Examples:  \n`cosim scan areas my-street -o areas.geojson`  \n`cosim scan areas "
+    "my-street --set areas.geojson`  \n`cosim scan areas my-street --way walk.geojson --width 2.5`",
 )
 def areas(
     name: _Map,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Where to write them, a .geojson.")
-    ] = Path("areas.geojson"),
+        Path | None, typer.Option("-o", "--output", help="Write the areas, a .geojson.")
+    ] = None,
+    draft: Annotated[
+        Path | None, typer.Option(help="Write a draft from the ground, a .geojson to edit.")
+    ] = None,
+    set_: Annotated[
+        Path | None, typer.Option("--set", help="GeoJSON with the areas that replace its own.")
+    ] = None,
+    osm: Annotated[
+        Path | None, typer.Option(help="OpenStreetMap file whose streets replace its areas.")
+    ] = None,
+    way: Annotated[
+        Path | None, typer.Option(help="Walked path along which a corridor replaces its areas.")
+    ] = None,
+    width: Annotated[
+        float, typer.Option(min=1.0, max=20.0, help="Width of the corridor in metres.")
+    ] = 3.0,
 ) -> None:
-    """Write the areas of a scan as GeoJSON in metres, to edit and import again with --areas."""
+    """Write the areas of a scan as GeoJSON in metres, or replace them and build its net again."""
     from cosim.place.scan import read_scan
-    from cosim.place.scan_areas import write_areas
+    from cosim.place.scan_areas import draft_areas, write_areas
 
-    check_output(output, "areas", (".geojson", ".json"))
-    scan = read_scan(_map_folder(name), splats=False)
-    instead = replacement_note(output)
-    write_areas(scan.areas, output)
-    count = f"{len(scan.areas)} areas"
-    out.print(f"Areas: {output} ({count}){instead}", soft_wrap=True, highlight=False)
+    folder = _map_folder(name)
+    sources = {"areas": set_, "osm": osm, "way": way}
+    chosen = {key: str(path) for key, path in sources.items() if path is not None}
+    written = [path for path in (output, draft) if path is not None]
+    if len(chosen) + len(written) != 1:
+        raise UsageError("give one of -o, --draft, --set, --osm and --way")
+    if chosen:
+        _replace_areas(name, chosen, width)
+        return
+    (target,) = written
+    check_output(target, "areas", (".geojson", ".json"))
+    scan = read_scan(folder, splats=False)
+    found = scan.areas
+    if draft is not None:
+        from physics.scans.ground import slope
+
+        found = draft_areas(scan.heights, slope(scan.heights))
+    instead = replacement_note(target)
+    write_areas(found, target)
+    out.print(f"Areas: {target} ({len(found)} areas){instead}", soft_wrap=True, highlight=False)
+
+
+def _replace_areas(name: str, chosen: dict[str, str], width_m: float) -> None:
+    from scenarios.places.chosen_areas import replace_areas
+    from scenarios.places.scan_options import ScanOptions
+
+    with doing(f"reading {name}") as progress:
+        options = ScanOptions(**chosen, width_m=width_m)  # type: ignore[arg-type]
+        _, findings = replace_areas(name, options, progress)
+    print_findings(name, findings)
+    out.print(
+        f"Replaced the areas of '{name}': scenarios made on the old ones are refused.",
+        soft_wrap=True,
+    )
 
 
 @scan_app.command(

@@ -87,7 +87,10 @@ def medial_axis(ground: Polygon | MultiPolygon, *, whole: bool = False) -> Axis:
     pieces: list[Piece] = []
     boundary = ground.boundary
     shapely.prepare(boundary)
-    for part in shapely.get_parts(shapely.simplify(opened(ground, OPENED_M), 0.05)):
+    wide = shapely.simplify(opened(ground, OPENED_M), 0.05)
+    for part in shapely.get_parts(shapely.get_parts(wide)):
+        if part.area < OPENED_M:
+            continue
         for line, ends in _lines(_with_islands_joined(part)):
             here = [_node_of(nodes, end) for end in (line[0], line[-1])]
             loop = here[0] == here[1]
@@ -116,7 +119,7 @@ def clear_widths(
     s_m = np.linspace(0.0, whole.length_m, count)
     poses = [whole.at(s) for s in s_m.tolist()]
     xy = np.array([pose.xy for pose in poses])
-    clear_m = 2.0 * shapely.distance(shapely.points(xy), boundary)
+    clear_m: Floats = np.asarray(2.0 * shapely.distance(shapely.points(xy), boundary))
     for end, gaps_m in zip(dead, (s_m, s_m[-1] - s_m), strict=True):
         for i in np.flatnonzero(gaps_m < 0.5 * clear_m.max() + _END_GAP_M) if end else ():
             across = np.array([-math.sin(poses[i].heading_rad), math.cos(poses[i].heading_rad)])
@@ -133,9 +136,12 @@ def between(line: Floats, from_m: float, to_m: float) -> Floats:
     return np.vstack([whole.at(from_m).xy[None], inner, whole.at(to_m).xy[None]])
 
 
-def opened(ground: shapely.Geometry, radius_m: float) -> shapely.Geometry:
+def opened(ground: shapely.Geometry, radius_m: float) -> Polygon | MultiPolygon:
     """Return ground without what is narrower than twice a radius."""
-    return overlay.grown(shapely.buffer(ground, -radius_m, quad_segs=4), radius_m)
+    found: Polygon | MultiPolygon = overlay.grown(
+        shapely.buffer(ground, -radius_m, quad_segs=4), radius_m
+    )
+    return found
 
 
 def _with_islands_joined(part: Polygon) -> Polygon:
@@ -163,7 +169,7 @@ def _lines(part: Polygon) -> list[tuple[Floats, tuple[bool, bool]]]:
         return []
     boundary = part.boundary
     shapely.prepare(boundary)
-    clearance = shapely.distance(shapely.points(xy), boundary)
+    clearance = np.asarray(shapely.distance(shapely.points(xy), boundary))
     _prune(xy, graph, clearance)
     merged = _contracted(xy, graph, clearance, part)
     found = []
@@ -221,7 +227,8 @@ def _voronoi_graph(part: Polygon) -> tuple[Floats, _Graph]:
 
 
 def _starts(rings: Sequence[Floats]) -> list[int]:
-    return np.cumsum([0, *map(len, rings)])[:-1].tolist()
+    starts: list[int] = np.cumsum([0, *map(len, rings)])[:-1].tolist()
+    return starts
 
 
 def _chains(xy: Floats, graph: _Graph, forks: Collection[int] = ()) -> list[_Chain]:
@@ -300,7 +307,7 @@ def _extended(line: Floats, part: Polygon) -> Floats:
     radius_m = float(
         shapely.distance(shapely.Point(whole.at(0.5 * whole.length_m).xy), part.boundary)
     )
-    cut_m = max(0.5 * whole.length_m, whole.length_m - 1.5 * radius_m)
+    cut_m = max(0.5 * whole.length_m, whole.length_m - 2.2 * radius_m)
     short = between(line, 0.0, cut_m)
     back = Polyline(short).at(max(0.0, cut_m - 2.0)).xy
     along = short[-1] - back
@@ -357,7 +364,6 @@ def _width_cuts(s_m: Floats, clear_m: Floats) -> list[int]:
             # The wider piece ends beside the narrow place, not in it.
             cuts.append(max(i - 1, 1) if width_m < least[i - 1] else i)
             low = high = width_m
-    # Short pieces join the neighbour of the nearer width.
     while cuts:
         edges = [0, *cuts, len(s_m) - 1]
         lengths = [s_m[b] - s_m[a] for a, b in pairwise(edges)]
@@ -366,7 +372,11 @@ def _width_cuts(s_m: Floats, clear_m: Floats) -> list[int]:
             break
         widths = [float(clear_m[a : b + 1].min()) for a, b in pairwise(edges)]
         sides = [i for i in (shortest - 1, shortest + 1) if 0 <= i < len(widths)]
-        side = min(sides, key=lambda i: (abs(widths[i] - widths[shortest]), i))
+        # A join with a narrower neighbour narrows no other piece.
+        side = min(
+            sides,
+            key=lambda i: (widths[i] > widths[shortest], abs(widths[i] - widths[shortest]), i),
+        )
         cuts.pop(min(side, shortest))
     return cuts
 

@@ -52,17 +52,18 @@ def union_all(shapes: Sequence[shapely.Geometry] | Shapes) -> Polygon | MultiPol
     return united
 
 
-def grown(shape: shapely.Geometry, by_m: float) -> Any:
+def grown(shape: Any, by_m: float) -> Any:
     """Return a shape grown by a positive distance.
 
     GEOS loses holes of some large shapes; these are grown side by side.
     """
-    whole = shapely.buffer(shape, by_m, quad_segs=4)
+    whole: Any = shapely.buffer(shape, by_m, quad_segs=4)
     if whole.is_valid and whole.area >= shape.area:
         return whole
     rings = [shapely.get_coordinates(ring) for ring in shapely.get_parts(shape.boundary)]
     sides = np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
-    return union_all([shape, *shapely.buffer(shapely.linestrings(sides), by_m, quad_segs=4)])
+    around = np.asarray(shapely.buffer(shapely.linestrings(sides), by_m, quad_segs=4))
+    return union_all([shape, *around])
 
 
 def where_geos_failed(error: Exception) -> str:

@@ -47,6 +47,8 @@ _SPECK_M2: Final = 1.0
 """Area in m2 below which walkable pieces and holes are dropped."""
 _SHIFTS_M: Final = ((4.0, 0.5), (0.5, 0.1))
 """Reach and step of the two rounds of a fit, in metres."""
+_FIT_POINTS: Final = 30_000
+"""Largest number of points of walkable ground that are compared with the scan in a fit."""
 _FAR_DEG: Final = 0.5
 """Distance from the georeference up to which coordinates can be degrees."""
 
@@ -226,7 +228,7 @@ def walkable_ground(areas: Iterable[ScanArea], grid: HeightGrid) -> Polygon | Mu
     return parts[0] if len(parts) == 1 else MultiPolygon(parts)
 
 
-def uncovered(grid: HeightGrid, around: shapely.Geometry) -> Polygon | MultiPolygon:
+def uncovered(grid: HeightGrid, around: Polygon | MultiPolygon) -> Polygon | MultiPolygon:
     """Return the part of an area that is farther than half a metre from measured ground."""
     near = _cells(grid, grid.measured, shapely.buffer(around, 2.0 * _GAP_M))
     found: Polygon | MultiPolygon = overlay.difference(around, overlay.grown(near, _GAP_M))
@@ -239,7 +241,7 @@ def fit_to_ground(areas: Sequence[ScanArea], grid: HeightGrid) -> tuple[tuple[Sc
     Of equal shifts, the smallest is taken. Raises MapError if no walkable ground is over the scan.
     """
     walked = overlay.union_all([area.polygon for area in areas if area.kind in WALKED])
-    points = _lattice_points(walked, 2.0 * grid.step_m)
+    points = _lattice_points(walked, max(grid.step_m, math.sqrt(walked.area / _FIT_POINTS)))
     free = grid.measured & ~grid.blocked
     x, y, before = 0.0, 0.0, _share_on(points, grid, free)
     for reach_m, step_m in _SHIFTS_M:
@@ -254,7 +256,7 @@ def fit_to_ground(areas: Sequence[ScanArea], grid: HeightGrid) -> tuple[tuple[Sc
         raise MapError("the map's sidewalks are not over the scan: check its georeference")
 
     def move(xy: Floats) -> Floats:
-        return xy + np.array([x, y])
+        return np.asarray(xy + np.array([x, y]))
 
     moved = [ScanArea(area.kind, shapely.transform(area.polygon, move)) for area in areas]
     return tuple(moved), Fit(round(x, 2), round(y, 2), before, after)
@@ -274,14 +276,19 @@ def grid_box(grid: HeightGrid) -> Polygon:
     """Return the rectangle that a height grid covers."""
     rows, columns = grid.heights.shape
     x0, y0 = grid.origin.tolist()
-    return shapely.box(x0, y0, x0 + (columns - 1) * grid.step_m, y0 + (rows - 1) * grid.step_m)
+    found: Polygon = shapely.box(
+        x0, y0, x0 + (columns - 1) * grid.step_m, y0 + (rows - 1) * grid.step_m
+    )
+    return found
 
 
-def _lattice_points(area: shapely.Geometry, step_m: float) -> Floats:
+def _lattice_points(area: Polygon | MultiPolygon, step_m: float) -> Floats:
     if area.is_empty:
         raise MapError("the map has no sidewalks or crossings: draw areas by hand")
     x0, y0, x1, y1 = area.bounds
-    x, y = (v.ravel() for v in np.meshgrid(np.arange(x0, x1, step_m), np.arange(y0, y1, step_m)))
+    half_m = 0.5 * step_m
+    columns, rows = np.arange(x0 + half_m, x1, step_m), np.arange(y0 + half_m, y1, step_m)
+    x, y = (v.ravel() for v in np.meshgrid(columns, rows))
     inside = shapely.contains_xy(area, x, y)
     return np.column_stack([x[inside], y[inside]])
 
@@ -296,7 +303,7 @@ def _share_on(points: Floats, grid: HeightGrid, free: NDArray[np.bool_]) -> floa
 
 
 def _cells(
-    grid: HeightGrid, wanted: NDArray[np.bool_], within: shapely.Geometry | None = None
+    grid: HeightGrid, wanted: NDArray[np.bool_], within: Polygon | MultiPolygon | None = None
 ) -> Polygon | MultiPolygon:
     """Return the union of the cells around wanted lattice points, near an area if given."""
     x0, y0 = grid.origin.tolist()
@@ -319,8 +326,8 @@ def _cells(
     middle = y0 + (first[1] + row) * grid.step_m
     boxes = shapely.box(west, middle - half, east, middle + half)
     # A grid makes the shared sides of cells equal to the bit.
-    found: Polygon | MultiPolygon = shapely.union_all(boxes, grid_size=1e-4)
-    return found
+    found: Any = shapely.union_all(boxes, grid_size=1e-4)
+    return found if isinstance(found, Polygon | MultiPolygon) else Polygon()
 
 
 def _large(shape: shapely.Geometry, least_m2: float) -> list[Polygon]:
@@ -360,8 +367,8 @@ def _features(path: Path) -> list[Mapping[str, Any]]:
     return [{"frame": held.get("frame"), **one} for one in features]
 
 
-def _geometry(where: str, feature: Mapping[str, Any]) -> shapely.Geometry:
-    held = feature.get("geometry") if feature.get("type") == "Feature" else feature
+def _geometry(where: str, feature: Mapping[str, Any]) -> Any:
+    held: Any = feature.get("geometry") if feature.get("type") == "Feature" else feature
     try:
         return shapely.force_2d(shapely.geometry.shape(held))
     except Exception as error:  # shapely raises errors of many kinds for damaged geometry
@@ -370,7 +377,7 @@ def _geometry(where: str, feature: Mapping[str, Any]) -> shapely.Geometry:
 
 def _placer(
     path: Path, features: Sequence[Mapping[str, Any]], georeference: Georeference | None
-) -> Callable[[shapely.Geometry], shapely.Geometry]:
+) -> Callable[[Any], Any]:
     """Return the function that moves geometry of a file into the net's frame."""
     frame = features[0].get("frame")
     if frame not in (None, "local", "wgs84"):

@@ -130,7 +130,8 @@ def _sampled(
                 sums[:, k] += found.astype(np.int64)
             counts += np.bincount(own, minlength=len(uv))
     mean = sums / (65535.0 * np.maximum(counts, 1)[:, None])
-    return np.rint(linear_to_srgb(mean) * 255.0).astype(np.uint8)
+    colours: NDArray[np.uint8] = np.rint(linear_to_srgb(mean) * 255.0).astype(np.uint8)
+    return colours
 
 
 def _areas(vertices: Floats, triangles: NDArray[np.int64]) -> Floats:

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats
 from cosim.place.scan import HeightGrid, ScanArea, ScanMesh, Splats
@@ -46,9 +47,11 @@ _OPAQUE: Final = 128
 _GROUND_REACH_M: Final = 0.4
 _MEASURED: Final = 20_000
 """Number of splats that are measured."""
-_PLANES: Final = 300
-_POINTS: Final = 6000
+_PLANES: Final = 200
+_POINTS: Final = 4000
 """Numbers of random planes and points by which the ground is found."""
+_LEVEL: Final = math.cos(math.radians(30.0))
+"""Least vertical component of the normal of a level plane."""
 
 
 class Ground(NamedTuple):
@@ -64,10 +67,10 @@ class Ground(NamedTuple):
     facing_up: float
 
 
-def ground_plane(mesh: ScanMesh, within_deg: float = 180.0) -> Ground:
+def ground_planes(mesh: ScanMesh) -> tuple[Ground, Ground]:
     """Return the plane with most of a mesh's area and little below it, by RANSAC.
 
-    within_deg: largest angle of its normal to +z.
+    Returns the best plane of all, and the best one within 30 degrees of level.
     """
     corners = mesh.vertices.astype(np.float64)[mesh.triangles]
     areas, normals = areas_of(corners), unit_normals(corners)
@@ -75,20 +78,19 @@ def ground_plane(mesh: ScanMesh, within_deg: float = 180.0) -> Ground:
     ends = np.cumsum(areas)
     picks = np.minimum(np.searchsorted(ends, random.random(_POINTS) * ends[-1]), len(areas) - 1)
     points, directions = corners[picks].mean(axis=1), normals[picks]
-    size_m = float(np.abs(points - np.median(points, axis=0)).max())
-    reach_m = 0.015 * size_m
-    best = Ground(np.array([0.0, 0.0, 1.0]), 0.0, 1.0)
-    best_score = 0.0
+    reach_m = 0.015 * float(np.abs(points - np.median(points, axis=0)).max())
+    none = Ground(np.array([0.0, 0.0, 1.0]), 0.0, 1.0)
+    best, scores = [none, none], [0.0, 0.0]
     for k in range(_PLANES):
         found = _plane(points, directions, points[k], directions[k], reach_m)
         if found is None:
             continue
         ground, below = found
-        tilt = math.degrees(math.acos(min(1.0, max(-1.0, float(ground.normal[2])))))
         score = ground.support * max(0.0, 1.0 - 4.0 * below)
-        if tilt <= within_deg and score > best_score:
-            best, best_score = ground, score
-    return best
+        for which, least in enumerate((-1.0, _LEVEL)):
+            if ground.normal[2] >= least and score > scores[which]:
+                best[which], scores[which] = ground, score
+    return best[0], best[1]
 
 
 def _plane(
@@ -136,8 +138,7 @@ def check_up(mesh: ScanMesh, up: str) -> list[Finding]:
 
     up: axis of the file; "" if a transform is given in place of it.
     """
-    overall = ground_plane(mesh)
-    ground = ground_plane(mesh, 30.0)
+    overall, ground = ground_planes(mesh)
     if ground.support < 0.4 * overall.support:
         ground = overall
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, float(ground.normal[2])))))
@@ -252,7 +253,7 @@ def check_areas(areas: Sequence[ScanArea], heights: HeightGrid) -> list[Finding]
     return findings
 
 
-def ground_share(area: shapely.Geometry, heights: HeightGrid) -> float:
+def ground_share(area: BaseGeometry, heights: HeightGrid) -> float:
     """Return the share of an area with measured ground, or with an obstacle on it."""
     points = lattice_points(area, heights.step_m)
     if not len(points):
@@ -262,7 +263,7 @@ def ground_share(area: shapely.Geometry, heights: HeightGrid) -> float:
     return float((inside & known[row, column]).mean())
 
 
-def lattice_points(area: shapely.Geometry, step_m: float) -> Floats:
+def lattice_points(area: BaseGeometry, step_m: float) -> Floats:
     """Return the points of a lattice in an area, (N, 2) m."""
     if area.is_empty:
         return np.empty((0, 2))
@@ -310,7 +311,7 @@ def check_alignment(
                 f"frames: give --splat-scale, --splat-up or --splat-transform{hint}"
             )
         ]
-    shift = best_shift(sample, distance)
+    shift = best_shift(_balanced(sample, heights), distance)
     if shift is not None:
         return [shift]
     fine = median <= MEDIAN_GAP_M and most <= MOST_GAP_M
@@ -321,9 +322,17 @@ def check_alignment(
     ]
 
 
-def best_shift(sample: Splats, distance: MeshDistance) -> Finding | None:
-    """Return a refusal if a shift of the splats fits the mesh much better than none."""
-    points = sample.centres[:: max(1, len(sample) // 700)].astype(np.float64)
+def _balanced(sample: Splats, heights: HeightGrid) -> Floats:
+    """Return places of splats, (N, 3): as many on the ground as above it, if there are enough."""
+    above, known = above_ground(heights, sample.centres)
+    ground = known & (np.abs(above) < _GROUND_REACH_M)
+    parts = [np.flatnonzero(one) for one in (ground, ~ground)]
+    picks = [part[:: max(1, len(part) // 350)] for part in parts]
+    return sample.centres[np.concatenate(picks)].astype(np.float64)
+
+
+def best_shift(points: Floats, distance: MeshDistance) -> Finding | None:
+    """Return a refusal if a shift of splats at (N, 3) points fits the mesh much better."""
 
     def share(shift: Floats) -> float:
         return float((distance.to_planes(points + shift, 0.4) < 0.1).mean())
@@ -339,10 +348,13 @@ def best_shift(sample: Splats, distance: MeshDistance) -> Finding | None:
             if (there := share(shift)) > found + 1e-3:
                 best, found = shift, there
     length_m = math.sqrt(float((best * best).sum()))
-    if length_m < REFUSED_SHIFT_M or found < 1.25 * unmoved + 0.05:
+    better = found > 1.25 * unmoved + 0.05 or (
+        found > unmoved + 0.08 and 1.0 - found < 0.5 * (1.0 - unmoved)
+    )
+    if length_m < REFUSED_SHIFT_M or not better:
         return None
     return refusal(
-        f"splats lie {length_m:.1f} m beside the mesh: {unmoved:.0%} of the opaque ones are "
+        f"splats lie {length_m:.1f} m beside the mesh: {unmoved:.0%} of a sample are "
         f"within 0.1 m of it, and {found:.0%} after a shift by "
         f"({', '.join(f'{one:+.1f}' for one in best)}) m: add it to the translation of "
         "--splat-transform"

@@ -9,8 +9,10 @@ from typing import Any, Final
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats
+from cosim.place import overlay
 from cosim.place.scan import HeightGrid, ScanArea, ScanMesh, Splats
 from physics.scans.ordering import take_splats
 
@@ -78,11 +80,14 @@ def clean(
     return Cleaned(marked, counts, np.concatenate(floaters))
 
 
-def walkable_area(areas: Sequence[ScanArea]) -> shapely.Geometry:
+def walkable_area(areas: Sequence[ScanArea]) -> BaseGeometry:
     """Return the union of sidewalks and crossings without obstacles."""
     walked = [area.polygon for area in areas if area.kind in ("sidewalk", "crossing")]
     obstacles = [area.polygon for area in areas if area.kind == "obstacle"]
-    return shapely.difference(shapely.union_all(walked), shapely.union_all(obstacles))
+    found: BaseGeometry = overlay.difference(
+        overlay.union_all(walked), overlay.union_all(obstacles)
+    )
+    return found
 
 
 def grid_cells(
@@ -114,18 +119,19 @@ def largest_m(splats: Splats) -> Floats:
     d, e, f = xy / safe, xz / safe, yz / safe
     half = 0.5 * (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e))
     angle = np.arccos(np.clip(half, -1.0, 1.0)) / 3.0
-    return np.sqrt(np.maximum(mean + 2.0 * spread * np.cos(angle), 0.0))
+    return np.asarray(np.sqrt(np.maximum(mean + 2.0 * spread * np.cos(angle), 0.0)))
 
 
 def _removed(
-    rule: str, splats: Splats, mesh: ScanMesh, heights: HeightGrid, walkable: shapely.Geometry
+    rule: str, splats: Splats, mesh: ScanMesh, heights: HeightGrid, walkable: BaseGeometry
 ) -> NDArray[np.bool_]:
     """Return which splats a rule removes."""
     if rule == "sky":
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        return ((splats.centres < low - SKY_M) | (splats.centres > high + SKY_M)).any(axis=1)
+        far = (splats.centres < low - SKY_M) | (splats.centres > high + SKY_M)
+        return np.asarray(far.any(axis=1))
     if rule == "faint":
-        return splats.rgba[:, 3] < LEAST_OPACITY * 255.0
+        return np.asarray(splats.rgba[:, 3] < LEAST_OPACITY * 255.0)
     if rule == "large":
         large = largest_m(splats) > LARGEST_M
         large[large] = _within(walkable, splats.centres[large], NEAR_M)
@@ -141,9 +147,7 @@ def _removed(
     return found
 
 
-def _within(
-    area: shapely.Geometry, points: NDArray[np.float32], reach_m: float
-) -> NDArray[np.bool_]:
+def _within(area: BaseGeometry, points: NDArray[np.float32], reach_m: float) -> NDArray[np.bool_]:
     """Return which points are in an area, or within a distance of it."""
     if reach_m:
         area = shapely.buffer(area, reach_m, quad_segs=8)
@@ -178,5 +182,5 @@ def _alone(centres: NDArray[np.float32]) -> NDArray[np.bool_]:
         found, _ = cKDTree(centres).query(
             centres[alone], k=NEIGHBOURS + 1, distance_upper_bound=NEIGHBOUR_M, workers=-1
         )
-        alone[alone] = ~np.isfinite(found[:, -1])
+        alone[alone] = ~np.isfinite(np.asarray(found)[:, -1])
     return alone

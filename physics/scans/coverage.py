@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats
 from cosim.place.scan import HeightGrid, Splats
@@ -24,6 +24,8 @@ _PIXEL_RAD: Final = np.pi / 90.0
 _COLUMNS: Final = 180
 _ROWS: Final = 15
 """Size of a panorama: all around, and 30 degrees down from the horizon."""
+_FIRST_ROW: Final = 1
+"""First row that counts: ground 2 degrees below the horizon is 17 m away."""
 _REACH_M: Final = 60.0
 _RADII_PX: Final = (1, 2, 4, 8, 16)
 """Radii of the windows in which splats are drawn; larger ones are cut off."""
@@ -31,7 +33,7 @@ _SOFTNESS: Final = 0.1
 """Variance in square pixels that is added, so that small splats are not lost between pixels."""
 
 
-def view_points(walkable: shapely.Geometry, heights: HeightGrid, most: int = VIEWS) -> Floats:
+def view_points(walkable: BaseGeometry, heights: HeightGrid, most: int = VIEWS) -> Floats:
     """Return eyes spread over the walkable area, (K, 3) m."""
     points = lattice_points(walkable, 0.5)
     if not len(points):
@@ -45,7 +47,8 @@ def view_points(walkable: shapely.Geometry, heights: HeightGrid, most: int = VIE
 
 def coverage(splats: Splats, eyes: Floats) -> Floats:
     """Return the covered share of the view below the horizon from each of (K, 3) eyes."""
-    return np.array([float((_panorama(splats, eye) > OPAQUE).mean()) for eye in eyes])
+    panoramas = (_panorama(splats, eye)[_FIRST_ROW:] for eye in eyes)
+    return np.array([float((found > OPAQUE).mean()) for found in panoramas])
 
 
 def check_coverage(splats: Splats, eyes: Floats) -> list[Finding]:

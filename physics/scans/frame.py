@@ -98,7 +98,7 @@ def check_similarity(transform: Sequence[Sequence[float]]) -> None:
 
 def scale_of(matrix: Sequence[Sequence[float]]) -> float:
     """Return the metres per unit of a matrix."""
-    return abs(_determinant(matrix)) ** (1.0 / 3.0)
+    return float(abs(_determinant(matrix)) ** (1.0 / 3.0))
 
 
 def combine(second: Matrix, first: Matrix) -> Matrix:
@@ -159,7 +159,7 @@ def place(low: Floats, high: Floats, placing: Placing | None) -> tuple[Matrix, G
             )
         there = Georeference(latitude_deg=placing.latitude_deg, longitude_deg=placing.longitude_deg)
         if np.any(origin[:2]):
-            lon, lat = _local(there)(*origin[:2], inverse=True)
+            lon, lat = _local(there)(origin[0], origin[1], inverse=True)
             there = Georeference(latitude_deg=lat, longitude_deg=lon)
         return shift(-origin), there
     return _place_in_system(low, high, placing)

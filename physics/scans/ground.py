@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +49,9 @@ _BASE_M: Final = 0.5
 """Length over which slopes are measured, in metres."""
 
 
-class Holes(NamedTuple):
-    """Closed holes of the measured ground. area_m2: of all of them."""
+@dataclass(frozen=True, slots=True)
+class Holes:
+    """Closed holes of the measured ground. area_m2: of all of them together."""
 
     count: int
     area_m2: float

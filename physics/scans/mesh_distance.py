@@ -45,8 +45,8 @@ class MeshDistance:
 
         It is faster than `to_mesh`, and exact only near the middle of large surfaces.
         """
-        gap, near = self._tree.query(points, distance_upper_bound=reach_m, workers=-1)
-        found = np.isfinite(gap)
+        gap, nearest = self._tree.query(points, distance_upper_bound=reach_m)
+        found, near = np.isfinite(np.asarray(gap)), np.asarray(nearest)
         owner = self._owner[near[found]]
         x, y, z = (points[found] - self._tree.data[near[found]]).T
         a, b, c = self.normals[owner].T
@@ -112,4 +112,4 @@ def _to_triangles(points: Floats, corners: Floats) -> Floats:
         inside &= side >= 0.0
     x, y, z = (points - a).T
     nx, ny, nz = normal.T
-    return np.where(inside, np.abs(nx * x + ny * y + nz * z), np.sqrt(best))
+    return np.asarray(np.where(inside, np.abs(nx * x + ny * y + nz * z), np.sqrt(best)))

@@ -20,7 +20,10 @@ def morton_codes(points: NDArray[np.float32]) -> NDArray[np.uint64]:
     half = 1 << (_BITS - 1)
     cells = np.floor(points.astype(np.float64) / _CELL_M) + half
     cells = np.clip(cells, 0, 2 * half - 1).astype(np.uint64)
-    return _spread(cells[:, 0]) | _spread(cells[:, 1]) << 1 | _spread(cells[:, 2]) << 2
+    one, two = np.uint64(1), np.uint64(2)
+    return np.asarray(
+        _spread(cells[:, 0]) | _spread(cells[:, 1]) << one | _spread(cells[:, 2]) << two
+    )
 
 
 def order_of(points: NDArray[np.float32], *more: NDArray[Any]) -> NDArray[np.int64]:
@@ -101,7 +104,7 @@ def _double_areas(vertices: NDArray[np.float32], triangles: NDArray[Any]) -> NDA
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    return np.sqrt(x * x + y * y + z * z)
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def _as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:

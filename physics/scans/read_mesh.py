@@ -189,14 +189,16 @@ def _plain(material: Any, vertices: Floats) -> NDArray[np.uint8]:
         colour = np.asarray(getattr(material, "main_color", (*GREY, 255)))[:3]
     else:  # trimesh turns the factor, which is linear, into bytes
         colour = as_uint8(linear_to_srgb(np.asarray(factor)[None, :3] / 255.0))[0]
-    return np.repeat(np.asarray(colour, dtype=np.uint8)[None], len(vertices), axis=0)
+    found: NDArray[np.uint8] = np.tile(np.asarray(colour, dtype=np.uint8), (len(vertices), 1))
+    return found
 
 
 def _as_srgb(colours: NDArray[np.uint8], encoding: Colours) -> NDArray[np.uint8]:
     if encoding == "srgb":
         return colours
     table = np.rint(linear_to_srgb(np.arange(256) / 255.0) * 255.0).astype(np.uint8)
-    return table[colours]
+    found: NDArray[np.uint8] = table[colours]
+    return found
 
 
 def _grey(vertices: Floats) -> NDArray[np.uint8]:
@@ -220,8 +222,8 @@ def _whole(
             f"{path}: a triangle has the vertex {triangles.max()} of {len(vertices)}: the file is "
             "damaged, export the scan again"
         )
-    finite = np.isfinite(vertices).all(axis=1)
-    valid = finite[triangles].all(axis=1)
+    finite = np.asarray(np.isfinite(vertices).all(axis=1))
+    valid = np.asarray(finite[triangles].all(axis=1))
     if dropped := int(len(valid) - np.count_nonzero(valid)):
         if dropped > MOST_DROPPED_SHARE * len(valid):
             raise MapError(

@@ -17,31 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import MapError
-from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, Splats, write_scan
-from cosim.place.scan_areas import (
-    corridor,
-    cut_to_scan,
-    draft_areas,
-    fit_to_ground,
-    read_areas,
-    read_way,
-)
 from physics.scans.check import (
     check_alignment,
     check_areas,
     check_rotations,
     check_scale,
     check_up,
-    check_way,
 )
 from physics.scans.clean import RULES, clean, walkable_area
 from physics.scans.coverage import check_coverage, view_points
-from physics.scans.findings import Finding, note, raise_refusals, warning
-from physics.scans.ground import closed_holes, height_grid, slope
+from physics.scans.findings import Finding, note, raise_refusals
+from physics.scans.ground import closed_holes, height_grid
 from physics.scans.labels import label_mesh
 from physics.scans.mesh_distance import MeshDistance
+from scenarios.places.chosen_areas import find_areas
 from scenarios.places.scan_options import ScanOptions
 from scenarios.places.scan_sources import LoadedScan, load_mesh, load_splats, splat_hint
 from sumo_nets.maps.import_rules import IMPORTER_VERSION
@@ -112,7 +103,7 @@ def check_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) 
     heights = height_grid(loaded.mesh, None, _step_m(loaded))
     findings += _holes(heights)
     progress("finding the walkable area")
-    areas, found = find_areas(options, heights, loaded, progress)
+    areas, found = find_areas(options, heights, loaded.georeference, progress)
     findings += found
     findings += check_areas(areas, heights)
     if any(one.level == "refused" for one in findings):
@@ -124,58 +115,6 @@ def check_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) 
     facts = _facts(loaded, options)
     scan = Scan(facts, mesh, heights, areas, splats, floaters)
     return CheckedScan(scan, tuple(findings))
-
-
-def find_areas(
-    options: ScanOptions, heights: HeightGrid, loaded: LoadedScan, progress: Progress = ignore
-) -> tuple[tuple[ScanArea, ...], list[Finding]]:
-    """Return the areas of a scan, from a file, a map, a walked way, or drafted."""
-    there = loaded.georeference
-    if options.areas:
-        return read_areas(Path(options.areas), heights, there), []
-    if options.osm:
-        return _mapped(Path(options.osm), heights, loaded, progress)
-    if options.way:
-        way = read_way(Path(options.way), there)
-        areas = corridor(way, options.width_m, heights)
-        words = f"areas: a corridor of {options.width_m:g} m along {Path(options.way).name}"
-        return areas, [note(words), *_way_heights(Path(options.way), way, heights)]
-    areas = draft_areas(heights, slope(heights))
-    size_m2 = sum(area.polygon.area for area in areas)
-    return areas, [
-        warning(
-            f"areas: a draft of {size_m2:.0f} m2 of level ground, in which roads, lawns and "
-            "sidewalks are not distinguished: edit it (`cosim scan areas`), or give --areas, "
-            "--osm or --way"
-        )
-    ]
-
-
-def _mapped(
-    path: Path, heights: HeightGrid, loaded: LoadedScan, progress: Progress
-) -> tuple[tuple[ScanArea, ...], list[Finding]]:
-    """Return the areas of a map, moved to fit the ground."""
-    from sumo_nets.maps.scan_osm import osm_areas
-
-    if loaded.georeference is None:
-        raise MapError(
-            f"{path}: a map needs to know where the scan is: give --georeference LATITUDE,LONGITUDE"
-        )
-    reach = np.abs(loaded.mesh.vertices[:, :2]).max()
-    mapped, licences = osm_areas(path, loaded.georeference, float(reach), progress)
-    moved, fit = fit_to_ground(mapped, heights)
-    areas = cut_to_scan(moved, heights)
-    words = f"areas: {len(areas)} from {path.name}, {fit}"
-    return areas, [note(words), *(note(licence) for licence in licences)]
-
-
-def _way_heights(path: Path, way: Floats, heights: HeightGrid) -> list[Finding]:
-    """Check the heights of a way over the ground, if its file has some."""
-    held = msgspec.json.decode(path.read_bytes())
-    points = held.get("route", []) if isinstance(held, dict) else []
-    if len(points) != len(way) or any(len(point) < 3 for point in points):
-        return []
-    return check_way(np.array([point[2] for point in points], dtype=float), way, heights)
 
 
 def _holes(heights: HeightGrid) -> list[Finding]:

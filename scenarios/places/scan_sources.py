@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import MapError
 from cosim.core.progress import Progress, ignore
 from cosim.place.scan import Georeference, ScanMesh, Splats
-from physics.scans.check import fitting_frame, ground_plane, guess_up
+from physics.scans.check import fitting_frame, ground_planes, guess_up
 from physics.scans.clean import largest_m
 from physics.scans.findings import Finding, note, warning
 from physics.scans.frame import (
@@ -31,11 +31,10 @@ from physics.scans.ordering import order_mesh, order_splats, take_splats
 from physics.scans.read_mesh import MOST_TRIANGLES, RawMesh, read_mesh
 from physics.scans.read_splats import RawSplats, read_splats
 from physics.scans.sources import kind_of_source, read_source, stem_and_ending
-from scenarios.places.scan_options import ScanOptions, read_transform
+from scenarios.places.scan_options import ScanOptions, Up, read_transform
 
 BUDGET: Final = 4_000_000
 """Number of splats above which a scan is refused: 3 million are drawn at 60 frames/s on a GPU."""
-_RAW_ARRAYS: Final = ("centres", "scales", "quaternions", "rgba")
 _ENDINGS: Final = (".glb", ".ply", ".obj", ".spz", ".splat")
 
 
@@ -126,7 +125,8 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
     for path, data in found.meshes.items():
         progress(f"reading the mesh {path.name}")
         gltf = stem_and_ending(path)[1] == ".glb"
-        scale, up = options.scale, options.up
+        scale: float | None = options.scale
+        up: Up | None = options.up
         if transform is None and gltf:
             scale, up = scale or 1.0, up or "+y"
         if transform is None and (scale is None or up is None):
@@ -156,7 +156,7 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
     )
     if not len(mesh.triangles):
         raise MapError("the mesh has only flat triangles, of no area: export the scan again")
-    matrix, up, _ = meshes[0]
+    matrix, stated, _ = meshes[0]
     findings = [finding for _, _, raw in meshes for finding in raw.findings]
     words = f"mesh: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices"
     findings.append(note(words))
@@ -166,7 +166,7 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
     return LoadedScan(
         mesh,
         combine(placing, matrix),
-        up,
+        stated,
         georeference,
         scale_of(matrix),
         placing=placing,
@@ -182,7 +182,7 @@ def _refuse_unstated(path: Path, data: bytes, scale: float | None, up: str | Non
     missing = [name for name, value in (("scale", scale), ("up", up)) if value is None]
     unit = size if scale is None else 1.0
     mesh = order_mesh((vertices / unit * 100.0).astype(np.float32), raw.triangles, raw.colours)
-    normal = ground_plane(mesh).normal
+    normal = ground_planes(mesh)[0].normal
     axis, angle = guess_up(normal, "+z")
     hints = []
     if up is None:
@@ -203,7 +203,12 @@ def load_splats(
     for path, data in files.items():
         progress(f"reading the splats {path.name}")
         raws.append(read_splats(path, data, options.quaternions))
-    raw = RawSplats(*(np.concatenate([getattr(one, name) for one in raws]) for name in _RAW_ARRAYS))
+    raw = RawSplats(
+        np.concatenate([one.centres for one in raws]),
+        np.concatenate([one.scales for one in raws]),
+        np.concatenate([one.quaternions for one in raws]),
+        np.concatenate([one.rgba for one in raws]),
+    )
     loaded.findings += [finding for one in raws for finding in one.findings]
     names = ", ".join(path.name for path in files)
     if len(raw) > BUDGET and options.most_splats is None:

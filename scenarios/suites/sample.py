@@ -60,9 +60,9 @@ def suite_on_map(
     if kind == "long-horizon":
         scenarios, left_out = drawn.long(count or 1), list[str]()
     elif kind == "reactive":
-        scenarios, left_out = drawn.in_turns(kinds, drawn.event, count, events)
+        scenarios, left_out = drawn.in_turns(kind, kinds, drawn.event, count, events)
     else:
-        scenarios, left_out = drawn.in_turns(STRUCTURES, drawn.unit, count)
+        scenarios, left_out = drawn.in_turns(kind, STRUCTURES, drawn.unit, count)
     return Suite(
         name=kind,
         version=f"map-{name}-{seed}" + (f"-rough{roughness:g}" if roughness else ""),
@@ -95,6 +95,7 @@ class _Drawn(NamedTuple):
 
     def in_turns(
         self,
+        suite: str,
         names: Iterable[str],
         draw: Callable[[str, int], Scenario],
         count: int | None,
@@ -122,7 +123,7 @@ class _Drawn(NamedTuple):
             if count is None or not left:
                 break
         if not found:
-            raise SpecError(f"no scenario fits on '{self.name}': {' '.join(left_out)}")
+            raise SpecError(f"no {suite} scenario fits on '{self.name}': {' '.join(left_out)}")
         return found, left_out
 
     def event(self, kind: str, seed: int) -> Scenario:

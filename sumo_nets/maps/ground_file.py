@@ -203,7 +203,7 @@ def _labelled_points(street_map: StreetMap) -> tuple[Floats, NDArray[np.int64]]:
         found.append(points)
         owners += [number] * len(points)
     xy, first = np.unique(np.round(np.concatenate(found), 6), axis=0, return_index=True)
-    return xy, np.array(owners, dtype=np.int64)[first]
+    return np.asarray(xy, dtype=float), np.array(owners, dtype=np.int64)[first]
 
 
 def _corner_points(street_map: StreetMap, corner: Corner) -> Floats:
@@ -272,7 +272,7 @@ def _whole(parts: list[Polygon]) -> Polygon:
 def _several(parts: list[Polygon], corner: Corner) -> Polygon | MultiPolygon:
     if not parts:  # between two pieces that touch
         return shapely.Point(corner.polygon.centroid).buffer(_END_M)
-    return parts[0] if len(parts) == 1 else MultiPolygon(parts)
+    return overlay.union_all(parts)
 
 
 def _rings(shape: Polygon | MultiPolygon) -> list[_Rings]:

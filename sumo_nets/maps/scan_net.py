@@ -8,7 +8,7 @@ over them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -50,8 +50,10 @@ _NEAR_END_M: Final = 3.0
 _ROAD_END_M: Final = 6.0
 """Least distance of a crossing from the end of a road, in metres."""
 _ON_ROAD_M2: Final = 0.5
-_KERB_M: Final = 0.3
-"""Distance before the curb from which the link to a crossing runs straight, in metres."""
+_BESIDE_M: Final = 0.3
+"""Gap between a crossing and its road that is closed, in metres."""
+_KERB_M: Final = 0.8
+"""Depth of the corner between a curb and the link to its sidewalk, in metres."""
 _OPTIONS: Final = (
     "--walkingareas",
     "--no-turnarounds.except-deadend",
@@ -87,11 +89,38 @@ class _Edge:
 
 @dataclass(slots=True)
 class _Zebra:
-    """Crossing at a node. line: from curb to curb, (2, 2) metres."""
+    """Crossing at a node.
 
+    number: of its area.
+    line: from curb to curb, (2, 2) metres.
+    turned: whether netconvert takes the line the other way than most.
+    """
+
+    number: int
     node: int
     line: Floats
     lane_m: float
+    turned: bool = False
+
+    @property
+    def outline(self) -> Floats:
+        """Outline of its node, with corners before the curbs, (4, 2) metres."""
+        along = (self.line[1] - self.line[0]) / np.hypot(*(self.line[1] - self.line[0]))
+        aside = np.array([-along[1], along[0]]) * (0.5 * self.lane_m + INNER_M)
+        start, end = self.line[0] - _KERB_M * along, self.line[1] + _KERB_M * along
+        return np.array([start - aside, end - aside, end + aside, start + aside])
+
+    @property
+    def id(self) -> str:
+        return f":n{self.node}_c0"
+
+
+class _NoCrossing(Exception):
+    """A crossing that does not fit on its road. number: of its area."""
+
+    def __init__(self, number: int, reason: str) -> None:
+        super().__init__(reason)
+        self.number = number
 
 
 @dataclass(slots=True)
@@ -99,6 +128,7 @@ class _Plan:
     nodes: list[Floats] = field(default_factory=list)
     edges: list[_Edge] = field(default_factory=list)
     zebras: list[_Zebra] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
 
     def node(self, xy: Floats) -> int:
         self.nodes.append(np.asarray(xy, dtype=float))
@@ -129,14 +159,20 @@ def build_scan_net(
     progress("finding the walkable ground")
     ground = walkable_ground(areas, heights)
     progress("finding the axis of the walkable ground")
-    plan = _plan(areas, ground)
     progress("building the net")
-    path, street_map = _built(plan, georeference, folder)
+    plain: dict[int, str] = {}
+    while True:
+        plan = _planned(areas, ground, plain)
+        path, street_map = _built(plan, georeference, folder)
+        lacking = [zebra for zebra in plan.zebras if zebra.id not in street_map.strips]
+        if not lacking:
+            break
+        plain |= {zebra.number: "netconvert refuses it" for zebra in lacking}
     for _ in range(_ROUNDS):
         if not _narrowed(plan, street_map, ground):
             break
         path, street_map = _built(plan, georeference, folder)
-    findings = _checked(plan, street_map)
+    findings = [*plan.findings, *_checked(plan, street_map)]
     progress("starting SUMO on the net")
     start_net(path, str(path))
     names = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
@@ -146,7 +182,7 @@ def build_scan_net(
     if narrow:
         at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
         findings.append(
-            f"{len(narrow)} of {len(names)} pieces of the walking net are narrower than "
+            f"net: {len(narrow)} of {len(names)} pieces of the walking net are narrower than "
             f"{CROWD_M:g} m, one of them at ({at[0]:.1f}, {at[1]:.1f}): robots may use them, the "
             "crowd does not"
         )
@@ -156,25 +192,41 @@ def build_scan_net(
     )
     both = shapely.intersection(inner, ground).area
     iou = both / (inner.area + ground.area - both)
+    outside = max(0.0, 1.0 - both / inner.area)
     findings.append(
-        f"{ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by {iou:.0%} "
-        f"(intersection over union), {1.0 - both / inner.area:.1%} of the lanes are outside"
+        f"net: {ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by "
+        f"{iou:.0%} (intersection over union), {outside:.1%} of the lanes are outside"
     )
     return ScanNet(path, tuple(findings), float(iou))
 
 
-def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
+def _planned(
+    areas: Sequence[ScanArea], ground: Polygon | MultiPolygon, plain: dict[int, str]
+) -> _Plan:
+    """Return the plan of a net. Crossings that do not fit are added to `plain`.
+
+    plain: reason for each crossing that is only walkable ground, by the number of its area.
+    """
+    while True:
+        try:
+            return _plan(areas, ground, plain)
+        except _NoCrossing as error:
+            plain[error.number] = str(error)
+
+
+def _plan(
+    areas: Sequence[ScanArea], ground: Polygon | MultiPolygon, plain: Mapping[int, str]
+) -> _Plan:
     roads = overlay.union_all([area.polygon for area in areas if area.kind == "road"])
     walks = overlay.union_all([a.polygon for a in areas if a.kind in WALKED - {"crossing"}])
-    over = [
-        area.polygon
-        for area in areas
-        if area.kind == "crossing" and shapely.intersection(area.polygon, roads).area > _ON_ROAD_M2
-    ]
-    off_road = overlay.difference(
-        ground, overlay.union_all([overlay.difference(one, walks) for one in over])
-    )
-    axis = medial_axis(off_road)
+    over = {
+        number: overlay.difference(area.polygon, walks)
+        for number, area in enumerate(areas)
+        if area.kind == "crossing"
+        and number not in plain
+        and shapely.intersection(area.polygon.buffer(_BESIDE_M), roads).area > _ON_ROAD_M2
+    }
+    axis = medial_axis(overlay.difference(ground, overlay.union_all([*over.values()])))
     if not axis.pieces:
         raise MapError("the walkable ground is nowhere wide enough to walk: draw wider areas")
     plan = _Plan(list(axis.nodes))
@@ -182,9 +234,17 @@ def _plan(areas: Sequence[ScanArea], ground: Polygon | MultiPolygon) -> _Plan:
         ends = (piece.start, piece.end)
         plan.edges.append(_Edge(*ends, piece.line, piece.clear_m, _inner(piece.clear_m)))
     if not roads.is_empty:
-        _add_roads(plan, medial_axis(roads, whole=True))
-    for crossing in over:
-        _add_crossing(plan, crossing, roads, walks)
+        # Roads may be drawn up to a crossing, or below it.
+        joined = overlay.union_all([roads, *over.values()])
+        joined = shapely.buffer(overlay.grown(joined, _BESIDE_M), -_BESIDE_M, quad_segs=4)
+        _add_roads(plan, medial_axis(joined, whole=True))
+        for number, crossing in over.items():
+            _add_crossing(plan, number, crossing, joined, walks)
+    for number, reason in plain.items():
+        at = areas[number].polygon.centroid
+        plan.findings.append(
+            f"net: crossing near ({at.x:.1f}, {at.y:.1f}): cars do not stop there: {reason}"
+        )
     return plan
 
 
@@ -202,30 +262,34 @@ def _inner(clear_m: float) -> float:
 
 
 def _add_crossing(
-    plan: _Plan, crossing: Polygon, roads: shapely.Geometry, walks: shapely.Geometry
+    plan: _Plan,
+    number: int,
+    crossing: Polygon | MultiPolygon,
+    roads: shapely.Geometry,
+    walks: shapely.Geometry,
 ) -> None:
     """Add a crossing, with links to the sidewalks on both sides.
 
     Where no drawn road leads straight over it, such as next to a junction, it gets a piece of road
-    of its own without cars. Raises MapError if it does not lead from sidewalk to sidewalk.
+    of its own without cars. Raises _NoCrossing if it does not lead from sidewalk to sidewalk.
     """
-    where = f"the crossing near ({crossing.centroid.x:.1f}, {crossing.centroid.y:.1f})"
     span = _span(crossing, roads, walks)
     if span is None:
-        raise MapError(f"{where} does not lead from one side of its road to the other: redraw it")
+        raise _NoCrossing(number, "it does not lead from one side of its road to the other")
     road = _road_over(plan, span)
     if road is None:
         across = np.array([-span.along[1], span.along[0]]) * _ROAD_END_M
         road = _stub(plan, np.array([span.middle - across, span.middle + across]), span)
     node = _split(plan, road, span.middle, _ROAD_END_M)
+    if node is None:
+        raise _NoCrossing(number, f"its road is shorter than {2.0 * _ROAD_END_M:g} m")
     lane_m = _inner(span.width_m - INNER_M)
-    plan.zebras.append(_Zebra(node, span.ends, lane_m))
+    plan.zebras.append(_Zebra(number, node, span.ends, lane_m))
     for end, outward in ((span.ends[0], -span.along), (span.ends[1], span.along)):
         meets = _joint(plan, end, outward)
-        if meets is None:
-            raise MapError(f"{where} joins no sidewalk at one end: draw one there")
-        piece, at = meets
-        joint = _split(plan, piece, at, _NEAR_END_M)
+        joint = None if meets is None else _split(plan, *meets, _NEAR_END_M)
+        if joint is None:
+            raise _NoCrossing(number, "it joins no sidewalk at one end: draw one there")
         line = np.vstack([plan.nodes[joint], end + _KERB_M * outward, span.middle])
         plan.edges.append(_Edge(joint, node, line, span.width_m, lane_m))
 
@@ -244,7 +308,9 @@ class _Span(NamedTuple):
     width_m: float
 
 
-def _span(crossing: Polygon, roads: shapely.Geometry, walks: shapely.Geometry) -> _Span | None:
+def _span(
+    crossing: Polygon | MultiPolygon, roads: shapely.Geometry, walks: shapely.Geometry
+) -> _Span | None:
     """Return the span of a crossing, along that of its axes whose ends are nearest to sidewalks."""
     corners = shapely.get_coordinates(
         shapely.minimum_rotated_rectangle(shapely.intersection(crossing, roads))
@@ -322,11 +388,16 @@ def _joint(plan: _Plan, end: Floats, outward: Floats) -> tuple[_Edge, Floats] | 
     return edge, line.at(line.project(*(end + outward).tolist())[0]).xy
 
 
-def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float) -> int:
-    """Return the node of an edge at a place: one of its ends if near, else a new one."""
+def _split(plan: _Plan, edge: _Edge, at: Floats, near_m: float) -> int | None:
+    """Return the node of an edge at a place: one of its ends if near, else a new one.
+
+    Roads are split at a distance from their ends; None if they are too short.
+    """
     line = Polyline(edge.line)
     s_m = line.project(*np.asarray(at).tolist())[0]
     if edge.drive:
+        if line.length_m < 2.0 * near_m:
+            return None
         s_m = min(max(s_m, near_m), line.length_m - near_m)
     elif s_m < near_m or s_m > line.length_m - near_m:
         return edge.start if s_m < 0.5 * line.length_m else edge.end
@@ -344,8 +415,12 @@ def _converted(
     left = georeference is not None and bool(
         left_hand_country(georeference.longitude_deg, georeference.latitude_deg)
     )
+    # netconvert mirrors left-hand nets, but not the outlines of their nodes.
+    outlines = {} if left else {zebra.node: zebra.outline for zebra in plan.zebras}
     nodes = [
-        f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"/>'
+        f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"'
+        + (f' shape="{_shape(outlines[i])}"' if i in outlines else "")
+        + "/>"
         for i, xy in enumerate(plan.nodes)
     ]
     edges = [row for i, edge in enumerate(plan.edges) for row in _rows(i, edge)]
@@ -384,7 +459,7 @@ def _clockwise(zebra: _Zebra, road: _Edge, left: bool) -> Floats:
     out = at.xy - zebra.line.mean(axis=0)
     right = np.array([out[1], -out[0]])
     from_right = float((zebra.line[0] - zebra.line[1]) @ right) > 0.0
-    return zebra.line if from_right != left else zebra.line[::-1]
+    return zebra.line if from_right != (left != zebra.turned) else zebra.line[::-1]
 
 
 def _built(plan: _Plan, georeference: Georeference | None, folder: Path) -> tuple[Path, StreetMap]:
@@ -392,10 +467,31 @@ def _built(plan: _Plan, georeference: Georeference | None, folder: Path) -> tupl
     for radius_m in _RADII_M:
         path = _converted(plan, georeference, folder, radius_m)
         street_map = read_net(path)
-        crossings = sum(strip.kind == "crossing" for strip in street_map.strips.values())
-        if crossings == len(plan.zebras):
+        if backwards := [zebra for zebra in plan.zebras if _is_backwards(zebra, street_map)]:
+            for zebra in backwards:
+                zebra.turned = not zebra.turned
+            path = _converted(plan, georeference, folder, radius_m)
+            street_map = read_net(path)
+        if all(zebra.id in street_map.strips for zebra in plan.zebras):
             break
     return path, street_map
+
+
+def _is_backwards(zebra: _Zebra, street_map: StreetMap) -> bool:
+    """Return whether the first corner of a built crossing is at its far end."""
+    strip = street_map.strips.get(zebra.id)
+    if strip is None or strip.corners[0] is None:
+        return False
+    corner = street_map.corners[strip.corners[0]]
+    ends = [
+        street_map.strips[port.strip].line[0 if port.end == 0 else -1, :2]
+        for port in corner.ports
+        if port.strip != zebra.id
+    ]
+    if not ends:
+        return False
+    to_first, to_last = (np.hypot(*(np.array(ends) - strip.line[i, :2]).T).min() for i in (0, -1))
+    return bool(to_first > to_last)
 
 
 def _narrowed(plan: _Plan, street_map: StreetMap, ground: Polygon | MultiPolygon) -> bool:
@@ -411,7 +507,7 @@ def _narrowed(plan: _Plan, street_map: StreetMap, ground: Polygon | MultiPolygon
     changed = False
     lanes: dict[str, _Edge | _Zebra] = {f"w{i}": edge for i, edge in enumerate(plan.edges)}
     for zebra in plan.zebras:
-        lanes |= {name: zebra for name in wide if name.startswith(f":n{zebra.node}_c")}
+        lanes[zebra.id] = zebra
     for name in sorted(wide):
         lane_m = max(_NARROWING * lanes[name].lane_m, min(_STRIPE_M, lanes[name].lane_m))
         changed |= lane_m < lanes[name].lane_m
@@ -477,10 +573,7 @@ def _checked(plan: _Plan, street_map: StreetMap) -> list[str]:
     wanted = [f"w{i}" for i, edge in enumerate(plan.edges) if not edge.drive]
     if missing := [name for name in wanted if name not in street_map.strips]:
         raise MapError(f"netconvert left out {len(missing)} walks of {len(wanted)}: {missing[0]}")
-    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing"]
-    if len(crossings) != len(plan.zebras):
-        raise MapError(f"netconvert made {len(crossings)} of {len(plan.zebras)} crossings")
     parts = len(set(WalkGraph(street_map).component.tolist()))
     if parts == 1:
         return []
-    return [f"the walkable ground is in {parts} separate parts: scenarios use the largest"]
+    return [f"net: the walkable ground is in {parts} separate parts: scenarios use the largest"]

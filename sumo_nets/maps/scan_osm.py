@@ -54,7 +54,7 @@ def osm_areas(
     offset = np.array([float(one) for one in location.attrib["netOffset"].split(",")])
 
     def to_scan(xy: Floats) -> Floats:
-        lonlat = projection(*(xy - offset).T, inverse=True)
+        lonlat = projection(xy[:, 0] - offset[0], xy[:, 1] - offset[1], inverse=True)
         return to_local(np.column_stack(lonlat), georeference)
 
     areas = tuple(
