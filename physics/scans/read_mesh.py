@@ -177,7 +177,12 @@ def _coloured(
                 f"{done.edge_m:.2g} m apart at most"
             )
             return done.vertices, done.triangles, done.colours, [note(words)]
-        return vertices, triangles, _plain(material, vertices), []
+        words = (
+            f"{path.name}: its texture is missing or packed in a format that is not read (KTX2): "
+            "drawn in one colour; export it with PNG or JPEG textures, beside an .obj"
+        )
+        found = [] if visual.uv is None else [warning(words)]
+        return vertices, triangles, _plain(material, vertices), found
     words = f"{path.name}: has no colours: drawn grey; export it with texture or vertex colours"
     return vertices, triangles, _grey(vertices), [warning(words)]
 

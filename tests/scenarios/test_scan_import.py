@@ -618,3 +618,7 @@ def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
     options = read_options(tmp_path, {"scale": 1.0, "up": "+z"})
     loaded, _ = scan_sources.load_mesh(tmp_path, options)
     assert (np.abs(loaded.mesh.colours.astype(int) - [200, 40, 10]) <= 1).all()
+    for image in tmp_path.glob("*.png"):
+        image.unlink()
+    loaded, _ = scan_sources.load_mesh(tmp_path, options)
+    assert any("its texture is missing" in str(one) for one in loaded.findings)
