@@ -28,6 +28,7 @@ from physics.robots import urdf_path
 from physics.street import props, vehicles
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
+from physics.street.scan_surface import posterized
 from physics.street.surface import grounded_obstacles
 from physics.textures.layers import Colour
 
@@ -127,7 +128,7 @@ class BulletScene:
         x0, y0, x1, y1 = tile_bounds(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
         chunk, posts = self._surface.chunk(key), self._surface.posts(key)
-        parts = [
+        parts = posterized(self._surface.scanned(key)) or [
             (patch.mesh, patch.colour, patch.label)
             for patch in (*chunk.ground, *self._surface.covers(key))
         ]
