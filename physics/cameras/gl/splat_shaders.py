@@ -3,12 +3,16 @@
 All shaders read the uniform block `Splatting` (binding VIEW_BINDING), see `view_rows` in
 `physics.cameras.gl.splats`. Buffers are storage blocks with the bindings of the shader.
 
+Pictures are upside down in textures: row 0 is the top one.
 No shader uses atomic operations, so that the order of blending depends on no schedule.
 """
 
 from __future__ import annotations
 
 from typing import Final
+
+from cosim.core.state import LABELS
+from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 
 VIEW_BINDING: Final = 1
 TILE_PX: Final = 8
@@ -19,6 +23,30 @@ BLUR_PX2: Final = 0.3
 """Variance added to each projected splat, in square pixels, as in the training of splats."""
 FULL: Final = 1.0 / 1024.0
 """Transmittance below which a pixel is full."""
+BEHIND_M: Final = 0.12
+"""Distance behind the mesh from which objects are covered, metres."""
+STEEP: Final = 0.02
+"""Minimum slope of a ray to the ground."""
+NOTHING_M: Final = 1.0e9
+"""Limit of pixels without an object."""
+GROUND_LABELS: Final = (LABELS["road"], LABELS["ground"])
+"""First and last label of the ground."""
+
+OBJECTS_UNIT: Final = 9
+OBJECTS_DEPTH_UNIT: Final = 10
+MESH_UNIT: Final = 11
+MESH_DEPTH_UNIT: Final = 12
+COLOUR_UNIT: Final = 13
+MEDIAN_UNIT: Final = 14
+LIMITS_UNIT: Final = 15
+"""Texture units of a picture's layers."""
+
+METRES: Final = f"""
+float metres(float depth) {{
+    return {FAR_PLANE_M * NEAR_PLANE_M} / ({FAR_PLANE_M} - {FAR_PLANE_M - NEAR_PLANE_M} * depth);
+}}
+"""
+"""Conversion of the depth buffer to metres along the view."""
 
 _BLOCK: Final = f"""#version 430
 layout(std140, binding = {VIEW_BINDING}) uniform Splatting {{
@@ -29,10 +57,6 @@ layout(std140, binding = {VIEW_BINDING}) uniform Splatting {{
     uvec4 sizes;  // width and height in pixels, columns and rows of tiles
     uvec4 counts; // splats
     vec4 lattice; // xyz of the point from which distances are sorted
-    vec4 sun;     // xyz towards the sun, w 1 where it casts shadows
-    vec4 light;   // rgb of the sun on a white surface
-    vec4 upward;  // rgb of the sky on a white surface that faces up; w 1 for contact shadows
-    vec4 feet;    // xy of the eye from the picture's anchor
 }};
 """
 
@@ -330,7 +354,7 @@ layout(std430, binding = 2) readonly buffer Lists {{ uint lists[]; }};
 layout(rgba16f, binding = 0) writeonly uniform image2D painted;
 layout(r32f, binding = 1) writeonly uniform image2D median;
 #ifdef LIMITED
-layout(binding = 9) uniform sampler2D limits;
+layout(binding = {LIMITS_UNIT}) uniform sampler2D limits;
 #endif
 void main() {{
     ivec2 here = ivec2(gl_GlobalInvocationID.xy) * ivec2(1, ROWS);
@@ -372,7 +396,11 @@ void main() {{
             sum[j] += share * colour;
             left[j] -= share;
             depth[j] = depth[j] == 0.0 && left[j] < 0.5 ? two.z : depth[j];
+#ifdef LIMITED
+            most = max(most, limit[j] == 0.0 ? 0.0 : left[j]);
+#else
             most = max(most, left[j]);
+#endif
         }}
         if (most < {FULL}) break;
     }}
@@ -390,4 +418,38 @@ void main() {{
 
 limits: depth up to which splats are drawn; negative where ground splats are not, 0 for none.
 Each invocation draws ROWS pixels of a column.
+"""
+
+LIMITS: Final = (
+    _BLOCK
+    + f"""
+layout(local_size_x = {TILE_PX}, local_size_y = {TILE_PX}) in;
+layout(r32f, binding = 0) writeonly uniform image2D limits;
+layout(binding = {OBJECTS_DEPTH_UNIT}) uniform sampler2D objects_depth;
+layout(binding = {MESH_UNIT}) uniform sampler2D mesh;
+layout(binding = {MESH_DEPTH_UNIT}) uniform sampler2D mesh_depth;
+{METRES}
+void main() {{
+    ivec2 here = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(here, ivec2(sizes.xy)))) return;
+    float object = texelFetch(objects_depth, here, 0).r;
+    float limit = {NOTHING_M:.1f};
+    if (object < 1.0) {{
+        float label = texelFetch(mesh, here, 0).a * 255.0;
+        float gap = metres(object) - metres(texelFetch(mesh_depth, here, 0).r);
+        float y = (0.5 * float(sizes.y) - float(here.y) - 0.5) / eye.w;
+        float x = (float(here.x) + 0.5 - 0.5 * float(sizes.x)) / eye.w;
+        float steep = abs(ahead.z + x * right.z + y * up.z);
+        bool ground = label < {GROUND_LABELS[1]}.5 && label > {GROUND_LABELS[0]}.0 - 0.5;
+        float behind = ground ? gap * max(steep, {STEEP}) : gap;
+        limit = behind < {BEHIND_M} ? 0.0 : ground ? metres(object) : -metres(object);
+    }}
+    imageStore(limits, here, vec4(limit));
+}}
+"""
+)
+"""Decide by the mesh which splats may cover an object.
+
+An object is covered where it is BEHIND_M behind the mesh: below ground measured vertically, because
+the noise of a scan's ground is long in a flat view.
 """

@@ -26,7 +26,7 @@ _LEAST_KEY: Final = 252928
 _MOST_KEY: Final = 65535
 _COUNTS_MAX: Final = 1 << 23
 """Maximum number of counters of a sort."""
-_VIEW_ROWS: Final = 11
+_VIEW_ROWS: Final = 7
 _LINE: Final = 65535 * 64
 """Maximum number of invocations in one dimension of a dispatch."""
 
@@ -129,7 +129,9 @@ class SplatShaders:
         x, y = (-(-count // group) for count, group in zip(size, each, strict=True))
         shader.run(x, y)
         self._context.memory_barrier(
-            moderngl.SHADER_STORAGE_BARRIER_BIT | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
+            moderngl.SHADER_STORAGE_BARRIER_BIT
+            | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
+            | moderngl.TEXTURE_FETCH_BARRIER_BIT
         )
 
     def along(self, name: str, count: int, **uniforms: int) -> None:
@@ -272,7 +274,7 @@ class SplatDrawing:
         """Draw a cloud.
 
         rows: of `view_rows`
-        limited: draw up to the depth in the texture of unit 9
+        limited: draw up to the depths in the texture of unit LIMITS_UNIT
         """
         run, tuning, room = self._shaders, self.tuning, self._buffers.room
         sizes = rows.view(np.uint32)[4]
@@ -292,6 +294,14 @@ class SplatDrawing:
         name = "PAINT LIMITED" if limited else "PAINT"
         across, down = sizes[2:].tolist()
         run.run(name, (across * glsl.TILE_PX, down * glsl.TILE_PX), (glsl.TILE_PX,) * 2)
+
+    def limit(self, rows: NDArray[np.float32], limits: moderngl.Texture) -> None:
+        """Compute the limits of a picture from its layers, which are bound to their units."""
+        self._view.write(rows)
+        self._view.bind_to_uniform_block(glsl.VIEW_BINDING)
+        limits.bind_to_image(0, read=False, write=True)
+        across, down = rows.view(np.uint32)[4, :2].tolist()
+        self._shaders.run("LIMITS", (across, down), (glsl.TILE_PX,) * 2)
 
     def _listed(self, count: int, tiles: int, rects: moderngl.Buffer) -> Any:
         run, tuning, room = self._shaders, self.tuning, self._buffers.room
@@ -344,7 +354,7 @@ class SplatTarget:
 
 
 def view_rows(taken: Shot) -> NDArray[np.float32]:
-    """Return the (_VIEW_ROWS, 4) rows of the block `Splatting` for a view, without its light."""
+    """Return the (_VIEW_ROWS, 4) rows of the block `Splatting` for a view, with its order."""
     rows = np.zeros((_VIEW_ROWS, 4), dtype=np.float32)
     width, height = taken.size
     wide, tall = taken.half_picture
