@@ -88,9 +88,7 @@ class Sky:
 
 
 @lru_cache(maxsize=8)
-def sky_of(
-    light: Light, seed: int = 0, to_sun: tuple[float, float, float] | None = None
-) -> Sky:
+def sky_of(light: Light, seed: int = 0, to_sun: tuple[float, float, float] | None = None) -> Sky:
     """Compute the sky of a light.
 
     seed: of the clouds
@@ -134,9 +132,7 @@ def irradiance(radiance: NDArray[np.floating], towards: Floats) -> Floats:
     return np.asarray(np.tensordot(weight, radiance.astype(float), axes=2))
 
 
-def _procedural(
-    light: Light, seed: int, to_sun: tuple[float, float, float] | None = None
-) -> Sky:
+def _procedural(light: Light, seed: int, to_sun: tuple[float, float, float] | None = None) -> Sky:
     sun = sun_direction(light.hour, light.day_of_year, light.latitude_deg)
     if to_sun is not None:
         sun = np.array(to_sun)

@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import Final
 
 import moderngl
+import msgspec
 import numpy as np
 
 from cosim.core.errors import EngineError
@@ -33,6 +34,8 @@ _ALWAYS: Final = "1"
 """Depth function of moderngl that passes every pixel."""
 _CLOUDS_MAX: Final = 2
 """Unused clouds that stay on the renderer."""
+_CONTACT: Final = 0.5
+"""Share of a scanned colour that is left under an object."""
 _CONTACT_M: Final = 0.2
 """Radius over which a contact shadow is blurred, metres."""
 
@@ -59,15 +62,17 @@ in vec2 spot;
 {glsl.METRES}
 float shaded(vec3 at, vec3 normal) {{
 #ifdef CONTACT
+    const float SHADED = {_CONTACT};
     float lit = 0.2 * sunlit(at, normal);
     for (int k = 0; k < 4; ++k) {{
         vec2 off = {_CONTACT_M} * vec2(k == 0 ? 1.0 : k == 1 ? -1.0 : 0.0, k == 2 ? 1.0 : k == 3 ? -1.0 : 0.0);
         lit += 0.2 * sunlit(at + vec3(off, 0.0), normal);
     }}
 #else
+    const float SHADED = {SHADE};
     float lit = sunlit(at, normal);
 #endif
-    return mix(1.0, mix({SHADE}, 1.0, lit), smoothstep(0.0, 0.2, dot(normal, sun.xyz)));
+    return mix(1.0, mix(SHADED, 1.0, lit), smoothstep(0.0, 0.2, dot(normal, sun.xyz)));
 }}
 void main() {{
     ivec2 here = ivec2(gl_FragCoord.xy);
@@ -222,15 +227,15 @@ def scan_light(light: Light, facts: ScanFacts, seed: int) -> tuple[Sky, Lighting
     Only shadows and the picture of the sky are those of `light`. Without a known sun the sky is
     overcast, and objects have contact shadows: the sun is straight above, without light.
     """
-    exposure = {"shadows": light.shadows, "hdri": light.hdri, "exposure_ev": facts.exposure_ev}
+    own = Light(shadows=light.shadows, hdri=light.hdri, exposure_ev=facts.exposure_ev)
     if facts.sun is not None:
         azimuth, rise = (
             math.radians(angle) for angle in (facts.sun.azimuth_deg, facts.sun.elevation_deg)
         )
         flat = math.cos(rise)
         to_sun = flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(rise)
-        sky = sky_of(Light(**exposure), seed, to_sun)
+        sky = sky_of(own, seed, to_sun)
         return sky, replace(lighting_of(sky), haze=False)
-    sky = sky_of(Light(cloud_cover=1.0, **exposure), seed)
+    sky = sky_of(msgspec.structs.replace(own, cloud_cover=1.0), seed)
     above = replace(sky, sun=_ABOVE, sun_colour=_DARK, shadows=light.shadows)
     return sky, replace(lighting_of(above), haze=False)

@@ -7,7 +7,7 @@ nearest point of a lattice of eyes, so the order does not depend on the heading.
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import moderngl
 import numpy as np
@@ -276,7 +276,7 @@ class SplatDrawing:
         rows: of `view_rows`
         limited: draw up to the depths in the texture of unit LIMITS_UNIT
         """
-        run, tuning, room = self._shaders, self.tuning, self._buffers.room
+        run, room = self._shaders, self._buffers.room
         sizes = rows.view(np.uint32)[4]
         tiles = int(sizes[2] * sizes[3])
         rows.view(np.uint32)[5, 0] = len(cloud)
@@ -287,7 +287,7 @@ class SplatDrawing:
         for place, buffer in enumerate((cloud.buffer, order, records, rects)):
             buffer.bind_to_storage_buffer(place)
         run.along("PROJECT", len(cloud))
-        keys, values, lists, starts = self._listed(len(cloud), tiles, rects)
+        lists, starts = self._listed(len(cloud), tiles, rects)
         for place, buffer in enumerate((records, starts, lists)):
             buffer.bind_to_storage_buffer(place)
         target.bind()
@@ -303,7 +303,10 @@ class SplatDrawing:
         across, down = rows.view(np.uint32)[4, :2].tolist()
         self._shaders.run("LIMITS", (across, down), (glsl.TILE_PX,) * 2)
 
-    def _listed(self, count: int, tiles: int, rects: moderngl.Buffer) -> Any:
+    def _listed(
+        self, count: int, tiles: int, rects: moderngl.Buffer
+    ) -> tuple[moderngl.Buffer, moderngl.Buffer]:
+        """Return the splats of each tile in their order, and where the tiles start."""
         run, tuning, room = self._shaders, self.tuning, self._buffers.room
         chunks = -(-count // tuning.pairs_chunk)
         sums = room("sums", chunks + 1)
@@ -322,7 +325,7 @@ class SplatDrawing:
             buffer.bind_to_storage_buffer(place)
         run.run("EMIT", *serial, chunk=tuning.pairs_chunk)
         starts = self._sort.sort((keys, values), (None, lists), total, tiles)
-        return keys, values, lists, starts
+        return lists, starts
 
     def release(self) -> None:
         self._buffers.release()
