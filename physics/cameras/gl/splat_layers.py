@@ -125,16 +125,11 @@ class Layers:
             texture.use(unit)
 
     def release(self) -> None:
-        for thing in (
-            self.objects,
-            self.mesh,
-            self._objects,
-            self._mesh,
-            *self._depths,
-            self.limits,
-            self.splats,
-        ):
-            thing.release()
+        self.objects.release()
+        self.mesh.release()
+        for texture in (self._objects, self._mesh, *self._depths, self.limits):
+            texture.release()
+        self.splats.release()
 
 
 @dataclass(slots=True)

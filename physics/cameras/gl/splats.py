@@ -71,9 +71,8 @@ def distance_keys(centres: NDArray[np.float32], point: NDArray[np.float32]) -> N
     """
     x, y, z = (centres[:, k] - point[k] for k in range(3))
     bits = (x * x + y * y + z * z).view(np.uint32) >> np.uint32(12)
-    return (np.clip(bits, _LEAST_KEY, _LEAST_KEY + _MOST_KEY) - np.uint32(_LEAST_KEY)).astype(
-        np.uint16
-    )
+    steps = np.clip(bits, _LEAST_KEY, _LEAST_KEY + _MOST_KEY) - np.uint32(_LEAST_KEY)
+    return np.asarray(steps, dtype=np.uint16)
 
 
 def cholesky(covariances: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -204,8 +203,8 @@ class StableSort:
         for place, buffer in enumerate((counts, pairs[0], sums, starts, pairs[1], keys, into[1])):
             buffer.bind_to_storage_buffer(place)
         keep = int(into[0] is not None)
-        size = (chunks, 1), (tuning.lanes, 1)
-        run.run("SCATTER", *size, group=tuning.group, keep_keys=keep, **sizes)
+        lanes = (tuning.lanes, 1)
+        run.run("SCATTER", (chunks, 1), lanes, group=tuning.group, keep_keys=keep, **sizes)
         return starts
 
 
@@ -312,8 +311,8 @@ class SplatDrawing:
         sums = room("sums", chunks + 1)
         rects.bind_to_storage_buffer(0)
         sums.bind_to_storage_buffer(1)
-        serial = (chunks, 1), (tuning.lanes, 1)
-        run.run("SUMS", *serial, chunk=tuning.pairs_chunk)
+        lanes = (tuning.lanes, 1)
+        run.run("SUMS", (chunks, 1), lanes, chunk=tuning.pairs_chunk)
         sums.bind_to_storage_buffer(0)
         run.run("SCAN", (1, 1), (1, 1), digits=chunks)
         # Room for all pairs must be known before they are written: the only value that is read.
@@ -323,7 +322,7 @@ class SplatDrawing:
         keys, values, lists = (room(name, total + 1) for name in ("tiles", "of tiles", "lists"))
         for place, buffer in enumerate((rects, sums, keys, values)):
             buffer.bind_to_storage_buffer(place)
-        run.run("EMIT", *serial, chunk=tuning.pairs_chunk)
+        run.run("EMIT", (chunks, 1), lanes, chunk=tuning.pairs_chunk)
         starts = self._sort.sort((keys, values), (None, lists), total, tiles)
         return lists, starts
 
