@@ -23,6 +23,8 @@ BLUR_PX2: Final = 0.3
 """Variance added to each projected splat, in square pixels, as in the training of splats."""
 FULL: Final = 1.0 / 1024.0
 """Transmittance below which a pixel is full."""
+STRAY: Final = 0.3
+"""Maximum difference of a pixel's depth from its splat's, as a share."""
 BEHIND_M: Final = 0.12
 """Distance behind the mesh from which objects are covered, metres."""
 STEEP: Final = 0.02
@@ -77,14 +79,14 @@ void main() {
     precise float xy = xx + yy;
     precise float all = xy + zz;
     uint bits = floatBitsToUint(all) >> 12;
-    keys[i] = min(max(bits, 252928u) - 252928u, 65535u);
+    keys[i] = min(max(bits, 251904u) - 251904u, 65535u);
     values[i] = i;
 }
 """
 )
 """Keys of the order: the bits of the squared distance, in steps of 2048 to a factor of two.
 
-252928 is the key of 2^-4, a distance of 0.25 m. Steps are below 0.03 % of the distance.
+251904 is the key of 2^-4, a distance of 0.25 m. Steps are below 0.03 % of the distance.
 """
 
 CLEAR: Final = """#version 430
@@ -245,6 +247,7 @@ layout(std430, binding = 0) readonly buffer Splats {{ uvec4 splats[]; }};
 layout(std430, binding = 1) readonly buffer Order {{ uint order[]; }};
 layout(std430, binding = 2) writeonly buffer Records {{ uvec4 records[]; }};
 layout(std430, binding = 3) writeonly buffer Rects {{ uvec2 rects[]; }};
+layout(std430, binding = 4) writeonly buffer Slopes {{ vec2 slopes[]; }};
 const float SCALE = 0.84932180;  // sqrt(log2(e) / 2)
 const float FAINTEST = -7.99435344;  // log2(1 / 255)
 void main() {{
@@ -282,6 +285,9 @@ void main() {{
     rects[i] = uvec2(uint(low.x) | (uint(low.y) << 16), uint(high.x) | (uint(high.y) << 16));
     float root = sqrt(c * det);
     uint marks = (rgba & 0xffffffu) | (second.z > 0.5 ? 0x1000000u : 0u);
+    vec3 w = vec3(dot(ahead.xyz, col), ahead.y * first.z + ahead.z * second.x, ahead.z * second.y);
+    float zu = dot(w, u), zv = dot(w, v);
+    slopes[i] = vec2(c * zu - b * zv, a * zv - b * zu) / det;
     records[2u * i] = floatBitsToUint(vec4(at, SCALE * c / root, -SCALE * b / root));
     records[2u * i + 1u] = uvec4(floatBitsToUint(vec3(SCALE / sqrt(c), lo, z)), marks);
 }}
@@ -290,7 +296,8 @@ void main() {{
 """Project splats in their order to records of 8 words, and to rectangles of tiles.
 
 A record is the pixel, three factors of the inverse covariance, log2 of the opacity, the depth, and
-the colour with the mark of the ground. The factors have no cancellation in long, thin splats.
+the colour with the mark of the ground. Slopes are of the depth of a flat splat, metres per pixel.
+The factors have no cancellation in long, thin splats.
 """
 
 SUMS: Final = (
@@ -351,20 +358,28 @@ layout(local_size_x = {TILE_PX}, local_size_y = DOWN) in;
 layout(std430, binding = 0) readonly buffer Records {{ uvec4 records[]; }};
 layout(std430, binding = 1) readonly buffer Starts {{ uint starts[]; }};
 layout(std430, binding = 2) readonly buffer Lists {{ uint lists[]; }};
+layout(std430, binding = 3) readonly buffer Slopes {{ vec2 slopes[]; }};
 layout(rgba16f, binding = 0) writeonly uniform image2D painted;
 layout(r32f, binding = 1) writeonly uniform image2D median;
 #ifdef LIMITED
 layout(binding = {LIMITS_UNIT}) uniform sampler2D limits;
 #endif
+const uint NONE = 0xffffffffu;
+float depth_at(uint record, vec2 pixel) {{
+    float z = uintBitsToFloat(records[record + 1u].z);
+    float slope = dot(slopes[record / 2u], pixel - uintBitsToFloat(records[record].xy));
+    return z * z / (z - clamp(slope, -{STRAY} * z, {STRAY} * z));
+}}
 void main() {{
     ivec2 here = ivec2(gl_GlobalInvocationID.xy) * ivec2(1, ROWS);
     vec2 at = vec2(here) + 0.5;
     uint tile = gl_WorkGroupID.y * sizes.z + gl_WorkGroupID.x;
-    float left[ROWS], depth[ROWS], limit[ROWS];
+    float left[ROWS], limit[ROWS];
+    uint middle[ROWS];
     vec3 sum[ROWS];
     for (int j = 0; j < ROWS; ++j) {{
         left[j] = 1.0;
-        depth[j] = 0.0;
+        middle[j] = NONE;
         sum[j] = vec3(0.0);
 #ifdef LIMITED
         limit[j] = texelFetch(limits, min(here + ivec2(0, j), ivec2(sizes.xy) - 1), 0).r;
@@ -395,7 +410,7 @@ void main() {{
             share = left[j] < {FULL} ? 0.0 : share;
             sum[j] += share * colour;
             left[j] -= share;
-            depth[j] = depth[j] == 0.0 && left[j] < 0.5 ? two.z : depth[j];
+            middle[j] = middle[j] == NONE && left[j] < 0.5 ? r : middle[j];
 #ifdef LIMITED
             most = max(most, limit[j] == 0.0 ? 0.0 : left[j]);
 #else
@@ -408,7 +423,7 @@ void main() {{
         ivec2 pixel = here + ivec2(0, j);
         if (all(lessThan(pixel, ivec2(sizes.xy)))) {{
             imageStore(painted, pixel, vec4(sum[j] / 255.0, left[j]));
-            imageStore(median, pixel, vec4(depth[j]));
+            imageStore(median, pixel, vec4(middle[j] == NONE ? 0.0 : depth_at(middle[j], vec2(pixel) + 0.5)));
         }}
     }}
 }}
@@ -417,7 +432,8 @@ void main() {{
 """Blend the splats of a tile from front to back until each pixel is full.
 
 limits: depth up to which splats are drawn; negative where ground splats are not, 0 for none.
-Each invocation draws ROWS pixels of a column.
+Each invocation draws ROWS pixels of a column. The median depth is that of the splat's plane: its
+inverse is linear in the picture.
 """
 
 LIMITS: Final = (

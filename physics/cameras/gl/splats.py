@@ -22,7 +22,7 @@ from physics.cameras.view import Shot
 LATTICE_M: Final = 0.25
 """Spacing of the eyes that splats are sorted for, metres."""
 _ORDERS_MAX: Final = 4
-_LEAST_KEY: Final = 252928
+_LEAST_KEY: Final = 251904
 _MOST_KEY: Final = 65535
 _COUNTS_MAX: Final = 1 << 23
 """Maximum number of counters of a sort."""
@@ -283,11 +283,12 @@ class SplatDrawing:
         self._view.bind_to_uniform_block(glsl.VIEW_BINDING)
         order = cloud.order(rows[6, :3].copy(), self)
         records, rects = room("records", 8 * len(cloud)), room("rects", 2 * len(cloud))
-        for place, buffer in enumerate((cloud.buffer, order, records, rects)):
+        slopes = room("slopes", 2 * len(cloud))
+        for place, buffer in enumerate((cloud.buffer, order, records, rects, slopes)):
             buffer.bind_to_storage_buffer(place)
         run.along("PROJECT", len(cloud))
         lists, starts = self._listed(len(cloud), tiles, rects)
-        for place, buffer in enumerate((records, starts, lists)):
+        for place, buffer in enumerate((records, starts, lists, slopes)):
             buffer.bind_to_storage_buffer(place)
         target.bind()
         name = "PAINT LIMITED" if limited else "PAINT"
