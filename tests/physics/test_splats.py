@@ -279,7 +279,7 @@ def test_exposure_brightens_people_alone() -> None:
     person, ground = (one.labels == LABELS[name] for name in ("person", "sidewalk"))
     assert other.rgb[person].mean() > 1.15 * one.rgb[person].mean()
     ground[:110] = False  # far ground lets some sky through
-    assert (np.abs(one.rgb[ground].astype(int) - other.rgb[ground]) <= 1).mean() > 0.99
+    assert np.abs(one.rgb[ground].astype(int) - other.rgb[ground]).mean() < 0.5
 
 
 def test_the_appearance_is_part_of_the_renderer() -> None:

@@ -142,7 +142,10 @@ def reference_picture(splats: Splats, taken: Shot) -> tuple[Floats, Floats]:
         limit = 1.3 * np.array(taken.half_picture)
         tu, tv = np.clip((u / z, v / z), -limit, limit)
         jacobian = focal / z * np.array([[1.0, 0.0, -tu], [0.0, 1.0, -tv]]) @ view
-        flat_m2 = jacobian @ whole @ view[2]
+        flatter = whole @ whole
+        (a, b), (_, c) = jacobian @ flatter @ jacobian.T
+        zu, zv = jacobian @ flatter @ view[2]
+        slope = np.array([c * zu - b * zv, a * zv - b * zu]) / ((1.0 + 1e-4) * a * c - b * b)
         flat = np.linalg.inv(jacobian @ whole @ jacobian.T + 0.3 * np.eye(2))
         dx, dy = x - 0.5 * width - focal * u / z, y - 0.5 * height - focal * v / z
         power = flat[0, 0] * dx * dx + 2.0 * flat[0, 1] * dx * dy + flat[1, 1] * dy * dy
@@ -150,7 +153,6 @@ def reference_picture(splats: Splats, taken: Shot) -> tuple[Floats, Floats]:
         share = np.where(alpha >= 1.0 / 255.0, alpha, 0.0) * left
         colour += share[..., None] * splats.rgba[i, :3] / 255.0
         left = left - share
-        slope = flat @ flat_m2
         aside = np.clip(slope[0] * dx + slope[1] * dy, -0.3 * z, 0.3 * z)
         median = np.where((median == 0.0) & (left < 0.5), z * z / (z - aside), median)
     return np.concatenate([colour, left[..., None]], axis=2), median

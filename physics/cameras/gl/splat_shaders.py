@@ -285,9 +285,13 @@ void main() {{
     rects[i] = uvec2(uint(low.x) | (uint(low.y) << 16), uint(high.x) | (uint(high.y) << 16));
     float root = sqrt(c * det);
     uint marks = (rgba & 0xffffffu) | (second.z > 0.5 ? 0x1000000u : 0u);
-    vec3 w = vec3(dot(ahead.xyz, col), ahead.y * first.z + ahead.z * second.x, ahead.z * second.y);
-    float zu = dot(w, u), zv = dot(w, v);
-    slopes[i] = vec2(c * zu - b * zv, a * zv - b * zu) / det;
+    mat3 lower = mat3(col, vec3(0.0, first.z, second.x), vec3(0.0, 0.0, second.y));
+    vec3 w = lower * (ahead.xyz * lower), flat_u = lower * u, flat_v = lower * v;
+    float zu = dot(w, flat_u), zv = dot(w, flat_v), ff = dot(flat_u, flat_v);
+    uu = dot(flat_u, flat_u);
+    vv = dot(flat_v, flat_v);
+    n = cross(flat_u, flat_v);
+    slopes[i] = vec2(vv * zu - ff * zv, uu * zv - ff * zu) / max(dot(n, n) + 1e-4 * uu * vv, 1e-37);
     records[2u * i] = floatBitsToUint(vec4(at, SCALE * c / root, -SCALE * b / root));
     records[2u * i + 1u] = uvec4(floatBitsToUint(vec3(SCALE / sqrt(c), lo, z)), marks);
 }}
@@ -296,7 +300,8 @@ void main() {{
 """Project splats in their order to records of 8 words, and to rectangles of tiles.
 
 A record is the pixel, three factors of the inverse covariance, log2 of the opacity, the depth, and
-the colour with the mark of the ground. Slopes are of the depth of a flat splat, metres per pixel.
+the colour with the mark of the ground. Slopes are those of the depth in metres per pixel, of the
+splat with its standard deviations squared, and so nearly flat.
 The factors have no cancellation in long, thin splats.
 """
 
