@@ -37,7 +37,13 @@ from physics.cameras.gl.splats import (
 from physics.cameras.view import Shot, shot
 from physics.dynamics.world import BulletWorld
 from physics.street.scan_surface import ScanSurface
-from tests.support.splat_scan import WALL_X_M, random_splats, reference_picture, street_scan
+from tests.support.splat_scan import (
+    WALL_X_M,
+    covariances,
+    random_splats,
+    reference_picture,
+    street_scan,
+)
 from tests.support.tiny_street import tiny_map
 
 pytestmark = [
@@ -92,6 +98,18 @@ def test_a_card_draws_as_the_processor_does(count: int) -> None:
     here, card = (drawn(few, tuning=tuning) for tuning in (PROCESSOR, CARD))
     assert np.array_equal(here[0], card[0]) and np.array_equal(here[1], card[1])
     assert (here[0][..., 3] < 1.0).any()
+
+
+def test_huge_splats_fill_a_large_picture() -> None:
+    """All pixels have what 150 faint layers let through, though each covers thousands of tiles."""
+    count = 150
+    centres = np.tile((20.0, 0.0, 0.0), (count, 1)).astype(np.float32)
+    wide = covariances(np.tile(np.eye(3), (count, 1, 1)), np.full((count, 3), 2000.0))
+    rgba = np.tile(np.array((255, 255, 255, 3), dtype=np.uint8), (count, 1))
+    splats = Splats(centres, wide, rgba, np.zeros(count, dtype=bool))
+    taken = shot((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1024, 512), 60.0)
+    found, _ = drawn(splats, taken)
+    assert np.abs(found[..., 3].astype(float) - (1.0 - 3.0 / 255.0) ** count).max() < 1.0 / 255.0
 
 
 def test_a_picture_depends_on_every_splat() -> None:

@@ -311,6 +311,7 @@ SUMS: Final = (
 layout(local_size_x = LANES) in;
 layout(std430, binding = 0) readonly buffer Rects { uvec2 rects[]; };
 layout(std430, binding = 1) writeonly buffer Sums { uint sums[]; };
+layout(std430, binding = 2) writeonly buffer Before { uint before[]; };
 uniform uint chunk;
 void main() {
     uint c = gl_GlobalInvocationID.x;
@@ -319,13 +320,14 @@ void main() {
     uint sum = 0u;
     for (uint i = c * chunk; i < end; ++i) {
         uvec2 rect = rects[i];
+        before[i] = sum;
         sum += ((rect.y & 0xffffu) - (rect.x & 0xffffu)) * ((rect.y >> 16) - (rect.x >> 16));
     }
     sums[c] = sum;
 }
 """
 )
-"""Count the pairs of tile and splat of each chunk."""
+"""Count the pairs of tile and splat of each chunk, and those before each splat in its chunk."""
 
 EMIT: Final = (
     _BLOCK
@@ -333,28 +335,62 @@ EMIT: Final = (
 layout(local_size_x = LANES) in;
 layout(std430, binding = 0) readonly buffer Rects { uvec2 rects[]; };
 layout(std430, binding = 1) readonly buffer Sums { uint sums[]; };
-layout(std430, binding = 2) writeonly buffer Keys { uint keys[]; };
-layout(std430, binding = 3) writeonly buffer Values { uint values[]; };
+layout(std430, binding = 2) readonly buffer Before { uint before[]; };
+layout(std430, binding = 3) writeonly buffer Keys { uint keys[]; };
+layout(std430, binding = 4) writeonly buffer Values { uint values[]; };
 uniform uint chunk;
+uniform uint chunks;
+uniform uint span;   // pairs of an invocation
+uniform uint total;
+uint splat_of(uint pair) {
+    uint low = 0u, high = chunks;
+    while (low + 1u < high) {
+        uint middle = (low + high) / 2u;
+        if (sums[middle] <= pair) low = middle; else high = middle;
+    }
+    uint inside = pair - sums[low];
+    high = min((low + 1u) * chunk, counts.x);
+    low *= chunk;
+    while (low + 1u < high) {
+        uint middle = (low + high) / 2u;
+        if (before[middle] <= inside) low = middle; else high = middle;
+    }
+    return low;
+}
 void main() {
-    uint c = gl_GlobalInvocationID.x;
-    uint end = min((c + 1u) * chunk, counts.x);
-    if (c * chunk >= end) return;
-    uint at = sums[c];
-    for (uint i = c * chunk; i < end; ++i) {
-        uvec2 rect = rects[i];
-        uvec2 low = uvec2(rect.x & 0xffffu, rect.x >> 16), high = uvec2(rect.y & 0xffffu, rect.y >> 16);
-        for (uint y = low.y; y < high.y; ++y)
-            for (uint x = low.x; x < high.x; ++x) {
-                keys[at] = y * sizes.z + x;
-                values[at] = i;
-                at += 1u;
-            }
+    uint pair = gl_GlobalInvocationID.x * span;
+    uint end = min(pair + span, total);
+    if (pair >= end) return;
+    uint i = splat_of(pair), x, y, x0, x1, y1, nth = pair - sums[i / chunk] - before[i];
+    uvec2 rect = rects[i];
+    for (bool begins = true; pair < end; ++pair) {
+        if (begins) {
+            x0 = rect.x & 0xffffu;
+            x1 = rect.y & 0xffffu;
+            y1 = rect.y >> 16;
+            x = x0 + nth % (x1 - x0);
+            y = (rect.x >> 16) + nth / (x1 - x0);
+        }
+        keys[pair] = y * sizes.z + x;
+        values[pair] = i;
+        x += 1u;
+        if (x == x1) { x = x0; y += 1u; }
+        begins = y == y1 && pair + 1u < end;
+        nth = 0u;
+        rect.y = begins ? 0u : 1u;
+        for (uint step = 0u; step < 8u && rect.y == 0u; ++step) rect = rects[++i];
+        if (begins && rect.y == 0u) {
+            i = splat_of(pair + 1u);
+            rect = rects[i];
+        }
     }
 }
 """
 )
-"""List the pairs of tile and splat in the order of the splats."""
+"""List the pairs of tile and splat in the order of the splats, the same number by each invocation.
+
+llvmpipe ends the loops of an invocation after 65535 iterations, so no loop goes over all tiles.
+"""
 
 PAINT: Final = (
     _BLOCK

@@ -26,6 +26,8 @@ _LEAST_KEY: Final = 251904
 _MOST_KEY: Final = 65535
 _COUNTS_MAX: Final = 1 << 23
 """Maximum number of counters of a sort."""
+_CHUNK_MAX: Final = 32768
+"""Maximum number of items of a chunk: llvmpipe ends loops after 65535 iterations."""
 _VIEW_ROWS: Final = 7
 _LINE: Final = 65535 * 64
 """Maximum number of invocations in one dimension of a dispatch."""
@@ -38,7 +40,8 @@ class Tuning(NamedTuple):
     lanes: invocations of a work group of the serial shaders
     chunks: maximum number of chunks of a sort
     group: chunks that are summed by one invocation
-    pairs_chunk: splats of a chunk in the shaders that list pairs
+    splats_chunk: splats whose pairs are counted by one invocation
+    pairs_span: pairs that are listed by one invocation
     rows: pixels of an invocation that blends
     """
 
@@ -46,12 +49,13 @@ class Tuning(NamedTuple):
     lanes: int
     chunks: int
     group: int
-    pairs_chunk: int
+    splats_chunk: int
+    pairs_span: int
     rows: int
 
 
-PROCESSOR: Final = Tuning(True, 8, 128, 16, 1024, 8)
-CARD: Final = Tuning(False, 32, 4096, 64, 32, 1)
+PROCESSOR: Final = Tuning(True, 8, 128, 16, 1024, 512, 8)
+CARD: Final = Tuning(False, 32, 4096, 64, 32, 64, 1)
 
 
 def tuning_of(context: moderngl.Context) -> Tuning:
@@ -182,7 +186,7 @@ class StableSort:
         """
         run, tuning, room = self._shaders, self._shaders.tuning, self._buffers.room
         most = max(1, min(tuning.chunks, _COUNTS_MAX // digits))
-        chunk = max(1, -(-total // most))
+        chunk = min(max(1, -(-total // most)), _CHUNK_MAX)
         chunks = max(1, -(-total // chunk))
         groups = -(-chunks // tuning.group)
         counts, sums = room("counts", chunks * digits), room("groups", groups * digits)
@@ -308,12 +312,12 @@ class SplatDrawing:
     ) -> tuple[moderngl.Buffer, moderngl.Buffer]:
         """Return the splats of each tile in their order, and where the tiles start."""
         run, tuning, room = self._shaders, self.tuning, self._buffers.room
-        chunks = -(-count // tuning.pairs_chunk)
-        sums = room("sums", chunks + 1)
-        rects.bind_to_storage_buffer(0)
-        sums.bind_to_storage_buffer(1)
-        lanes = (tuning.lanes, 1)
-        run.run("SUMS", (chunks, 1), lanes, chunk=tuning.pairs_chunk)
+        chunk, lanes = tuning.splats_chunk, (tuning.lanes, 1)
+        chunks = -(-count // chunk)
+        sums, before = room("sums", chunks + 1), room("before", count)
+        for place, buffer in enumerate((rects, sums, before)):
+            buffer.bind_to_storage_buffer(place)
+        run.run("SUMS", (chunks, 1), lanes, chunk=chunk)
         sums.bind_to_storage_buffer(0)
         run.run("SCAN", (1, 1), (1, 1), digits=chunks)
         # Room for all pairs must be known before they are written: the only value that is read.
@@ -321,9 +325,11 @@ class SplatDrawing:
         total = int(np.frombuffer(sums.read(4, offset=4 * chunks), dtype=np.uint32)[0])
         self.pairs = total
         keys, values, lists = (room(name, total + 1) for name in ("tiles", "of tiles", "lists"))
-        for place, buffer in enumerate((rects, sums, keys, values)):
+        for place, buffer in enumerate((rects, sums, before, keys, values)):
             buffer.bind_to_storage_buffer(place)
-        run.run("EMIT", (chunks, 1), lanes, chunk=tuning.pairs_chunk)
+        span = tuning.pairs_span
+        size = -(-max(total, 1) // span), 1
+        run.run("EMIT", size, lanes, chunk=chunk, chunks=chunks, span=span, total=total)
         starts = self._sort.sort((keys, values), (None, lists), total, tiles)
         return lists, starts
 
