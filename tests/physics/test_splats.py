@@ -4,7 +4,6 @@ does."""
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
 import os
 import subprocess
@@ -24,22 +23,16 @@ from physics.cameras.choice import renderer_of
 from physics.cameras.gl import context
 from physics.cameras.gl.atlas import Atlas
 from physics.cameras.gl.camera import GlCamera
-from physics.cameras.gl.splats import (
-    CARD,
-    PROCESSOR,
-    SplatCloud,
-    SplatDrawing,
-    SplatTarget,
-    Tuning,
-    distance_keys,
-    view_rows,
-)
-from physics.cameras.view import Shot, shot
+from physics.cameras.gl.splats import CARD, PROCESSOR, SplatDrawing, distance_keys
+from physics.cameras.view import shot
 from physics.dynamics.world import BulletWorld
 from physics.street.scan_surface import ScanSurface
 from tests.support.splat_scan import (
+    AHEAD,
     WALL_X_M,
     covariances,
+    drawn,
+    picture_hash,
     random_splats,
     reference_picture,
     street_scan,
@@ -51,28 +44,9 @@ pytestmark = [
     pytest.mark.skipif(not context.available(), reason="no OpenGL through EGL here"),
 ]
 
-SIZE = (160, 96)
-AHEAD = shot((0.0, 0.0, 0.0), (1.0, 0.02, -0.05), SIZE, 60.0)
 LOW = CameraSpec(width=240, height=160, fov_deg=60.0)
 APPEARANCES: tuple[Appearance, ...] = ("splats", "mesh")
 SUN = ScanSun(azimuth_deg=90.0, elevation_deg=45.0)
-
-
-def drawn(
-    splats: Splats, taken: Shot = AHEAD, tuning: Tuning | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return premultiplied colour with transmittance, and median depth."""
-    with context.context() as gl:
-        cloud, drawing, target = (
-            SplatCloud(gl, splats),
-            SplatDrawing(gl, tuning),
-            SplatTarget(gl, taken.size),
-        )
-        drawing.draw(cloud, view_rows(taken), target, limited=False)
-        found = target.read()
-        for thing in (cloud, drawing, target):
-            thing.release()
-    return found
 
 
 def test_splats_agree_with_a_reference_in_float64() -> None:
@@ -132,25 +106,12 @@ def test_keys_grow_with_the_distance() -> None:
     assert (np.diff(keys)[far_m[1:] > 0.26] > 0).all()
 
 
-_HASH = """
-from tests.physics.test_splats import picture_hash
-print(picture_hash())
-"""
-
-
-def picture_hash() -> str:
-    """Return the hash of a picture of the scanned street with people."""
-    frame = _picture(street_scan(sun=SUN), "splats", walkers(6))
-    return hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()  # type: ignore[union-attr]
-
-
 def test_the_number_of_threads_changes_no_bit() -> None:
     """A picture by one thread is the picture by four."""
-    root = Path(__file__).parents[2]
     drawing = [
         subprocess.Popen(
-            [sys.executable, "-c", _HASH],
-            cwd=root,
+            [sys.executable, "-c", "import tests.support.splat_scan as s; print(s.picture_hash())"],
+            cwd=Path(__file__).parents[2],
             env={**os.environ, "LP_NUM_THREADS": count},
             stdout=subprocess.PIPE,
             text=True,
