@@ -18,7 +18,8 @@ from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, Frame, People, RobotState, Street
 from cosim.place.scan import Scan, ScanSun, Splats
 from cosim.spec.camera import CameraSpec
-from cosim.spec.run_config import Appearance
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.run_config import Appearance, RunConfig
 from physics.cameras.choice import renderer_of
 from physics.cameras.gl import context
 from physics.cameras.gl.atlas import Atlas
@@ -266,3 +267,4 @@ def test_the_appearance_is_part_of_the_renderer() -> None:
     names = [renderer_of("gl", look) for look in APPEARANCES]
     assert names[0] == renderer_of("gl") != names[1]
     assert renderer_of("bullet", "mesh") == renderer_of("bullet")
+    assert EpisodeOptions.asked(RunConfig(appearance="mesh")).appearance == "mesh"

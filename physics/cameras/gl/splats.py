@@ -112,7 +112,7 @@ class SplatShaders:
     def __init__(self, context: moderngl.Context, tuning: Tuning) -> None:
         self._context = context
         self.tuning = tuning
-        self._shaders: dict[str, moderngl.ComputeShader] = {}
+        self._shaders: dict[str, tuple[moderngl.ComputeShader, dict[str, moderngl.Uniform]]] = {}
 
     def run(self, name: str, size: tuple[int, int], each: tuple[int, int], **uniforms: int) -> None:
         """Run a shader over (x, y) invocations in groups of `each`, and wait for its writes."""
@@ -123,12 +123,16 @@ class SplatShaders:
             lanes, rows = self.tuning.lanes, self.tuning.rows
             for word, value in (("LANES", lanes), ("ROWS", rows), ("DOWN", glsl.TILE_PX // rows)):
                 code = code.replace(word, str(value))
-            self._shaders[name] = self._context.compute_shader(code)
-        shader = self._shaders[name]
+            made = self._context.compute_shader(code)
+            members = {member: made[member] for member in made}
+            self._shaders[name] = (
+                made,
+                {k: one for k, one in members.items() if isinstance(one, moderngl.Uniform)},
+            )
+        shader, known = self._shaders[name]
         for uniform, value in uniforms.items():
-            found = shader.get(uniform, None)
-            if isinstance(found, moderngl.Uniform):
-                found.value = value
+            if uniform in known:  # the compiler removes unused ones
+                known[uniform].value = value
         x, y = (-(-count // group) for count, group in zip(size, each, strict=True))
         shader.run(x, y)
         self._context.memory_barrier(

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import LABELS, RobotState
+from cosim.core.state import LABELS, RobotState, Street
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, ScanMesh, ScanSun, Splats
 from cosim.spec.camera import CameraSpec
 from cosim.spec.run_config import Appearance
@@ -76,8 +76,8 @@ def scanned_together(
     with Atlas(CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
         keys = [eyes.join(world) for _ in range(environments)]
 
-        def draw(street: object) -> None:
-            tick = busy.streets.index(street)  # type: ignore[arg-type]
+        def draw(street: Street) -> None:
+            tick = street.tick
             eyes.begin([(key, robots[tick + k], busy.streets[tick]) for k, key in enumerate(keys)])
             if tick:
                 eyes.end()
@@ -125,13 +125,15 @@ def _facts(count: int) -> ScanFacts:
 
 def _mesh() -> ScanMesh:
     """Return ground and fronts as squares of a metre."""
-    vertices, triangles, labels = [], [], []
+    vertices: list[Floats] = []
+    triangles = []
+    labels = []
     columns = round(_LONG_M / _MESH_M) + 1
     for label, points in zip(("sidewalk", "building", "building"), _sheets(), strict=True):
         rows = len(points) // columns
         first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
         a, b, c, d = first, first + 1, first + columns + 1, first + columns
-        start = sum(map(len, vertices))
+        start = sum(len(part) for part in vertices)
         triangles.append(start + np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
         labels.append(np.full(len(triangles[-1]), LABELS[label]))
         vertices.append(points)
