@@ -23,7 +23,7 @@ from physics.cameras.gl.context import context
 from physics.cameras.gl.lighting import Lighting, lighting_of
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shadows import ShadowMaps
-from physics.cameras.gl.splat_layers import scan_light, splat_pictures
+from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, View
@@ -50,11 +50,9 @@ class GlCamera(WorldCamera):
         super().__init__(world, spec, depth)
         scan = world.surface.scan
         self._splats = scan.splats if scan is not None and appearance == "splats" else None
-        if scan is not None and self._splats is not None:
-            self._sky, self._light = scan_light(light, scan.facts, world.surface.seed)
-        else:
-            self._sky = sky_of(light, world.surface.seed)
-            self._light = lighting_of(self._sky)
+        seed = world.surface.seed
+        self._sky = sky_of(light, seed) if scan is None else scan_sky(light, scan.facts, seed)
+        self._light = lighting_of(self._sky, haze=self._splats is None)
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}

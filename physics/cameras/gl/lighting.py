@@ -68,8 +68,8 @@ class Lighting:
         ]
 
 
-def lighting_of(sky: Sky) -> Lighting:
-    """Convert a sky to shader values."""
+def lighting_of(sky: Sky, haze: bool = True) -> Lighting:
+    """Convert a sky to shader values. haze: of distant objects."""
     up, side, down = sky.ambient
     return Lighting(
         sky.sun,
@@ -83,6 +83,7 @@ def lighting_of(sky: Sky) -> Lighting:
         sky.exposure,
         sky.lamps,
         sky.shadows,
+        haze,
     )
 
 

@@ -21,7 +21,7 @@ from cosim.core.errors import EngineError
 from cosim.place.scan import ScanFacts, Splats
 from cosim.spec.scenario import Light
 from physics.cameras.gl import splat_shaders as glsl
-from physics.cameras.gl.lighting import Lighting, lighting_of
+from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.scans import SHADE
 from physics.cameras.gl.shading import programs
 from physics.cameras.gl.splats import SplatCloud, SplatDrawing, SplatTarget, view_rows
@@ -216,11 +216,12 @@ def splat_pictures(context: moderngl.Context) -> SplatPictures:
     return SplatPictures(context)
 
 
-def scan_light(light: Light, facts: ScanFacts, seed: int) -> tuple[Sky, Lighting]:
-    """Return sky and light of people and objects in a scan's own light.
+def scan_sky(light: Light, facts: ScanFacts, seed: int) -> Sky:
+    """Return the sky whose light people and objects have in a scan.
 
-    Only shadows and the picture of the sky are those of `light`. Without a known sun the sky is
-    overcast, and objects have contact shadows: the sun is straight above, without light.
+    The scan contains its own light, so only shadows and the picture of the sky are those of
+    `light`. Without a known sun the sky is overcast, and objects have contact shadows: the sun is
+    straight above, without light.
     """
     own = Light(shadows=light.shadows, hdri=light.hdri, exposure_ev=facts.exposure_ev)
     if facts.sun is not None:
@@ -229,8 +230,6 @@ def scan_light(light: Light, facts: ScanFacts, seed: int) -> tuple[Sky, Lighting
         )
         flat = math.cos(rise)
         to_sun = flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(rise)
-        sky = sky_of(own, seed, to_sun)
-        return sky, replace(lighting_of(sky), haze=False)
+        return sky_of(own, seed, to_sun)
     sky = sky_of(msgspec.structs.replace(own, cloud_cover=1.0), seed)
-    above = replace(sky, sun=_ABOVE, sun_colour=_DARK, shadows=light.shadows)
-    return sky, replace(lighting_of(above), haze=False)
+    return replace(sky, sun=_ABOVE, sun_colour=_DARK, shadows=light.shadows)
