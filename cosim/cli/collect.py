@@ -52,6 +52,7 @@ _OF_COLLECT = Fields(
         "goal",
         "seed",
         "camera",
+        "appearance",
         "own_camera",
         "jobs",
         "resume",

@@ -54,6 +54,7 @@ _OF_OWN_RUN = Fields(
         "seed",
         "frames",
         "camera",
+        "appearance",
         "latency",
         "real_time",
         "rerun",

@@ -14,6 +14,8 @@ from cosim.spec.connection import Connection, connecting, listening
 
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 """Renderers of `--camera`; auto selects gl where it works."""
+Appearance = Literal["splats", "mesh"]
+"""Appearances of scanned places in the gl camera; splats are drawn where a scan has them."""
 Isolation = Literal["no", "auto", "namespaces", "landlock", "weak"]
 """Kinds of `--isolated`: "auto" is the strongest sandbox that the kernel offers, "weak" none."""
 POLICY_MEMORY_GB = 16.0
@@ -273,6 +275,15 @@ class RunConfig:
             panel=_PICTURES,
         ),
     ] = "auto"
+    appearance: Annotated[
+        Appearance,
+        Option(
+            "Appearance of scanned places: splats (where the scan has them, with the gl camera) "
+            "or mesh.",
+            metavar="APPEARANCE",
+            panel=_PICTURES,
+        ),
+    ] = "splats"
     own_camera: Annotated[
         bool,
         Option(

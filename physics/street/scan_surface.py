@@ -52,6 +52,8 @@ _SURFACE_LABELS: Final = {kind: surface_look(kind)[0] for kind in (*_KINDS, _GRO
 class ScanSurface(PlaceSurface):
     """Surface of a scanned place. scan: with or without its splats."""
 
+    scan: Scan
+
     def __init__(self, street_map: StreetMap, scan: Scan, seed: int) -> None:
         self.street_map = street_map
         self.scan = scan

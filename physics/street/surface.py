@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from cosim.core.cache import Arrays
 from cosim.core.geometry import Floats, Pose
+from cosim.place.scan import Scan
 from cosim.place.street_map import StreetMap
 from cosim.spec.obstacle import Obstacle
 from physics.ground.mesh import Mesh
@@ -96,10 +97,12 @@ class Surface(ABC):
 
     seed: seed of random details such as clouds and lens noise
     level: whether the land is flat at height 0
+    scan: the scan of a scanned place
     """
 
     seed: int = 0
     level: bool = False
+    scan: Scan | None = None
     _last_lean: tuple[Pose, tuple[float, float], tuple[float, float, float]] | None = None
 
     @abstractmethod

@@ -19,7 +19,7 @@ from cosim.results.run_folder import read_records
 from cosim.results.traffic import RoadState
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
-from cosim.spec.run_config import CameraChoice
+from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
 from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
@@ -56,13 +56,18 @@ def replay_episode(
     camera: CameraChoice = "auto",
     *watches: Watch,
     judged_alone: bool = False,
+    appearance: Appearance = "splats",
 ) -> tuple[Episode, Replay]:
     """Return a new Episode for a replay, and the policy that repeats the recorded commands.
 
     judged_alone: compute no measures, for a replay whose result is not needed.
+    appearance: of scanned places in pictures.
     """
     options = EpisodeOptions(
-        seed=original.record.setup.seed, camera=camera, injections=original.record.injections
+        seed=original.record.setup.seed,
+        camera=camera,
+        appearance=appearance,
+        injections=original.record.injections,
     )
     policy = Replay(original.log.command)
 

@@ -59,9 +59,9 @@ def make_surface(where: Place, street_map: StreetMap) -> PlaceSurface:
     return StreetSurface(street_map, where.seed, where.roughness)
 
 
-def scan_of(where: Place, *, splats: bool = False) -> Scan | None:
-    """Return the scan of a place, None if it has none. splats: whether to read its splats."""
+def scan_of(where: Place) -> Scan | None:
+    """Return the scan of a place, None if it has none."""
     folder = cache_folder() / "maps" / where.map if isinstance(where, CityMap) else None
     if folder is None or not has_scan(folder):
         return None
-    return read_scan(folder, splats=splats)
+    return read_scan(folder)

@@ -89,8 +89,9 @@ def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
         if (spec := hello.manifest.camera) is not None:
             from physics.cameras.gl.atlas import Atlas  # needs OpenGL
 
-            atlas = stack.enter_context(Atlas(spec))
-            drawn_by = renderer_of("gl")
+            appearance = hello.renderer.appearance
+            atlas = stack.enter_context(Atlas(spec, appearance))
+            drawn_by = renderer_of("gl", appearance)
         rendered = Rendered(hello.renderer.number, drawn_by)
         renderer = _Renderer(rendered, room_for(hello.manifest), atlas, desk, partial(say, Ready()))
         renderer.serve(socket.socket(fileno=listening), pipe)

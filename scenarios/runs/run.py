@@ -372,6 +372,7 @@ def measured_latency(
         goal=options.goal,
         own_camera=options.own_camera,
         camera=options.camera,
+        appearance=options.appearance,
         real_time=True,
     )
     row = run(whole, policy, scenarios=[first.id], options=real_time, host=host).iloc[0]
@@ -442,7 +443,12 @@ def _run_todo(
         renderer = None
         if plan.config.shared_renderer:
             logs = run.held.path / "logs"
-            renderer = SharedRenderer(logs, run.hello, asks=plan.driver.batches)
+            renderer = SharedRenderer(
+                logs,
+                run.hello,
+                asks=plan.driver.batches,
+                appearance=plan.options.appearance,
+            )
             stack.enter_context(renderer)
         transport, tell = stack.enter_context(create_transport(run, tell))
         run_all(

@@ -41,9 +41,18 @@ void main() {{
 """
 
 
-def scan_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
-    """Create the program of all scanned triangles."""
-    return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
+_NORMALS: Final = """
+in vec3 at; in vec3 normal; in vec3 colour; flat in float label;
+void main() { pixel = vec4(0.5 + 0.5 * normalize(normal), label / 255.0); }
+"""
+
+
+def scan_shaders(
+    context: moderngl.Context, surfaces: Surfaces, shadows: bool, normals: bool = False
+) -> SurfaceShaders:
+    """Create the program of all scanned triangles. normals: draw these in place of colours."""
+    fragment = _NORMALS if normals else _FRAGMENT
+    return SurfaceShaders(context, surfaces, _VERTEX, fragment, shadows)
 
 
 def scan_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:

@@ -89,11 +89,20 @@ class _Words(msgspec.Struct, array_like=True):
 
 
 class GlScene:
-    """Static street around a view, as a function of view and signals alone."""
+    """Static street around a view, as a function of view and signals alone.
+
+    splats: the scan's mesh is not in the picture, but drawn apart by `draw_mesh`
+    """
 
     def __init__(
-        self, context: moderngl.Context, forms: Forms, world: BulletWorld, light: Lighting
+        self,
+        context: moderngl.Context,
+        forms: Forms,
+        world: BulletWorld,
+        light: Lighting,
+        splats: bool = False,
     ) -> None:
+        self._splats = splats
         self._surface = world.surface
         self._forms = forms
         self._shadows = light.shadows
@@ -103,7 +112,9 @@ class GlScene:
         self._ground = ground_layer(context, ground)
         self._paint = ground_layer(context, ground)
         self._walls = wall_layer(context, walls)
-        self._scan = scan_layer(context, scan_shaders(context, self._surfaces, light.shadows))
+        self._scan = scan_layer(
+            context, scan_shaders(context, self._surfaces, light.shadows and not splats, splats)
+        )
         self._seen = Things(context, forms)
         self._standing = Things(context, forms)
         self._fence_forms = forms.apart()  # the number of sizes is unlimited
@@ -149,7 +160,12 @@ class GlScene:
         self._fenced.draw(stage, self._shadows)
         self._walls.draw(stage)
         self._ground.draw(stage)
-        self._scan.draw(stage)
+        if not self._splats:
+            self._scan.draw(stage)
+
+    def draw_mesh(self) -> None:
+        """Draw normals and labels of the scan's mesh."""
+        self._scan.draw("colour")
 
     def draw_paint(self) -> None:
         """Draw road paint after the ground, without labels and depth."""
