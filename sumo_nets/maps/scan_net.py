@@ -329,7 +329,7 @@ def _span(
         if not (math.isfinite(low) and math.isfinite(high)):
             continue
         ends = np.array([middle + low * along, middle + high * along])
-        gap_m = sum(float(walks.distance(shapely.Point(end))) for end in ends)
+        gap_m = sum(float(shapely.distance(walks, shapely.Point(end))) for end in ends)
         found.append((gap_m, k, _Span(middle, along, ends, lengths_m[1 - k])))
     return min(found, key=lambda one: one[:2])[2] if found else None
 
