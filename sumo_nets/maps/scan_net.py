@@ -45,6 +45,8 @@ _LANE_MPS: Final = 8.33
 _WALK_MPS: Final = 1.4
 _JOIN_M: Final = 20.0
 """Largest distance from a crossing to the axis of a sidewalk, in metres."""
+_TO_WALK_M: Final = 5.0
+"""Largest distance from the end of a crossing to a sidewalk, in metres."""
 _NEAR_END_M: Final = 3.0
 """Distance from the end of a piece up to which a crossing joins its node, in metres."""
 _ROAD_END_M: Final = 6.0
@@ -271,13 +273,18 @@ def _add_crossing(
     """Add a crossing, with links to the sidewalks on both sides.
 
     Where no drawn road leads straight over it, such as next to a junction, it gets a piece of road
-    of its own without cars. Raises _NoCrossing if it does not lead from sidewalk to sidewalk.
+    of its own, and no cars drive there.
+
+    Raises _NoCrossing if it does not lead from sidewalk to sidewalk.
     """
     span = _span(crossing, roads, walks)
     if span is None:
         raise _NoCrossing(number, "it does not lead from one side of its road to the other")
     road = _road_over(plan, span)
     if road is None:
+        for edge in plan.edges:
+            if edge.drive and shapely.intersects(LineString(edge.line), crossing):
+                edge.cars = False  # they would not stop for people
         across = np.array([-span.along[1], span.along[0]]) * _ROAD_END_M
         road = _stub(plan, np.array([span.middle - across, span.middle + across]), span)
     node = _split(plan, road, span.middle, _ROAD_END_M)
@@ -329,8 +336,9 @@ def _span(
         if not (math.isfinite(low) and math.isfinite(high)):
             continue
         ends = np.array([middle + low * along, middle + high * along])
-        gap_m = sum(float(shapely.distance(walks, shapely.Point(end))) for end in ends)
-        found.append((gap_m, k, _Span(middle, along, ends, lengths_m[1 - k])))
+        gap_m = max(float(shapely.distance(walks, shapely.Point(end))) for end in ends)
+        if gap_m < _TO_WALK_M:
+            found.append((gap_m, k, _Span(middle, along, ends, lengths_m[1 - k])))
     return min(found, key=lambda one: one[:2])[2] if found else None
 
 

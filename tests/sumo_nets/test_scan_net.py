@@ -181,8 +181,8 @@ def test_the_hash_covers_the_drawn_ground(street: StreetMap) -> None:
         (folder / GROUND_FILE).write_bytes(data)
 
 
-def test_crossings_that_fit_no_road_stay_walkable(tmp_path: Path) -> None:
-    """A crossing at the end of a short road is ground to walk on, and the finding says why."""
+def test_a_crossing_of_a_short_road_is_a_crossing(tmp_path: Path) -> None:
+    """It gets a piece of road without cars, and joins both sidewalks."""
     box = shapely.box
     areas = [
         ScanArea("sidewalk", box(0, 0, 30, 3)),
@@ -191,9 +191,27 @@ def test_crossings_that_fit_no_road_stay_walkable(tmp_path: Path) -> None:
         ScanArea("crossing", box(13, 3, 17, 9)),
     ]
     net = build_scan_net(areas, flat_grid(-1, -1, 31, 13), None, tmp_path)
-    assert any("cars do not stop there: its road is shorter than 12 m" in w for w in net.findings)
     street_map = with_drawn_ground(read_net(net.path), tmp_path / GROUND_FILE)
+    assert [strip.kind for strip in street_map.strips.values()].count("crossing") == 1
     assert WalkGraph(street_map).component.max() == 0
+    over = [
+        lane for lane in street_map.lanes.values() if lane.polygon.intersects(box(14, 5, 16, 7))
+    ]
+    assert over and not any(lane.cars for lane in over)
+
+
+def test_a_crossing_that_leads_nowhere_stays_walkable(tmp_path: Path) -> None:
+    """A crossing without a sidewalk at one end is ground to walk on, and the finding says why."""
+    box = shapely.box
+    areas = [
+        ScanArea("sidewalk", box(0, 0, 30, 3)),
+        ScanArea("road", box(0, 3, 30, 40)),
+        ScanArea("crossing", box(13, 3, 17, 30)),
+    ]
+    net = build_scan_net(areas, flat_grid(-1, -1, 31, 41), None, tmp_path)
+    assert any("cars do not stop there: it " in words for words in net.findings), net.findings
+    street_map = with_drawn_ground(read_net(net.path), tmp_path / GROUND_FILE)
+    assert all(strip.kind == "sidewalk" for strip in street_map.strips.values())
 
 
 def test_equal_areas_give_equal_bytes(tmp_path: Path) -> None:
