@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from typing import Annotated, NoReturn
+from functools import cache
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.markup import escape
@@ -92,13 +93,19 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with guarded_streams():
         try:
-            with_paths_checked(typer.main.get_command(app))()
+            _command()()
         except CosimError as error:
             _end(error)
         except OSError as error:
             if error.filename is None:
                 raise
             _end(file_error(error))
+
+
+@cache
+def _command() -> Any:
+    """Return the Typer command with all subcommands, built once."""
+    return with_paths_checked(typer.main.get_command(app))
 
 
 def _end(error: CosimError) -> NoReturn:

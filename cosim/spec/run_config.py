@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, get_type_hints
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from cosim.core.errors import UsageError
 from cosim.spec.connection import Connection, connecting, listening
@@ -446,8 +448,14 @@ def help_of(field: str) -> str:
 
 def option_of(config: type, field: str) -> Option:
     """Return the command-line option of a config's field."""
-    found: Option = get_type_hints(config, include_extras=True)[field].__metadata__[0]
+    found: Option = annotations_of(config)[field].__metadata__[0]
     return found
+
+
+@cache
+def annotations_of(config: type) -> Mapping[str, Any]:
+    """Return the resolved annotations of a config's fields, computed once per config."""
+    return MappingProxyType(get_type_hints(config, include_extras=True))
 
 
 class RunConnections(NamedTuple):

@@ -159,7 +159,8 @@ class BulletScene:
             who.ids, who.age.tolist(), parts.at_m.tolist(), parts.turn.tolist(), strict=True
         ):
             bodies = self._walkers[family_of(name, age)].lend()
-            for k, (body, colour) in enumerate(zip(bodies, part_colours(name, age), strict=True)):
+            colours = part_colours(name, age, self._surface.seed)
+            for k, (body, colour) in enumerate(zip(bodies, colours, strict=True)):
                 self._canvas.put_at(body, at[k], turn[k])
                 if self._painted.get(body) != colour:
                     self._painted[body] = colour

@@ -197,7 +197,7 @@ def test_reactive_scenarios_are_drawn_where_there_is_room() -> None:
 def test_a_run_on_a_city_of_ones_own_is_replayed(cosim: Cosim, city: Path) -> None:
     """`cosim run reactive --map FOLDER` runs, and its replay gives the recorded hash from the run's
     folder alone."""
-    words = ("--map", "seven", "--event", "frontal", "--policy", "straight", "--out", "run")
+    words = ("--map", "seven", "--event", "frontal", "--policy", "schedule:stand", "--out", "run")
     said = cosim("run", "reactive", *words, cwd=city.parent)
     assert said.returncode == 0, said.stderr
     (episode,) = (p.name for p in (city.parent / "run" / "episodes").iterdir())

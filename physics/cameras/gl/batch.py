@@ -103,7 +103,13 @@ class BatchDrawing:
             surface = stage.surface
             shadows = stage.shadows is not None
             watched.append(
-                PeopleSeen(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows)
+                PeopleSeen(
+                    street.people,
+                    _CLOCK.time_s(street.tick),
+                    surface.heights,
+                    shadows,
+                    surface.seed,
+                )
             )
             driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
         self._crowd.set(watched, shots)

@@ -317,7 +317,8 @@ class _Reel:
         for event, state in zip(self._scenario.events, step.events.states, strict=True):
             if state.phase == "acting" and event.id not in self._triggered:
                 self._triggered.add(event.id)
-                self._say(step.tick, event.kind.replace("_", " "), hud.INK)
+                decoy = " (decoy)" if self._scenario.decoy_of else ""
+                self._say(step.tick, event.kind.replace("_", " ") + decoy, hud.INK)
         for failure in verdict.failures:
             self._counts[failure.kind] += 1
             other = f" with {failure.other_kind}" if failure.other_kind else ""
