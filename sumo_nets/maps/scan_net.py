@@ -52,8 +52,8 @@ _ROAD_END_M: Final = 6.0
 _ON_ROAD_M2: Final = 0.5
 _BESIDE_M: Final = 0.3
 """Gap between a crossing and its road that is closed, in metres."""
-_KERB_M: Final = 0.3
-"""Distance before the curb from which the link to a crossing runs straight, in metres."""
+_KERB_M: Final = 0.8
+"""Depth of the corner between a curb and the link to its sidewalk, in metres."""
 _OPTIONS: Final = (
     "--walkingareas",
     "--no-turnarounds.except-deadend",
@@ -96,6 +96,14 @@ class _Zebra:
     line: Floats
     lane_m: float
     turned: bool = False
+
+    @property
+    def outline(self) -> Floats:
+        """Outline of its node, with corners before the curbs, (4, 2) metres."""
+        along = (self.line[1] - self.line[0]) / np.hypot(*(self.line[1] - self.line[0]))
+        aside = np.array([-along[1], along[0]]) * (0.5 * self.lane_m + INNER_M)
+        start, end = self.line[0] - _KERB_M * along, self.line[1] + _KERB_M * along
+        return np.array([start - aside, end - aside, end + aside, start + aside])
 
     @property
     def id(self) -> str:
@@ -357,8 +365,12 @@ def _converted(
     left = georeference is not None and bool(
         left_hand_country(georeference.longitude_deg, georeference.latitude_deg)
     )
+    # netconvert mirrors left-hand nets, but not the outlines of their nodes.
+    outlines = {} if left else {zebra.node: zebra.outline for zebra in plan.zebras}
     nodes = [
-        f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"/>'
+        f'<node id="n{i}" x="{xy[0]:.3f}" y="{xy[1]:.3f}" type="priority"'
+        + (f' shape="{_shape(outlines[i])}"' if i in outlines else "")
+        + "/>"
         for i, xy in enumerate(plan.nodes)
     ]
     edges = [row for i, edge in enumerate(plan.edges) for row in _rows(i, edge)]
