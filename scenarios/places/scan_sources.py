@@ -217,7 +217,9 @@ def load_splats(
             f"--most-splats {BUDGET // 2}, or in SuperSplat"
         )
     loaded.raw = raw
-    loaded.splat_matrix = combine(loaded.placing, _splat_matrix(loaded, names, raw, options))
+    stated = all(stem_and_ending(path)[1] == ".spz" for path in files)
+    own = _splat_matrix(loaded, names, raw, options, "+y" if stated else None)
+    loaded.splat_matrix = combine(loaded.placing, own)
     progress("ordering the splats")
     splats = order_splats(move_splats(raw, loaded.splat_matrix))
     loaded.findings.append(note(f"{names}: {len(splats)} splats"))
@@ -232,9 +234,12 @@ def load_splats(
     loaded.splats = splats
 
 
-def _splat_matrix(loaded: LoadedScan, names: str, raw: RawSplats, options: ScanOptions) -> Matrix:
+def _splat_matrix(
+    loaded: LoadedScan, names: str, raw: RawSplats, options: ScanOptions, format_up: Up | None
+) -> Matrix:
     """Return the matrix from the splats' frame to metres with z up.
 
+    format_up: axis that the format states, None without one.
     Raises MapError if scale or up are not given, with what fits the mesh.
     """
     own = any(
@@ -243,9 +248,7 @@ def _splat_matrix(loaded: LoadedScan, names: str, raw: RawSplats, options: ScanO
     )
     transform = read_transform(options.splat_transform if own else options.transform)
     scale = options.splat_scale or (None if transform else options.scale)
-    up = options.splat_up or (None if transform else options.up)
-    if names.lower().endswith(".spz") and transform is None:
-        up = up or "+y"
+    up = options.splat_up or (None if transform else options.up or format_up)
     if transform is None and (scale is None or up is None):
         missing = [
             name for name, value in (("splat_scale", scale), ("splat_up", up)) if value is None
