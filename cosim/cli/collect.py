@@ -48,6 +48,9 @@ _OF_COLLECT = Fields(
         "no_decoys",
         "map",
         "policy",
+        "isolated",
+        "policy_data",
+        "policy_memory",
         "robot",
         "goal",
         "seed",
@@ -167,19 +170,19 @@ def collect_command(
     Only solved episodes are stored. The bytes are the same for any --jobs. A stopped collection
     continues with --resume.
     """
-    from cosim.spec.options import PolicyHost
     from scenarios.episodes.demonstration import check_parquet
 
     check_parquet()
     from cosim.spec.options import EpisodeOptions
-    from scenarios.runs.policy_host import inspected_driver
+    from scenarios.runs.policy_host import host_of, inspected_driver
     from scenarios.tools.dataset.collect import collect
 
     folder = config.out
     jobs = config.jobs or 1
     assert folder is not None
     collecting = demo.collecting
-    expert = inspected_driver(config.policy, PolicyHost(), jobs)
+    host = host_of(config)
+    expert = inspected_driver(config.policy, host, jobs)
     options = EpisodeOptions.asked(replace(config, camera=camera_here(config.camera)))
     source = _source(config, demo)
     began_s = time.monotonic()
@@ -193,6 +196,7 @@ def collect_command(
             options=options,
             episodes=config.episodes,
             jobs=jobs,
+            host=host,
             resume=config.resume,
             showing=_show_board,
             progress=stages_in_lines(),
