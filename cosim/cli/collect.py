@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cosim.cli.console import err, out, say
-from cosim.cli.generated_options import Fields, configured
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import LEARN, camera_here, check_output, parse_size, replacement_note
 from cosim.cli.progress import doing, stages_in_lines
 from cosim.cli.run_progress import ProgressDisplay
@@ -151,6 +151,7 @@ class DemoConfig:
 
 @collect_app.command(
     "collect",
+    cls=ConfiguredCommand,
     rich_help_panel=LEARN,
     epilog="Examples:  \n`cosim collect reactive --cities 900:940 --event gesturing --episodes "
     "500 --jobs 2 --out demos/gesturing`  \n`cosim collect unit --cities 900:980 --episodes 1000 "

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.generated_options import Fields, configured
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import Camera, Insecure, Tls, camera_here, check_output, replacement_note
 from cosim.cli.progress import doing
 from cosim.core.errors import SOME_CRASHED, unknown
@@ -38,6 +38,7 @@ def policies() -> None:
 
 @policy_app.command(
     "check",
+    cls=ConfiguredCommand,
     epilog="Examples:  \n`cosim policy check my.py:Mine -o check.png`  \n`cosim policy check "
     "onnx:bundle --json`  \n`cosim policy check zenoh:vint --policy-at tcp/gpu:7449 --goal image`",
 )

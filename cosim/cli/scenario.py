@@ -13,7 +13,7 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import err, notice, out, say
-from cosim.cli.generated_options import Fields, configured
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import camera_here, check_rerun, replacement_note, write_rerun
 from cosim.cli.progress import doing
 from cosim.core.bounding_box import check_overlap, parse_box
@@ -209,6 +209,7 @@ def draw_own(
 
 @scenario_app.command(
     "run",
+    cls=ConfiguredCommand,
     epilog="Examples:  \n`cosim scenario run mine.toml --policy orca`  \n"
     "`cosim scenario run sweep.toml --policy social_force --jobs 2 --out runs/sweep`  \n"
     "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`  \n"

@@ -42,6 +42,53 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+PEEKS = """
+from pathlib import Path
+import cosim
+
+Path(__file__).parents[1].joinpath("secret.txt").read_text()
+
+class Peeks:
+    manifest = cosim.Manifest("peeks", camera=None, goal="route_point")
+    def reset(self, episode, seed): pass
+    def act(self, observation):
+        return cosim.Command(0.5, 0.1 * float(observation.goal.y_m))
+"""
+OWN = """
+name = "own"
+place = {city = 1, size_m = 500}
+way = {kind = "straight", length_m = 30}
+limits = {time_s = 1}
+"""
+
+
+@pytest.mark.engine
+def test_every_command_that_runs_a_policy_can_isolate_it(tmp_path: Path, cosim: Cosim) -> None:
+    """It cannot read beyond its folder in runs, checks and collections; --policy-data shows it
+    more."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/peeks.py").write_text(PEEKS)
+    (tmp_path / "secret.txt").write_text("secret")
+    (tmp_path / "own.toml").write_text(OWN)
+    write_suite(Suite(name="one", version="1", scenarios=(small_scenario(),)), tmp_path / "s.json")
+    name = "mine/peeks.py:Peeks"
+    commands = {
+        "check": ("policy", "check", name, "--frames", "2"),
+        "own": ("scenario", "run", "own.toml", "--policy", name, "--out", "own"),
+        "collect": ("collect", "s.json", "--policy", name, "--unsolved", "--out", "demos"),
+    }
+    for command in commands.values():
+        said = cosim(*command, "--isolated", cwd=tmp_path)
+        assert said.returncode == 2 and "--policy-data" in said.stderr, (command, said.stderr)
+    shown = ("--isolated", "--policy-data", "secret.txt")
+    said = cosim(*commands["own"], *shown, cwd=tmp_path)
+    assert said.returncode == 0, said.stderr
+    spec = json.loads((tmp_path / "own/run.json").read_text())
+    assert spec["policy_runs"] in ("isolated: namespaces", "isolated: landlock")
+    said = cosim(*commands["check"], *shown, cwd=tmp_path)
+    assert said.returncode in (0, 1) and "peeks" in said.stdout, said.stderr
+
+
 MEMORY = """
 import os
 from pathlib import Path
