@@ -85,7 +85,7 @@ def unknown_names(parameters: dict[str, Any]) -> list[object]:
     wrong: list[object] = []
     for key, valid in named.items():
         given = parameters.get(key) or ()
-        for name in (given,) if isinstance(given, str) else given:
+        for name in given.split(",") if isinstance(given, str) else given:
             free = key in ("policy", "learner", "suite") and (
                 ":" in name or name.endswith((".toml", ".json"))
             )

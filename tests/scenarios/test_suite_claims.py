@@ -477,16 +477,18 @@ def exploit_for(suite_hash: str) -> Exploit:
     schedule = Schedule(name="blind-all")
     shares = {"val_sr": Share(0, 0), "val_d": None, "sr": Share(0, 0), "d": None}
     found = Found(
-        kind=ALL, objective="sr", evaluations=1, schedule=schedule, kinds={}, episodes=(), **shares
-    )
-    return Exploit(
-        suite="unit",
-        suite_hash=suite_hash,
+        kind=ALL,
+        objective="sr",
         goal="final_point",
         seed=0,
+        budget=1,
         evaluations=1,
-        found=(found,),
+        schedule=schedule,
+        kinds={},
+        episodes=(),
+        **shares,
     )
+    return Exploit(suite="unit", suite_hash=suite_hash, found=(found,))
 
 
 def test_a_broken_claim_is_found_out() -> None:
