@@ -23,7 +23,7 @@ from cosim.spec.scenario import City, Scenario, read_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.catalog import SUITES, load_suite
-from scenarios.suites.decoys import decoy_of, differing_fields, limited
+from scenarios.suites.decoys import DECOY, decoy_of, differing_fields, limited
 from scenarios.suites.gate_fences import drawn_gate
 from scenarios.suites.lanes import ENDS_M, free_lanes
 from scenarios.suites.obstacles import prove_gap
@@ -34,6 +34,7 @@ from scenarios.tools.build.build_suite import build_suite
 from scenarios.tools.build.claims import CLAIMS, Read
 from scenarios.tools.build.place_claims import common_ways, faults_in_places, straight_lanes
 from scenarios.tools.exploit import measure
+from scenarios.tools.exploit.evaluate import drive
 from tests.conftest import Cosim
 
 SMALL = City(seed=1, size_m=500.0)
@@ -221,3 +222,18 @@ def test_cheats_are_driven_on_a_redraw(
     said = cosim("bench", "exploit", "--cheats", "--suite", str(out), "--out", str(tmp_path / "e"))
     assert said.returncode == 0 and "swerve-left" in said.stdout, said.stderr
     assert len((tmp_path / "e" / "evaluations.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize(
+    ("number", "cheat"),
+    [("7007", "swerve-fast-left"), ("7010", "swerve-wide-left"), ("7012", "swerve-right")],
+)
+def test_a_swerve_away_from_who_cuts_in_solves_the_decoy_alone(number: str, cheat: str) -> None:
+    """It reaches both goals without a failure, but did not give way in the event."""
+    name = f"overtaking-{number}"
+    ids = (name, name + DECOY)
+    twins = [one for one in load_suite("reactive").scenarios if one.id in ids]
+    results = [drive(twin, CHEATS[cheat]) for twin in twins]
+    assert [(one.done, one.failures) for one in results] == [(1.0, 0.0)] * 2
+    assert [one.solved for one in results] == [False, True]
