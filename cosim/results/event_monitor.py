@@ -8,8 +8,8 @@ renderer and also exists for policies without a camera.
 
 The paper's table has rules beyond the goal: the robot passes around the whole group of `conversing`
 and the whole line of `queueing` (`EventKind.passed_as_group`), never between two people.
-`gesturing` ends its episode at a stop: see the referee. Decoys have the rule of
-`cosim.results.go_on`.
+`gesturing` ends its episode at a stop: see the referee. Decoys, and events that require the robot
+to give way, have the rules of `cosim.results.go_on`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PersonKind, RobotState
 from cosim.episode.loop import Step
-from cosim.results.go_on import STOP_S, Passing, PassingWindow, is_measured, passing_of
+from cosim.results.go_on import (
+    STOP_S,
+    Passing,
+    PassingWindow,
+    is_measured,
+    passing_of,
+    rule_met,
+)
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import Ended
 from cosim.spec.camera import CameraSpec
@@ -125,8 +132,9 @@ class EventMonitor:
         passing = self._motion(first, window.end or len(self._v_mps))
         if passing is None:
             return False
-        over = window.end is not None
-        return passing.stopped_s >= STOP_S or (over and not passing.goes_on(self._go_on_mps))
+        if window.end is not None:
+            return not rule_met(self._events[i], passing, self._go_on_mps)
+        return self._events[i].decoy and passing.stopped_s >= STOP_S
 
     def _sees(self, robot: RobotState, bodies: Floats) -> bool:
         """Return whether the camera sees one of the (N, 2) bodies."""
@@ -154,7 +162,7 @@ class EventMonitor:
         end, passing = self._passing(i, ended)
         rules = [not self._went_between[i]] if self._passed_round[i] else []
         if self._go_on_mps > 0.0:
-            rules.append(passing is not None and passing.goes_on(self._go_on_mps))
+            rules.append(rule_met(event, passing, self._go_on_mps))
         return TriggeredEvent(
             id=event.id,
             kind=event.kind,

@@ -255,6 +255,7 @@ class EventKind:
     has_free_side: whether a suite draws `Event.free_side`. People who block no side then stand
         next to the robot's way.
     decoy: behaviour of its decoys; None if a decoy is the event with the other side free.
+    gives_way: whether the robot must give way in a reactive scenario, see `Scenario.go_on_mps`.
     """
 
     name: str
@@ -272,6 +273,7 @@ class EventKind:
     blocked: Callable[[Event], tuple[float, float]] | None = None
     has_free_side: bool = False
     decoy: Decoy | None = None
+    gives_way: bool = False
 
     def trigger_m_of(self, event: Event) -> float | None:
         """Return the distance before an event at which it begins, in metres: its own, else the

@@ -43,6 +43,11 @@ def has_decoy(scenario: Scenario) -> bool:
     return scenario.ends_on_failure and bool(scenario.events) and not scenario.decoy_of
 
 
+def must_give_way(scenario: Scenario, kinds: EventKinds = EVENT_KINDS) -> bool:
+    """Return whether the robot must give way in a scenario, at the pace that its decoy requires."""
+    return has_decoy(scenario) and any(kinds[event.kind].gives_way for event in scenario.events)
+
+
 def differing_fields(scenario: Scenario, decoy: Scenario) -> list[str]:
     """Return the fields in which a decoy differs from its scenario, but must not."""
     should = msgspec.structs.replace(
@@ -63,8 +68,11 @@ def time_limit_s(scenario: Scenario, expert_s: float) -> float:
 def least_pace_mps(scenario: Scenario, expert_mps: float | None) -> float:
     """Return `go_on_mps` of a scenario past whose person the expert drives at expert_mps.
 
-    It is 0 for all scenarios but decoys in which nothing happens.
+    It follows from this speed in decoys in which nothing happens. A scenario in which the robot
+    must give way has that of its decoy already. It is 0 for all others.
     """
+    if must_give_way(scenario):
+        return scenario.go_on_mps
     if expert_mps is None or not any(event.decoy for event in scenario.events):
         return 0.0
     return round(GO_ON_SHARE * expert_mps, _GO_ON_DIGITS)
