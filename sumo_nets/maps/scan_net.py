@@ -160,8 +160,38 @@ def build_scan_net(
     """
     progress("finding the walkable ground")
     ground = walkable_ground(areas, heights)
-    progress("finding the axis of the walkable ground")
     progress("building the net")
+    plan, path, street_map = _fitted(areas, ground, georeference, folder)
+    findings = [*plan.findings, *_checked(plan, street_map)]
+    progress("starting SUMO on the net")
+    start_net(path, str(path))
+    walks = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
+    narrow = tuple(name for name, edge in walks.items() if edge.clear_m < CROWD_M)
+    widths_m = {name: round(edge.clear_m, 3) for name, edge in walks.items()}
+    write_ground(drawn_ground(street_map, ground, widths_m, narrow), folder / GROUND_FILE)
+    if narrow:
+        line = walks[narrow[0]].line
+        x, y = line[len(line) // 2].tolist()
+        findings.append(
+            f"net: {len(narrow)} of {len(walks)} pieces of the walking net are narrower than "
+            f"{CROWD_M:g} m, one of them at ({x:.1f}, {y:.1f}): robots may use them, the crowd "
+            "does not"
+        )
+    iou, outside = _agreement(street_map, ground)
+    findings.append(
+        f"net: {ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by "
+        f"{iou:.0%} (intersection over union), {outside:.1%} of the lanes are outside"
+    )
+    return ScanNet(path, tuple(findings), iou)
+
+
+def _fitted(
+    areas: Sequence[ScanArea],
+    ground: Polygon | MultiPolygon,
+    georeference: Georeference | None,
+    folder: Path,
+) -> tuple[_Plan, Path, StreetMap]:
+    """Build the net, without crossings that do not fit, and with lanes inside of the ground."""
     plain: dict[int, str] = {}
     while True:
         plan = _planned(areas, ground, plain)
@@ -174,32 +204,16 @@ def build_scan_net(
         if not _narrowed(plan, street_map, ground):
             break
         path, street_map = _built(plan, georeference, folder)
-    findings = [*plan.findings, *_checked(plan, street_map)]
-    progress("starting SUMO on the net")
-    start_net(path, str(path))
-    names = {f"w{i}": edge for i, edge in enumerate(plan.edges) if not edge.drive}
-    narrow = [name for name, edge in names.items() if edge.clear_m < CROWD_M]
-    widths_m = {name: round(edge.clear_m, 3) for name, edge in names.items()}
-    write_ground(drawn_ground(street_map, ground, widths_m, tuple(narrow)), folder / GROUND_FILE)
-    if narrow:
-        at = names[narrow[0]].line[len(names[narrow[0]].line) // 2]
-        findings.append(
-            f"net: {len(narrow)} of {len(names)} pieces of the walking net are narrower than "
-            f"{CROWD_M:g} m, one of them at ({at[0]:.1f}, {at[1]:.1f}): robots may use them, the "
-            "crowd does not"
-        )
-    inner = overlay.union_all(
-        [strip.polygon for strip in street_map.strips.values()]
-        + [corner.polygon for corner in street_map.corners.values()]
-    )
-    both = shapely.intersection(inner, ground).area
-    iou = both / (inner.area + ground.area - both)
-    outside = max(0.0, 1.0 - both / inner.area)
-    findings.append(
-        f"net: {ground.area:.0f} m2 are walkable; SUMO's lanes and corners agree with them by "
-        f"{iou:.0%} (intersection over union), {outside:.1%} of the lanes are outside"
-    )
-    return ScanNet(path, tuple(findings), float(iou))
+    return plan, path, street_map
+
+
+def _agreement(street_map: StreetMap, ground: Polygon | MultiPolygon) -> tuple[float, float]:
+    """Return the intersection over union of SUMO's lanes and the ground, and the share of the lanes
+    outside."""
+    strips, corners = street_map.strips.values(), street_map.corners.values()
+    lanes = overlay.union_all([s.polygon for s in strips] + [c.polygon for c in corners])
+    both = float(shapely.intersection(lanes, ground).area)
+    return both / (lanes.area + ground.area - both), max(0.0, 1.0 - both / lanes.area)
 
 
 def _planned(
