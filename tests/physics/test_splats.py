@@ -28,6 +28,7 @@ from physics.cameras.gl.splats import CARD, PROCESSOR, SplatDrawing, distance_ke
 from physics.cameras.view import shot
 from physics.dynamics.world import BulletWorld
 from physics.street.scan_surface import ScanSurface
+from tests.conftest import PATIENCE_S
 from tests.support.splat_scan import (
     AHEAD,
     WALL_X_M,
@@ -119,7 +120,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
         )
         for count in ("1", "4")
     ]
-    found = [process.communicate(timeout=120)[0].strip() for process in drawing]
+    found = [process.communicate(timeout=PATIENCE_S)[0].strip() for process in drawing]
     assert found == [picture_hash()] * 2
 
 
