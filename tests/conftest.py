@@ -57,8 +57,8 @@ LONGEST = (
     "scenarios/test_verify.py",
     "scenarios/test_exploit.py",
 )
-"""Files that take longest. They run first, so that no worker of pytest-xdist is left alone with one
-of them in the end."""
+"""Files of engine tests that take longest. They are the first of these, so that no worker of
+pytest-xdist is left alone with one of them in the end."""
 
 COLLECTED = pytest.StashKey[list[str]]()
 """The ids of all tests of a session, those that it leaves out included."""
@@ -67,8 +67,9 @@ COLLECTED = pytest.StashKey[list[str]]()
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     config.stash[COLLECTED] = [item.nodeid for item in items]
+    slow = {item.path for item in items if item.get_closest_marker("engine")}
     rank = {ROOT / "tests" / name: place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+    items.sort(key=lambda item: (item.path in slow, rank.get(item.path, len(rank))))
 
 
 def still_runs(pid: int) -> bool:
