@@ -308,7 +308,7 @@ def make(
         ),
     ] = "",
     hour: Annotated[float, typer.Option(min=0, max=24, help="Solar time of the light.")] = 13.0,
-    spacing: Annotated[float, typer.Option(help="Metres between splats on the ground.")] = 0.12,
+    spacing: Annotated[float, typer.Option(help="Metres between splats on the ground.")] = 0.1,
 ) -> None:
     """Make a scan of a generated street: a mesh and splats, for demonstrations and tests.
 

@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
@@ -37,7 +38,7 @@ from physics.textures.layers import Layers, linear_to_srgb, srgb_to_linear
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1 in metres."""
 
-SPACING_M: Final = 0.12
+SPACING_M: Final = 0.1
 """Default distance between splats on the ground in metres."""
 _WALL_SPACING: Final = 1.7
 """Distance between splats elsewhere, as a multiple of that on the ground."""
@@ -48,6 +49,10 @@ _THICKNESS_M: Final = 0.004
 _OPACITY: Final = 0.98
 _MESH_EDGE_M: Final = 0.5
 """Longest edge of the mesh in metres, as colours are stored at its vertices."""
+_COVER_M: Final = 0.1
+"""Largest distance in metres between a wall and a window before it."""
+_NEAR_SHARE: Final = 0.75
+"""Distance within which a splat covers another, as a share of the distance between splats."""
 _BORDER_M: Final = 0.5
 """Longest edge of triangles at the border of the box in metres."""
 _TEXELS: Final = 256
@@ -185,7 +190,29 @@ def sample_splats(pieces: Sequence[_Piece], sky: Sky, seed: int, spacing_m: floa
         normals = across[owner] / twice_m2[owner, None]
         colours = _lit(piece, centres, normals, sky, spacing)
         found.append(SurfaceSplats(centres, normals, colours, np.full(len(owner), spacing)))
-    return SurfaceSplats(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    return _without_covered(SurfaceSplats(*map(np.concatenate, zip(*found, strict=True))), found)
+
+
+def _without_covered(whole: SurfaceSplats, parts: Sequence[SurfaceSplats]) -> SurfaceSplats:
+    """Return the splats that no parallel surface of another piece covers within `_COVER_M`.
+
+    Walls continue behind windows, and would mix with them.
+    """
+    owner = np.repeat(np.arange(len(parts)), [len(part.centres) for part in parts])
+    upright = np.flatnonzero(np.abs(whole.normals[:, 2]) < 0.5)
+    at = whole.centres[upright]
+    one, other = (
+        cKDTree(at).query_pairs(_NEAR_SHARE * whole.spacings.max(), output_type="ndarray").T
+    )
+    one, other = np.concatenate([one, other]), np.concatenate([other, one])
+    normals, offset = whole.normals[upright], at[other] - at[one]
+    ahead_m = sum(offset[:, k] * normals[one, k] for k in range(3))
+    parallel = sum(normals[one, k] * normals[other, k] for k in range(3))
+    apart = owner[upright][one] != owner[upright][other]
+    covered = apart & (parallel > 0.9) & (ahead_m > 1e-4) & (ahead_m < _COVER_M)
+    shown = np.ones(len(whole.centres), dtype=bool)
+    shown[upright[one[covered]]] = False
+    return SurfaceSplats(*(column[shown] for column in whole))
 
 
 def _pieces(surface: StreetSurface, box: Box) -> Iterator[_Piece]:
