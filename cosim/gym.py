@@ -5,8 +5,8 @@
 
     env = gymnasium.make("cosim/Reactive-v2")
 
-The ids are cosim/Unit-v2, cosim/Reactive-v2 and cosim/LongHorizon-v2. `gymnasium.make` passes
-further arguments to `cosim.make_env`.
+The ids are cosim/Unit-v2, cosim/Reactive-v2, cosim/LongHorizon-v2 and cosim/Scans-v1.
+`gymnasium.make` passes further arguments to `cosim.make_env`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ ENV_IDS = {
     "cosim/Unit-v2": "unit",
     "cosim/Reactive-v2": "reactive",
     "cosim/LongHorizon-v2": "long-horizon",
+    "cosim/Scans-v1": "scans",
 }
 """Suite name by environment id."""
 

@@ -40,6 +40,14 @@ class ScanChoices:
     """Options of an import, as `scan.json` has them. None and "" are left to it."""
 
     name: Annotated[str, Option("Name of the map.", default="the folder's", panel=_FACTS)] = ""
+    preset: Annotated[
+        str,
+        Option(
+            "Place of the suite `scans` whose options and areas replace scan.json.",
+            metavar="PLACE",
+            panel=_FACTS,
+        ),
+    ] = ""
     scale: Annotated[
         float | None, Option("Metres per unit.", default="1 in .glb files", panel=_FRAME)
     ] = None
@@ -128,14 +136,16 @@ class ScanChoices:
         Raises UsageError and SpecError for invalid values.
         """
         from scenarios.places.scan_options import parse_georeference, parse_sun, read_options
+        from scenarios.places.scan_places import preset_folder
 
         given: dict[str, Any] = dataclasses.asdict(self)
+        preset = given.pop("preset")
         given["width_m"] = given.pop("width")
         given["exposure_ev"] = given.pop("exposure")
         given["flip"] = self.flip or None
         given["georeference"] = parse_georeference(self.georeference) if self.georeference else None
         given["sun"] = parse_sun(self.sun) if self.sun else None
-        return read_options(folder, given)
+        return read_options(folder, given, preset_folder(preset) if preset else None)
 
 
 _Folder = Annotated[
@@ -148,7 +158,7 @@ _Map = Annotated[str, typer.Argument(metavar="NAME", help="Name of an imported s
     "import",
     epilog="Examples:  \n`cosim scan import my-street`  \n`cosim scan import my-street --up +z "
     "--scale 1 --areas areas.geojson`  \n`cosim scan import my-street --way walk.geojson --width 3 "
-    "--georeference 55.698,13.195`",
+    "--georeference 55.698,13.195`  \n`cosim scan import lund-street --preset lund-street`",
 )
 @configured
 def import_(folder: _Folder, choices: Annotated[ScanChoices, Fields(panels=True)]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 import typer
 from rich.console import Console
 
@@ -206,6 +207,7 @@ def check_suites(
 
 def _false_claims(name: str, sample: int | None, drive: int | None, jobs: int) -> int:
     """Print a suite's table and false claims, and return the number of false claims."""
+    from scenarios.places.scan_places import lacking_scans
     from scenarios.suites.catalog import SUITES, load_suite
     from scenarios.suites.exploits import read_exploit
     from scenarios.suites.proofs import read_proofs
@@ -227,9 +229,13 @@ def _false_claims(name: str, sample: int | None, drive: int | None, jobs: int) -
     read = Read(suite, proofs, path, exploit)
     faults = {claim: list(of(read)) for claim, of in CLAIMS.items()}
     checked = {claim: len(suite.scenarios) for claim in CLAIMS}
-    every = list(suite.scenarios)
-    picked = every if sample is None else sample_of(suite, sample)
-    driven = [s.id for s in (every if drive is None else sample_of(suite, drive))]
+    lacking = lacking_scans(scenario.place for scenario in suite.scenarios)
+    for place, remedy in lacking.items():
+        notice(f"{name}: '{place}' is not imported, and not looked at: {remedy}")
+    every = [s for s in suite.scenarios if s.place.name.removeprefix("map-") not in lacking]
+    here = msgspec.structs.replace(suite, scenarios=tuple(every))
+    picked = every if sample is None else sample_of(here, sample)
+    driven = [s.id for s in (every if drive is None else sample_of(here, drive))]
     extra = [s for s in every if s.id in set(driven) - {s.id for s in picked}]
     with doing(f"looking at {len(picked)} scenarios in their places, driving {len(driven)}"):
         for fault in faults_in_places([*picked, *extra], driven, proofs, jobs):

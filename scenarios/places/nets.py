@@ -19,13 +19,19 @@ from sumo_nets.net.snapshot import street_map_of
 
 @lru_cache(maxsize=1)
 def place(where: Place) -> tuple[Path, StreetMap]:
-    """Return the net file of a place and its street map; the last one is cached."""
+    """Return the net file of a place and its street map; the last one is cached.
+
+    A generated scan of the suite `scans` is made if it is missing, which takes a minute.
+    Raises UsageError for an unknown map, MapError for one with another hash.
+    """
     if isinstance(where, City):
         path = city_net(where)
         return path, street_map_of(path)
-    # Imported only where needed: it loads the importer of maps, which takes a second.
+    # Imported only where needed: they load the importer of maps, which takes a second.
+    from scenarios.places.scan_places import provide_scan
     from sumo_nets.maps.map_store import map_net, read_map
 
+    provide_scan(where)
     return map_net(where), read_map(where)
 
 

@@ -88,11 +88,12 @@ class ScanOptions(Ranged, frozen=True, kw_only=True):
             yield f"{' and '.join(given)} both determine the walkable area: give one of them"
 
 
-def read_options(folder: Path, given: Mapping[str, Any]) -> ScanOptions:
+def read_options(folder: Path, given: Mapping[str, Any], preset: Path | None = None) -> ScanOptions:
     """Return the options of `scan.json` in a folder, if it exists, replaced by given ones.
 
     given: options by name; None and empty ones are left out.
-    Paths of the file are relative to the folder.
+    preset: other folder whose `scan.json` is read instead.
+    Paths of the file are relative to its folder.
     Raises SpecError for wrong options, UsageError for a folder that does not exist.
     """
     if not folder.is_dir():
@@ -100,10 +101,10 @@ def read_options(folder: Path, given: Mapping[str, Any]) -> ScanOptions:
             f"{folder}: must be a folder with the mesh (.glb, .ply, .obj) and, if there are any, "
             "the splats (.ply, .spz, .splat) of a scan"
         )
-    path = folder / OPTIONS_FILE
+    path = (preset or folder) / OPTIONS_FILE
     options = read_spec_file(path, ScanOptions) if path.exists() else ScanOptions()
     placed = {
-        field: str(folder / value)
+        field: str(path.parent / value)
         for field in ("transform", "splat_transform", "areas", "osm", "way")
         if isinstance(value := getattr(options, field), str) and value
     }

@@ -16,7 +16,7 @@ from scenarios.events import EVENT_KINDS
 
 _HERE = Path(__file__).parent
 
-_NAMES = ("unit", "reactive", "long-horizon")
+_NAMES = ("unit", "reactive", "long-horizon", "scans")
 _FILES = {name: _HERE / f"{name}.json" for name in _NAMES}
 SUITES: Mapping[str, Path] = MappingProxyType(
     {name: path for name, path in _FILES.items() if path.exists()}

@@ -23,6 +23,7 @@ from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.daylight import drawn_daylight
 from scenarios.suites.decoys import DECOY
+from scenarios.suites.drawing import passable
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.reactive import LIMIT_S, WAY_M, Wanted, build_reactive
 from scenarios.suites.unit import STRUCTURES, Structure, build_unit
@@ -31,6 +32,7 @@ from sumo_nets.maps.import_rules import WHEEL_PLACES
 
 LONG_WAY: Final = "route"
 TEST_CROPS: Final = ("braunschweig-2", "wildau-1")
+TEST_SCANS: Final = ("lund-street", "scan-12")
 _SMALL_CROPS: Final = ("ingolstadt-1", "braunschweig-1")
 _REAL_UNIT: Final = tuple(name for name in WHEEL_PLACES if name != "berlin-7")
 """Ten real places with straight ways and corners."""
@@ -46,6 +48,21 @@ _REAL_ROUTES: Final = {
     "braunschweig-2": 350.0,
 }
 ALL_ROUTES_M: Final = 36_500.0
+SCANS_ROUTE_M: Final = (60.0, 150.0)
+"""Shortest and longest route of `scans`, in metres."""
+_ROUTE_NUMBER: Final = 900
+_SCANS: Final[Mapping[str, tuple[int, int, int, float]]] = MappingProxyType(
+    {
+        "scan-5": (10, 8, 1, 145.0),
+        "scan-12": (6, 12, 4, 110.0),
+        "scan-40": (22, 10, 5, 130.0),
+        "lund-street": (22, 0, 0, 90.0),
+        "autzen-boulevard": (10, 0, 0, 72.0),
+    }
+)
+"""Places of `scans`: numbers of scenarios of each structure, and the length of the route in metres.
+The real places have neither corners between sidewalks nor crossings shorter than 17 m.
+"""
 _SHORTEST_M: Final = 120.0
 _DIGITS: Final = 4
 _REDRAW_SEEDS: Final = 1_000_000
@@ -121,7 +138,9 @@ def candidate(slot: Slot, seed: int) -> Scenario:
     rng = np.random.default_rng([seed, zlib.crc32(slot.name.encode())])
     # Each structure has another offset, so that those of one city are not all of one hour.
     light = drawn_daylight(rng, slot.number + 5 * zlib.crc32(slot.structure.encode()) % 84)
-    whole = msgspec.structs.replace(drawn, light=light, split=slot.split, structure=slot.structure)
+    whole = msgspec.structs.replace(
+        drawn, suite=slot.suite, light=light, split=slot.split, structure=slot.structure
+    )
     return msgspec.convert(_in_few_digits(msgspec.to_builtins(whole)), Scenario)
 
 
@@ -156,7 +175,7 @@ def _graph(where: Place) -> WalkGraph:
 
 def _split_of(where: Place) -> Split:
     name = where.map if isinstance(where, CityMap) else where.seed
-    return "test" if name in TEST_CROPS or name in TEST_SEEDS else "val"
+    return "test" if name in (*TEST_CROPS, *TEST_SEEDS, *TEST_SCANS) else "val"
 
 
 def _cities() -> list[tuple[int, City]]:
@@ -260,6 +279,23 @@ def _route_slots() -> list[Slot]:
     return found
 
 
+def _scan_slots() -> list[Slot]:
+    """Return slots with short scenarios and a route on each scan."""
+    found = []
+    for place_number, (name, (*counts, length_m)) in enumerate(_SCANS.items()):
+        where = CityMap(map=name)
+        for structure, count in zip(STRUCTURES, counts, strict=True):
+            found += [
+                _slot("scans", f"{structure}-{name}-{number:02d}", structure, where, number)
+                for number in range(count)
+            ]
+        number = _ROUTE_NUMBER + 17 * place_number
+        found.append(
+            _slot("scans", f"{LONG_WAY}-{name}", LONG_WAY, where, number, length_m=length_m)
+        )
+    return found
+
+
 def _unit(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Scenario:
     return build_unit(
         cast(Structure, slot.structure), slot.where, street_map, graph, seed, slot.name
@@ -282,6 +318,16 @@ def _route(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Sc
     return build_long_horizon(
         slot.where, street_map, graph, seed, slot.name, length_m=slot.length_m
     )
+
+
+def _scan(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Scenario:
+    """Draw a scenario of `scans`. Its crowd is thinner where people could not pass the robot."""
+    if slot.structure != LONG_WAY:
+        return _unit(slot, street_map, graph, seed)
+    route = build_long_horizon(
+        slot.where, street_map, graph, seed, slot.name, length_m=slot.length_m, roomy=True
+    )
+    return passable(route, street_map)
 
 
 RECIPES: Final[Mapping[str, SuiteRecipe]] = MappingProxyType(
@@ -312,6 +358,15 @@ RECIPES: Final[Mapping[str, SuiteRecipe]] = MappingProxyType(
             purpose="long ways through street life",
             slots=_route_slots(),
             draw=_route,
+        ),
+        "scans": SuiteRecipe(
+            version="1.0",
+            description="110 ways of 10 to 20 m past things that stand there, and 5 of 60 to "
+            "150 m with crowd and events, on five scanned places: two real ones, whose files the "
+            "user imports, and three generated ones. The long ones never end on a failure.",
+            purpose="scanned places, with images of real streets",
+            slots=_scan_slots(),
+            draw=_scan,
         ),
     }
 )

@@ -31,6 +31,7 @@ from scenarios.suites.catalog import SUITES
 from scenarios.suites.decoys import decoy_of, has_decoy, must_give_way
 from scenarios.suites.proofs import Dropped, Proof, Proofs, write_proofs
 from scenarios.suites.recipes import Slot, SuiteRecipe, candidate, recipe_of, repeated
+from scenarios.tools.build.claims import on_one_spot
 from scenarios.tools.build.proving import accepted
 
 CANDIDATES: Final = 6
@@ -232,13 +233,17 @@ def _started(piece: _Piece, folder: Path, tries: int) -> BaseProcess:
 
 def _work(piece: _Piece, folder: Path, tries: int) -> None:
     """Prove the open slots of a piece, in a worker process."""
-    for slot in piece.slots:
+    for number, slot in enumerate(piece.slots):
         if not _over(folder, slot, tries):
-            _fill(slot, folder, tries)
+            there = (_kept(folder, one) for one in piece.slots[:number])
+            _fill(slot, folder, tries, [one.scenario for one in there if one is not None])
 
 
-def _fill(slot: Slot, folder: Path, tries: int) -> None:
-    """Find and store the first candidate that the expert solves."""
+def _fill(slot: Slot, folder: Path, tries: int, there: Sequence[Scenario] = ()) -> None:
+    """Find and store the first candidate on a spot of its own that the expert solves.
+
+    there: accepted scenarios of the place.
+    """
     tried = _tried(folder, slot.name)
     dropped = list(tried.dropped)
     begun = tried.begun
@@ -257,6 +262,9 @@ def _fill(slot: Slot, folder: Path, tries: int) -> None:
         except CosimError as error:
             dropped.append(Dropped(seed, "none drawn", str(error)[:300]))
             continue
+        if not slot.like and (twin := _twin(scenario, there)):
+            dropped.append(Dropped(seed, "on the spot of another", twin))
+            continue
         found = _accepted(scenario)
         if isinstance(found, Dropped):
             dropped.append(msgspec.structs.replace(found, seed=seed))
@@ -267,6 +275,20 @@ def _fill(slot: Slot, folder: Path, tries: int) -> None:
             write_atomic(folder / f"{one.id}.json", msgspec.json.encode(kept))
         _trying(folder, slot.name).unlink()
         return
+
+
+def _twin(scenario: Scenario, there: Sequence[Scenario]) -> str:
+    """Return the id of an accepted scenario of the same structure on the same spot, or ""."""
+    return next(
+        (
+            one.id
+            for one in there
+            if one.structure == scenario.structure
+            and not one.decoy_of
+            and on_one_spot(one, scenario)
+        ),
+        "",
+    )
 
 
 def _accepted(scenario: Scenario) -> list[tuple[Scenario, Proof]] | Dropped:

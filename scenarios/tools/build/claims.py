@@ -30,10 +30,11 @@ from scenarios.suites.decoys import (
 )
 from scenarios.suites.exploits import ALL, Exploit, Share, kind_of
 from scenarios.suites.lanes import THINGS
+from scenarios.suites.long_horizon import LENGTH_SLACK_M
 from scenarios.suites.proofs import Proofs, proofs_path
 from scenarios.suites.reactive import WAY_M as REACTIVE_WAY_M
 from scenarios.suites.reactive import event_share
-from scenarios.suites.recipes import ALL_ROUTES_M, LONG_WAY, RECIPES
+from scenarios.suites.recipes import ALL_ROUTES_M, LONG_WAY, RECIPES, SCANS_ROUTE_M
 from scenarios.suites.unit import STRUCTURES, TURN_RAD, WAY_M, turn_rad
 from sumo_nets.maps.import_rules import WHEEL_PLACES
 
@@ -60,6 +61,43 @@ _FEWEST_EVENTS: Final = 5
 """Least number of events of each kind on the long routes."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Limits of claims that differ between suites.
+
+    test_share: share of each structure that is test.
+    route_m: shortest and longest long route; a third of this range is short, middle or long.
+    all_routes_m: length of all long routes, None without a claim.
+    signals_share: least share of long routes with signals.
+    fewest_events: least number of events of each kind on long routes.
+    crossed: whether each long route has a crossing and a barrier.
+    """
+
+    test_share: float = 0.2
+    route_m: tuple[float, float] = (100.0, 600.0)
+    all_routes_m: float | None = ALL_ROUTES_M
+    signals_share: float = 0.25
+    fewest_events: int = _FEWEST_EVENTS
+    crossed: bool = True
+
+
+LIMITS: Final[Mapping[str, Limits]] = MappingProxyType(
+    {
+        "scans": Limits(
+            test_share=0.4,
+            route_m=SCANS_ROUTE_M,
+            all_routes_m=None,
+            signals_share=0.0,
+            fewest_events=0,
+            crossed=False,
+        )
+    }
+)
+"""Limits by suite; others have the defaults. Five small scans have two places of test, no signals,
+streets without a branch, and no room for every event.
+"""
+
+
 @dataclass(frozen=True)
 class Read:
     """Suite with its proofs.
@@ -73,6 +111,11 @@ class Read:
     proofs: Proofs | None
     path: Path | None = None
     exploit: Exploit | None = None
+
+    @property
+    def limits(self) -> Limits:
+        """Limits of the claims of this suite."""
+        return LIMITS.get(self.suite.name, Limits())
 
 
 def _counts(read: Read) -> Iterator[str]:
@@ -93,11 +136,14 @@ def _counts(read: Read) -> Iterator[str]:
 
 
 def _split(read: Read) -> Iterator[str]:
-    """Check that a fifth of each structure is test, in places that val does not use."""
+    """Check that a fifth of each structure, or the suite's share, is test, in places that val does
+    not use.
+    """
+    wanted = read.limits.test_share
     for structure, those in _by(read.suite.scenarios, lambda s: s.structure).items():
         share = sum(s.split == "test" for s in those) / len(those)
-        if abs(share - 0.2) > 0.5 / len(those):
-            yield f"{structure}: {share:.1%} is test, not a fifth"
+        if abs(share - wanted) > 0.5 / len(those):
+            yield f"{structure}: {share:.1%} is test, not {wanted:.0%}"
     val = {s.place.name for s in read.suite.scenarios if s.split == "val"}
     yield from (
         f"{s.id}: is test in {s.place.name}, where val is, too"
@@ -154,22 +200,23 @@ def _proofs(read: Read) -> Iterator[str]:
 
 def _lengths(read: Read) -> Iterator[str]:
     """Check lengths: 10 to 20 m in `unit`, 12 to 30 m in `reactive`; long routes more than 100 m,
-    and 36.5 km +- 1 % in all.
+    and 36.5 km +- 1 % in all. On scans, long routes have 60 to 150 m.
 
     All kinds of reactive scenarios have the same distribution of lengths.
     """
     for scenario in read.suite.scenarios:
         length_m = scenario.route_line.length_m
-        low_m, high_m = _wanted_length_m(scenario)
+        low_m, high_m = _wanted_length_m(scenario, read.limits)
         if not low_m - _EDGE_M < length_m < high_m + _EDGE_M:
             yield f"{scenario.id}: is {length_m:.1f} m long"
     short = [scenario for scenario in read.suite.scenarios if _is_reactive(scenario)]
     yield from _other_lengths(short)
     routes_m = sum(s.route_line.length_m for s in read.suite.scenarios if s.structure == LONG_WAY)
-    if routes_m and abs(routes_m / ALL_ROUTES_M - 1.0) > 0.01:
+    wanted_m = read.limits.all_routes_m
+    if routes_m and wanted_m is not None and abs(routes_m / wanted_m - 1.0) > 0.01:
         yield (
             f"{read.suite.name}: its ways are {routes_m / 1000:.2f} km in all, not "
-            f"{ALL_ROUTES_M / 1000:g} +- 1 %"
+            f"{wanted_m / 1000:g} +- 1 %"
         )
 
 
@@ -198,9 +245,10 @@ def _is_reactive(scenario: Scenario) -> bool:
     return scenario.structure == STATIC or scenario.structure in EVENT_KINDS
 
 
-def _wanted_length_m(scenario: Scenario) -> tuple[float, float]:
+def _wanted_length_m(scenario: Scenario, limits: Limits) -> tuple[float, float]:
     if scenario.structure == LONG_WAY:
-        return 100.0, math.inf
+        low_m, high_m = limits.route_m
+        return low_m, math.inf if limits.all_routes_m is not None else high_m + LENGTH_SLACK_M
     return REACTIVE_WAY_M if _is_reactive(scenario) else WAY_M
 
 
@@ -331,7 +379,7 @@ def _structures(read: Read) -> Iterator[str]:
             "curve": TURN_RAD[0] <= turn <= TURN_RAD[1] and not one.crossings and not kinds,
             "crosswalk": len(one.crossings) == 1 and not one.crossings[0].signalised and not kinds,
             STATIC: not kinds and turn <= _STRAIGHT_RAD,
-            LONG_WAY: bool(one.crossings) and bool(one.barriers),
+            LONG_WAY: not read.limits.crossed or (bool(one.crossings) and bool(one.barriers)),
         }
         if not says.get(one.structure, kinds == [one.structure] and turn <= _STRAIGHT_RAD):
             yield (
@@ -355,7 +403,7 @@ def _street_life(read: Read) -> Iterator[str]:
             yield f"{one.id}: {crowd.persons} people and {crowd.vehicles} vehicles around it"
     if routes := [one for one in read.suite.scenarios if one.structure == LONG_WAY]:
         with_signals = sum(any(c.signalised for c in one.crossings) for one in routes)
-        if with_signals < 0.25 * len(routes):
+        if with_signals < read.limits.signals_share * len(routes):
             yield f"{with_signals} of {len(routes)} ways have signals: at least a quarter should"
 
 
@@ -371,8 +419,8 @@ def _events(read: Read) -> Iterator[str]:
     if any(one.structure == LONG_WAY for one in read.suite.scenarios):
         times = Counter(event.kind for _, event in events)
         for kind in EVENT_KINDS:
-            if times[kind] < _FEWEST_EVENTS:
-                yield f"{kind}: {times[kind]} times on the long ways, fewer than {_FEWEST_EVENTS}"
+            if times[kind] < (fewest := read.limits.fewest_events):
+                yield f"{kind}: {times[kind]} times on the long ways, fewer than {fewest}"
     if events:
         yield from _shares(
             "events from",
@@ -412,7 +460,7 @@ def _spread(read: Read) -> Iterator[str]:
         yield f"{foggy:.1%} of the scenarios have fog, not 4 to 30 %"
     for structure in (*STRUCTURES[:2], LONG_WAY):
         those = [one for one in whole if one.structure == structure]
-        low, high = (100.0, 600.0) if structure == LONG_WAY else WAY_M
+        low, high = read.limits.route_m if structure == LONG_WAY else WAY_M
         thirds = np.linspace(low, high, 4)[1:3]
         sizes = [
             ("short", "middle", "long")[int(np.digitize(s.route_line.length_m, thirds))]
@@ -442,11 +490,13 @@ def _duplicates(read: Read) -> Iterator[str]:
     groups = _by(whole, lambda s: f"{s.structure} {_ground(s)}")
     for those in groups.values():
         for a, b in itertools.combinations(those, 2):
-            starts, goals = (
-                math.dist(p, q) for p, q in ((a.start[:2], b.start[:2]), (a.goal, b.goal))
-            )
-            if starts < _APART_M and goals < _APART_M:
+            if on_one_spot(a, b):
                 yield f"{b.id}: is on the spot of {a.id}"
+
+
+def on_one_spot(a: Scenario, b: Scenario) -> bool:
+    """Return whether the starts and the goals of two scenarios of one place are near each other."""
+    return math.dist(a.start[:2], b.start[:2]) < _APART_M and math.dist(a.goal, b.goal) < _APART_M
 
 
 def _ground(scenario: Scenario) -> str:

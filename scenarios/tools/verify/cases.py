@@ -14,7 +14,7 @@ LASTS_S: Final = 10.0
 
 
 def verified_cases() -> tuple[Scenario, ...]:
-    """Return the first scenario of each structure, or kind of event, of each suite.
+    """Return the first scenario of each structure, or kind of event, of the first suite with it.
 
     Scenarios with events are preferred. Each is cut to its first 10 seconds.
 
@@ -25,6 +25,7 @@ def verified_cases() -> tuple[Scenario, ...]:
     for name in SUITES:
         scenarios = load_suite(name).scenarios
         wanted = [s for s in scenarios if s.events] or scenarios
-        first = {s.structure: s for s in reversed(wanted)}
-        cases += [s for s in wanted if first[s.structure] is s]
+        known = {case.structure for case in cases}
+        first = {s.structure: s for s in reversed(wanted) if s.structure not in known}
+        cases += [s for s in wanted if first.get(s.structure) is s]
     return tuple(msgspec.structs.replace(case, time_limit_s=LASTS_S) for case in cases)
