@@ -135,7 +135,7 @@ def _make(name: str, recipe: GeneratedScan) -> None:
         if _is_stored(name):
             return
         progress = _printing(name)
-        with temp_folder("scan-", maps_folder()) as folder:
+        with temp_folder(".source-", maps_folder()) as folder:
             source = folder / name
             make_scan(
                 recipe.city, recipe.box, source, spacing_m=recipe.spacing_m, progress=progress

@@ -50,7 +50,6 @@ _REAL_ROUTES: Final = {
 ALL_ROUTES_M: Final = 36_500.0
 SCANS_ROUTE_M: Final = (60.0, 150.0)
 """Shortest and longest route of `scans`, in metres."""
-_ROUTE_NUMBER: Final = 900
 _SCANS: Final[Mapping[str, tuple[int, int, int, float]]] = MappingProxyType(
     {
         "scan-5": (10, 8, 1, 145.0),
@@ -282,17 +281,14 @@ def _route_slots() -> list[Slot]:
 def _scan_slots() -> list[Slot]:
     """Return slots with short scenarios and a route on each scan."""
     found = []
-    for place_number, (name, (*counts, length_m)) in enumerate(_SCANS.items()):
+    for name, (*counts, length_m) in _SCANS.items():
         where = CityMap(map=name)
         for structure, count in zip(STRUCTURES, counts, strict=True):
-            found += [
-                _slot("scans", f"{structure}-{name}-{number:02d}", structure, where, number)
-                for number in range(count)
-            ]
-        number = _ROUTE_NUMBER + 17 * place_number
-        found.append(
-            _slot("scans", f"{LONG_WAY}-{name}", LONG_WAY, where, number, length_m=length_m)
-        )
+            for number in range(count):
+                called = f"{structure}-{name}-{number:02d}"
+                found.append(_slot("scans", called, structure, where, len(found)))
+        called = f"{LONG_WAY}-{name}"
+        found.append(_slot("scans", called, LONG_WAY, where, len(found), length_m=length_m))
     return found
 
 

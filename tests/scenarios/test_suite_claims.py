@@ -277,7 +277,7 @@ def broken() -> dict[str, tuple[str, Read, str]]:
         "all-val": (
             "val and test",
             all_of(unit, lambda s: replace(s, split="val")),
-            "is test, not a fifth",
+            "is test, not 20%",
         ),
         "test-where-val-is": ("val and test", one(unit, 0, split="test"), "where val is, too"),
         "no-net-hash": ("hashes", one(unit, 0, place=City(seed=1)), "has no hash"),

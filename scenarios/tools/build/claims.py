@@ -70,6 +70,7 @@ class Limits:
     all_routes_m: length of all long routes, None without a claim.
     signals_share: least share of long routes with signals.
     fewest_events: least number of events of each kind on long routes.
+    side_share: least share of events from either side.
     crossed: whether each long route has a crossing and a barrier.
     """
 
@@ -78,6 +79,7 @@ class Limits:
     all_routes_m: float | None = ALL_ROUTES_M
     signals_share: float = 0.25
     fewest_events: int = _FEWEST_EVENTS
+    side_share: float = 0.35
     crossed: bool = True
 
 
@@ -89,6 +91,7 @@ LIMITS: Final[Mapping[str, Limits]] = MappingProxyType(
             all_routes_m=None,
             signals_share=0.0,
             fewest_events=0,
+            side_share=0.0,
             crossed=False,
         )
     }
@@ -426,7 +429,7 @@ def _events(read: Read) -> Iterator[str]:
             "events from",
             [("left", "right")[e.side < 0] for _, e in events],
             ("left", "right"),
-            0.35,
+            read.limits.side_share,
         )
 
 
