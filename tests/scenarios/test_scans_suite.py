@@ -27,6 +27,7 @@ from scenarios.suites.catalog import SUITES, load_suite
 from scenarios.suites.proofs import read_proofs
 from scenarios.suites.recipes import LONG_WAY, RECIPES, SCANS_ROUTE_M
 from scenarios.tools.build.claims import CLAIMS, Read
+from scenarios.tools.build.place_claims import faults_in_places
 from sumo_nets.maps.map_store import map_hash, maps_folder
 from tests.support.flat_scans import store_flat, street_areas
 
@@ -117,10 +118,6 @@ def test_a_generated_scan_is_made_and_driven_on() -> None:
     scenario = load_suite("scans").scenarios[0]
     assert isinstance(scenario.place, CityMap)
     assert isinstance(SCAN_PLACES[scenario.place.map], GeneratedScan)
-    proofs = {proof.scenario: proof for proof in read_proofs(SUITES["scans"]).proofs}
-    straight, orca = (
-        run_episode(scenario, load_policy(name)).record for name in ("straight", "orca")
-    )
-    assert straight.status == "done"
-    assert orca.measures["success"] == 1.0
-    assert orca.state_hash == proofs[scenario.id].state_hash
+    proofs = read_proofs(SUITES["scans"])
+    assert list(faults_in_places([scenario], [scenario.id], proofs)) == []
+    assert run_episode(scenario, load_policy("straight")).record.status == "done"
