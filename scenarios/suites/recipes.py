@@ -280,7 +280,7 @@ def _route_slots() -> list[Slot]:
 
 def _scan_slots() -> list[Slot]:
     """Return slots with short scenarios and a route on each scan."""
-    found = []
+    found: list[Slot] = []
     for name, (*counts, length_m) in _SCANS.items():
         where = CityMap(map=name)
         for structure, count in zip(STRUCTURES, counts, strict=True):
