@@ -21,7 +21,7 @@ from cosim.cli.options import (
 )
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, listed, unknown
-from cosim.spec.run_config import help_of
+from cosim.spec.run_config import Appearance, help_of
 
 if TYPE_CHECKING:
     from scenarios.tools.viewing.look import Viewpoint
@@ -111,7 +111,10 @@ def film(
     ] = "follow",
     speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
     camera: Camera = "auto",
-    appearance: Appears = "splats",
+    appearance: Annotated[
+        Appearance | None,
+        typer.Option("--appearance", help="Look of a scanned place. Default: the run's."),
+    ] = None,
 ) -> None:
     """Film an episode of a run from behind or above, with camera picture, map and failures."""
     from scenarios.tools.viewing.film import Cut, failure_to_film, make_film

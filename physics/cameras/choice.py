@@ -14,6 +14,9 @@ from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Light
 from physics.cameras.gl import context
 
+_MESH = ", mesh"
+"""End of a renderer's name with the mesh's look of scanned places."""
+
 if TYPE_CHECKING:
     from physics.cameras.bullet_camera import BulletCamera
     from physics.cameras.gl.camera import GlCamera
@@ -40,8 +43,13 @@ def renderer_of(name: CameraName, appearance: Appearance = "splats") -> str:
     Pictures have the same bits on the same renderer only.
     """
     if name == "gl":
-        return context.renderer() + (", mesh" if appearance == "mesh" else "")
+        return context.renderer() + (_MESH if appearance == "mesh" else "")
     return {"bullet": "bullet-tiny", "bullet-egl": "bullet-egl"}[name]
+
+
+def appearance_of(renderer: str) -> Appearance:
+    """Return the appearance of scanned places in pictures, by the renderer's name in a record."""
+    return "mesh" if renderer.endswith(_MESH) else "splats"
 
 
 def camera_of(

@@ -128,10 +128,11 @@ class BulletScene:
         x0, y0, x1, y1 = tile_bounds(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
         chunk, posts = self._surface.chunk(key), self._surface.posts(key)
-        parts = posterized(self._surface.scanned(key)) or [
-            (patch.mesh, patch.colour, patch.label)
-            for patch in (*chunk.ground, *self._surface.covers(key))
-        ]
+        if self._surface.scan is not None:
+            parts = posterized(self._surface.scanned(key))
+        else:
+            patches = (*chunk.ground, *self._surface.covers(key))
+            parts = [(patch.mesh, patch.colour, patch.label) for patch in patches]
         for facade, mesh in facade_meshes(chunk.buildings).items():
             parts.append((mesh, WINDOW_COLOUR if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)

@@ -368,7 +368,8 @@ def _ground_bias(sample: Splats, heights: HeightGrid) -> list[Finding]:
     if np.count_nonzero(near) < 100:
         return []
     bias = float(np.median(above[near]))
-    words = f"ground splats are {bias:+.3f} m over the mesh's ground (median)"
+    side = "over" if bias >= 0.0 else "below"
+    words = f"ground splats are {abs(bias):.3f} m {side} the mesh's ground (median)"
     if abs(bias) <= GROUND_BIAS_M:
         return [note(words)]
     return [

@@ -169,8 +169,15 @@ def street_areas(surface: StreetSurface, box: Box) -> list[ScanArea]:
         shape = overlay.intersection(overlay.union_all(shapes), inside)
         if kind not in ("crossing", "obstacle"):
             shape, taken = overlay.difference(shape, taken), overlay.union_all([taken, shape])
-        areas += [ScanArea(kind, part) for part in _polygons(shape)]
+        areas += [ScanArea(kind, part) for part in _polygons(_without_slivers(shape))]
     return areas
+
+
+def _without_slivers(shape: shapely.Geometry) -> shapely.Geometry:
+    """Return a shape in whole millimetres, without parts and holes narrower than 4 cm."""
+    smaller = shapely.buffer(shape, -0.02, join_style="mitre")
+    larger = shapely.buffer(smaller, 0.04, join_style="mitre")
+    return shapely.set_precision(shapely.buffer(larger, -0.02, join_style="mitre"), 1e-3)
 
 
 def sample_splats(pieces: Sequence[_Piece], sky: Sky, seed: int, spacing_m: float) -> SurfaceSplats:

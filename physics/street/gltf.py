@@ -79,7 +79,8 @@ class _Parts:
         scanned = posterized(surface.scanned(key))
         for mesh, colour, label in scanned:
             self.add("surfaces", label, mesh, colour)
-        for patch in () if scanned else (*chunk.ground, *finish.laid, *finish.painted):
+        ground = (*chunk.ground, *finish.laid, *finish.painted) if surface.scan is None else ()
+        for patch in ground:
             self.add("surfaces", patch.name, patch.mesh, self._mean_colour(patch))
         for facade, mesh in facade_meshes(chunk.buildings).items():
             name, colour = ("windows", WINDOW_COLOUR) if facade < 0 else ("walls", FACADES[facade])

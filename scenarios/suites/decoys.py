@@ -1,13 +1,17 @@
-"""Decoys of reactive scenarios, and the limits that follow from the proofs of the expert."""
+"""Decoys of reactive scenarios, where their people stay, and limits by the proofs of the expert."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Final
 
 import msgspec
+import shapely
 
+from cosim.core.state import PERSON_RADIUS_M
 from cosim.spec.events import EventKinds
+from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 from scenarios.events import EVENT_KINDS
 
@@ -56,6 +60,19 @@ def differing_fields(scenario: Scenario, decoy: Scenario) -> list[str]:
     return [
         name for name in decoy.__struct_fields__ if getattr(decoy, name) != getattr(should, name)
     ]
+
+
+def people_in_obstacles(scenario: Scenario, kinds: EventKinds = EVENT_KINDS) -> Iterator[str]:
+    """Yield the people of a short scenario who may stay inside an obstacle after the trigger."""
+    if not scenario.ends_on_failure or not scenario.obstacles:
+        return
+    obstacles = shapely.union_all([footprint(one) for one in scenario.obstacles])
+    for event in scenario.events:
+        for number in range(event.people):
+            places = kinds[event.kind].stays_of(event, number)
+            inside_m = PERSON_RADIUS_M - obstacles.distance(shapely.MultiPoint(places).convex_hull)
+            if places and inside_m > 0.0:
+                yield f"person '{event.names[number]}' stays {inside_m:.2f} m inside an obstacle"
 
 
 def time_limit_s(scenario: Scenario, expert_s: float) -> float:

@@ -6,6 +6,7 @@ import dataclasses
 import gzip
 import hashlib
 import re
+import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import cache
@@ -213,6 +214,22 @@ def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
         check_map(street_map, None, read_facts(map_net(name)), about.guessed_share),
         about,
     )
+
+
+def delete_map(name: str) -> Path:
+    """Delete an imported map, and return its former folder.
+
+    Raises UsageError for a map that is not imported, MachineError if it cannot be deleted.
+    """
+    folder = maps_folder() / name
+    imported = sorted(one.name for one in known_maps().values() if one.origin == "imported")
+    if name not in imported:
+        raise unknown("imported map", name, imported)
+    try:
+        shutil.rmtree(folder)
+    except OSError as error:
+        raise unwritable(folder, error) from error
+    return folder
 
 
 def known_maps() -> dict[str, KnownMap]:

@@ -13,6 +13,7 @@ from cosim.core.state import LABELS, Command, Street
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, ScanMesh
 from cosim.spec.camera import CameraSpec
 from physics.cameras.bullet_camera import BulletCamera
+from physics.cameras.choice import appearance_of, renderer_of
 from physics.cameras.gl.camera import GlCamera
 from physics.dynamics.world import BulletWorld
 from physics.ground.tiles import tiles_touching
@@ -24,8 +25,11 @@ WALL_X_M = 8.0
 SIZE_M = 24.0
 
 
-def sloped_scan(*, hole: bool = False, kind: str = "sidewalk") -> Scan:
-    """A scanned slope with a wall across it, in two colours; its middle may be missing."""
+def sloped_scan(*, hole: bool = False, kind: str = "sidewalk", grid_m: float = SIZE_M) -> Scan:
+    """A scanned slope with a wall across it, in two colours; its middle may be missing.
+
+    grid_m: half the side of the height grid, which may be larger than the mesh.
+    """
     at = np.arange(-SIZE_M, SIZE_M + 0.1, 1.0)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
     ground = np.column_stack([x, y, GRADE * x])
@@ -45,7 +49,7 @@ def sloped_scan(*, hole: bool = False, kind: str = "sidewalk") -> Scan:
         ]
     ).astype(np.int32)
     colours = np.concatenate([np.full((len(ground), 3), 120), np.tile((200, 60, 40), (4, 1))])
-    lattice = np.arange(-SIZE_M, SIZE_M + 0.1, 0.25)
+    lattice = np.arange(-grid_m, grid_m + 0.1, 0.25)
     heights = np.tile(GRADE * lattice, (len(lattice), 1)).astype(np.float32)
     near = np.abs(lattice) <= 2.0
     measured = ~(near[:, None] & near) if hole else np.ones(heights.shape, dtype=bool)
@@ -55,7 +59,7 @@ def sloped_scan(*, hole: bool = False, kind: str = "sidewalk") -> Scan:
         scale=1.0,
         up="+z",
         transform=tuple(tuple(map(float, row)) for row in np.eye(4)),
-        mesh_hash=f"slope-{hole}",
+        mesh_hash=f"slope-{hole}-{grid_m}",
         areas_hash=kind,
     )
     return Scan(
@@ -66,7 +70,7 @@ def sloped_scan(*, hole: bool = False, kind: str = "sidewalk") -> Scan:
             colours.astype(np.uint8),
             np.zeros(len(triangles), dtype=np.uint8),
         ),
-        HeightGrid(np.full(2, -SIZE_M), 0.25, heights, measured, ~measured),
+        HeightGrid(np.full(2, -grid_m), 0.25, heights, measured, ~measured),
         (ScanArea(kind, shapely.box(-16.0, -3.0, 16.0, 3.0)),),
     )
 
@@ -134,6 +138,27 @@ def test_cameras_see_the_scan(hole: bool) -> None:
     same = frames[0].labels == frames[1].labels
     assert same.mean() > 0.97
     assert np.abs(frames[0].rgb[90, 48].astype(int) - 120).max() < 12
+
+
+def test_nothing_is_drawn_around_a_scan() -> None:
+    """Where the scan ends, both cameras see nothing, and no ground of the height grid."""
+    spec = CameraSpec(width=96, height=96)
+    with BulletWorld(surface_of(sloped_scan(grid_m=80.0))) as world:
+        robot = world.place(Pose(-SIZE_M + 0.5, 0.0, math.pi))
+        with (
+            GlCamera(world, spec, depth=True) as gl,
+            BulletCamera(world, spec, depth=True) as bullet,
+        ):
+            for frame in (gl.render(robot, Street(0)), bullet.render(robot, Street(0))):
+                assert frame.depth is not None
+                assert frame.depth[40:].min() > 100.0
+
+
+def test_a_renderer_names_the_look_of_scans() -> None:
+    """Films and reports of a run show the look that its record names."""
+    for appearance in ("splats", "mesh"):
+        assert appearance_of(renderer_of("gl", appearance)) == appearance
+    assert appearance_of(renderer_of("bullet")) == appearance_of("none") == "splats"
 
 
 def test_the_tiles_of_a_scan_depend_on_the_scan_alone() -> None:

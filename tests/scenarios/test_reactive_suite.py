@@ -17,9 +17,9 @@ from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Pose
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.schedule.cheats import CHEATS
-from cosim.spec.obstacle import footprint
+from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.robot import COURIER, SCOUT
-from cosim.spec.scenario import City, Scenario, read_suite
+from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.catalog import SUITES, load_suite
@@ -27,12 +27,13 @@ from scenarios.suites.decoys import DECOY, decoy_of, differing_fields, limited
 from scenarios.suites.gate_fences import drawn_gate
 from scenarios.suites.lanes import ENDS_M, free_lanes
 from scenarios.suites.obstacles import prove_gap
-from scenarios.suites.proofs import read_proofs
+from scenarios.suites.proofs import Dropped, read_proofs
 from scenarios.suites.reactive import Wanted, build_reactive, event_share
 from scenarios.suites.recipes import RECIPES, recipe_of
 from scenarios.tools.build.build_suite import build_suite
 from scenarios.tools.build.claims import CLAIMS, Read
 from scenarios.tools.build.place_claims import common_ways, faults_in_places, straight_lanes
+from scenarios.tools.build.proving import accepted
 from scenarios.tools.exploit import measure
 from scenarios.tools.exploit.evaluate import drive
 from tests.conftest import Cosim
@@ -128,6 +129,21 @@ def test_a_decoy_equals_its_scenario_but_for_the_response(kind: str) -> None:
     assert other.free_side == (-event.free_side if mirrored else event.free_side)
     assert differing_fields(scenario, limited(decoy, 9.0, 1.0)) == []
     assert differing_fields(scenario, replace(decoy, seed=9, obstacles=())) == ["seed", "obstacles"]
+
+
+def test_a_decoy_with_a_person_inside_an_obstacle_is_refused() -> None:
+    """Before the expert drives; the claim finds the person, too, in the decoy alone."""
+    event = drawn("ped_crossing")
+    decoy = decoy_of(event)
+    ((x_m, y_m),) = EVENT_KINDS["ped_crossing"].stays_of(decoy.events[0], 0)
+    thing = Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)
+    event, decoy = (replace(one, obstacles=(*one.obstacles, thing)) for one in (event, decoy))
+    refused = accepted(decoy)
+    assert isinstance(refused, Dropped)
+    words = "person 'e0' stays 0.30 m inside an obstacle"
+    assert (refused.reason, refused.details) == ("person inside an obstacle", words)
+    suite = Suite(name="reactive", version="1", scenarios=(event, decoy))
+    assert list(CLAIMS["people"](Read(suite, None))) == [f"{decoy.id}: {words}"]
 
 
 def test_limits_follow_from_the_experts_time_and_the_robots_speed() -> None:

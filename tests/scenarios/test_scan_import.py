@@ -22,6 +22,7 @@ from cosim.cli.scan import ScanChoices
 from cosim.core.errors import CosimError
 from cosim.core.state import LABELS
 from cosim.place.scan import ScanArea, encode_areas, read_scan
+from cosim.place.scan_areas import read_way
 from cosim.spec.scenario import City
 from physics.scans.check import lattice_points
 from physics.scans.clean import above_ground, walkable_area
@@ -274,7 +275,7 @@ BAD: dict[str, tuple[Spoil, str]] = {
     "above": (_cloud(_move((0.0, 0.0, 0.5))), r"lie 0\.[45] m beside the mesh"),
     "slightly-above": (
         _cloud(_move((0.0, 0.0, 0.07))),
-        r"warning: ground splats are \+0\.070 m over the mesh's ground",
+        r"warning: ground splats are 0\.070 m over the mesh's ground",
     ),
     "other-scale": (_cloud(_move((0.0, 0.0, 0.0), 10.0)), "splats.*give --splat-scale"),
     "splat-up": (
@@ -537,9 +538,12 @@ def test_a_street_in_lund_is_imported(tmp_path: Path) -> None:
 
 
 def test_the_documented_options_are_those_of_the_import(tmp_path: Path) -> None:
-    """The scan.json of the page is read, and its table names every key and option."""
-    (block,) = blocks("json", "docs/scans.md")
-    (tmp_path / "scan.json").write_text(block.text)
+    """The scan.json and the path of the page are read, and its table names every key and
+    option."""
+    options, path = blocks("json", "docs/scans.md")
+    (tmp_path / "scan.json").write_text(options.text)
+    (tmp_path / "walk.geojson").write_text(path.text)
+    assert read_way(tmp_path / "walk.geojson", None).tolist() == [[-12, 3], [-22, 9]]
     assert read_options(tmp_path, {}).splat_up == "+z"
     text = text_of("docs/scans.md")
     for name in ScanOptions.__struct_fields__:

@@ -416,6 +416,11 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             one(reactive, overtaken, go_on_mps=0.0),
             "need not give way",
         ),
+        "a-person-inside-an-obstacle": (
+            "people",
+            one(reactive, 1, obstacles=(replace(BIN, y_m=-1.0), replace(BIN, y_m=1.0))),
+            "stays 0.30 m inside an obstacle",
+        ),
         "another-speed-than-the-decoys": (
             "exclusive",
             one(reactive, overtaken, go_on_mps=0.9),

@@ -289,7 +289,7 @@ class GlScene:
             self._surface.posts(key),
         )
         scanned = self._surface.scanned(key)
-        ground = () if scanned else (*finish.laid, *chunk.ground)
+        ground = (*finish.laid, *chunk.ground) if self._surface.scan is None else ()
         layers = {
             "scan": scan_rows(scanned, middle),
             "ground": ground_rows(self._surfaces, ground, middle),

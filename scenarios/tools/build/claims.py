@@ -26,6 +26,7 @@ from scenarios.suites.decoys import (
     has_decoy,
     least_pace_mps,
     must_give_way,
+    people_in_obstacles,
     time_limit_s,
 )
 from scenarios.suites.exploits import ALL, Exploit, Share, kind_of
@@ -319,6 +320,12 @@ def _decoys(read: Read) -> Iterator[str]:
     yield from (f"{those[0].id}: is the decoy of no scenario" for those in decoys.values())
 
 
+def _people(read: Read) -> Iterator[str]:
+    """Check that people of reactive scenarios and decoys stay at places without obstacles."""
+    for one in read.suite.scenarios:
+        yield from (f"{one.id}: {words}" for words in people_in_obstacles(one))
+
+
 def _exclusive(read: Read) -> Iterator[str]:
     """Check that no motion solves both an event in which the robot must give way and its decoy.
 
@@ -570,6 +577,7 @@ CLAIMS: Final[Mapping[str, Callable[[Read], Iterator[str]]]] = MappingProxyType(
         "sides": _sides,
         "obstacles": _obstacles,
         "decoys": _decoys,
+        "people": _people,
         "exclusive": _exclusive,
         "limits": _limits,
         "spread": _spread,

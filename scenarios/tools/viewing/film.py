@@ -76,7 +76,7 @@ class Cut(NamedTuple):
     speed: factor of real time.
     camera: renderer.
     view: viewpoint.
-    appearance: of scanned places.
+    appearance: of scanned places, by default that of the run.
     """
 
     from_s: float = 0.0
@@ -85,7 +85,7 @@ class Cut(NamedTuple):
     speed: int = 1
     camera: CameraChoice = "auto"
     view: Viewpoint = "follow"
-    appearance: Appearance = "splats"
+    appearance: Appearance | None = None
 
 
 class FilmedFailure(NamedTuple):
