@@ -81,11 +81,12 @@ class BrakingForRobot:
         robot: its pose; None without a robot.
         """
         slow: set[str] = set()
-        for row in () if robot is None else _approaching(near, robot):
-            name = near.names[row]
-            way_m = self._free_m(name, near, row, robot)
-            if way_m is not None and self._hold(name, float(near.mps[row]), way_m):
-                slow.add(name)
+        if robot is not None:
+            for row in _approaching(near, robot):
+                name = near.names[row]
+                way_m = self._free_m(name, near, row, robot)
+                if way_m is not None and self._hold(name, float(near.mps[row]), way_m):
+                    slow.add(name)
         for name in sorted(self._held - slow):
             if name in near.names:
                 self._engine.vehicle.setSpeed(name, -1.0)
@@ -142,7 +143,8 @@ class BrakingForRobot:
         lane_m = self._engine.lane.getLength(path.lane)
         shape_m = float(_length_m(self._lines[path.lane]))
         at_m = vehicle.getLanePosition(name) * shape_m / max(lane_m, 1e-6)
-        s_m, _ = line.project(*front.tolist(), (at_m - _ROUND_M, at_m + _ROUND_M))
+        x_m, y_m = front.tolist()
+        s_m, _ = line.project(x_m, y_m, (at_m - _ROUND_M, at_m + _ROUND_M))
         points = np.concatenate([[back, front], line.points[line.s_m > s_m + 1e-6]])
         steps = np.hypot(*np.diff(points, axis=0).T)
         along = np.concatenate([[0.0], np.cumsum(steps)])

@@ -6,12 +6,11 @@ held up or in a crowd. With wide gaps, people in crowds could not step aside, an
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
 
-from cosim.core.geometry import headings_from_sumo
+from cosim.core.geometry import Floats, headings_from_sumo
 from sumo_nets.crowd.separation import pairs_within
 from sumo_nets.engine import NearPersons, Sumo
 
@@ -59,21 +58,34 @@ class FollowingGaps:
         shares = np.where(
             others >= CROWDED, _IN_CROWD, np.where(near.mps < HELD_UP_MPS, _HELD_UP, 1.0)
         )
+        waiting = []
         for row, (name, share) in enumerate(zip(near.names, shares.tolist(), strict=True)):
             now = self._share.get(name, 1.0)
-            if share == now or name not in self._gaps_m:
-                continue
-            gap_m = CLOSEST_M + share * (self._gaps_m[name] - CLOSEST_M)
-            if share < now or self._has_room(near, row, gap_m):
-                self._share[name] = share
-                self._engine.person.setMinGap(name, gap_m)
+            if share < now and name in self._gaps_m:
+                self._set(name, share)
+            elif share > now:
+                waiting.append(row)
+        for row in self._with_room(near, waiting, shares):
+            self._set(near.names[row], float(shares[row]))
 
-    def _has_room(self, near: NearPersons, row: int, gap_m: float) -> bool:
-        """Return whether nobody is within a gap ahead of a person."""
-        heading = float(headings_from_sumo(self._engine.person.getAngle(near.names[row])))
-        cos, sin = math.cos(heading), math.sin(heading)
-        offset = near.xy - near.xy[row]
-        ahead = cos * offset[:, 0] + sin * offset[:, 1]
-        aside = np.abs(cos * offset[:, 1] - sin * offset[:, 0])
-        need_m = _LENGTH_M + gap_m + _SPARE_M
-        return not bool(((ahead > 1e-6) & (ahead < need_m) & (aside < _ASIDE_M)).any())
+    def _set(self, name: str, share: float) -> None:
+        self._share[name] = share
+        self._engine.person.setMinGap(name, self._gap_m(name, share))
+
+    def _gap_m(self, name: str, share: float) -> float:
+        return CLOSEST_M + share * (self._gaps_m[name] - CLOSEST_M)
+
+    def _with_room(self, near: NearPersons, rows: list[int], shares: Floats) -> list[int]:
+        """Return those rows that have nobody within the gap that they want to take up."""
+        if not rows:
+            return []
+        names = [near.names[row] for row in rows]
+        heading = headings_from_sumo([self._engine.person.getAngle(name) for name in names])
+        cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+        dx, dy = (near.xy[None] - near.xy[rows][:, None]).transpose(2, 0, 1)
+        ahead = cos * dx + sin * dy
+        aside = np.abs(cos * dy - sin * dx)
+        gaps_m = [self._gap_m(near.names[row], float(shares[row])) for row in rows]
+        need_m = _LENGTH_M + np.array(gaps_m)[:, None] + _SPARE_M
+        taken = (ahead > 1e-6) & (ahead < need_m) & (aside < _ASIDE_M)
+        return [row for row, full in zip(rows, taken.any(axis=1).tolist(), strict=True) if not full]

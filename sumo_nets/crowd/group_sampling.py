@@ -82,7 +82,9 @@ class PersonGroup(NamedTuple):
 
     def gaps_m(self, rng: np.random.Generator) -> list[float]:
         """Draw the gap of each member to people ahead, metres."""
-        return rng.uniform(*(GAP_M if self.size == 1 else GROUP_GAP_M), self.size).tolist()
+        low_m, high_m = GAP_M if self.size == 1 else GROUP_GAP_M
+        gaps_m: list[float] = rng.uniform(low_m, high_m, self.size).tolist()
+        return gaps_m
 
 
 class GroupDraws:
