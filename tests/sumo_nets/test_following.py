@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import heading_to_sumo
-from scenarios.tools.bench.people import (
-    FOLLOWING_BIN_M,
-    FOLLOWING_M,
-    Flow,
-    following_m,
-    on_ground,
-    walk_round,
-)
+from scenarios.tools.bench.people import FOLLOWED, follow, largest_share
 from sumo_nets.crowd.following_gaps import CROWDED, FollowingGaps
 from sumo_nets.engine import NearPersons
 
@@ -55,9 +48,6 @@ def test_a_person_stands_closer_where_it_is_held_up_and_then_takes_up_its_gap_ag
 def test_people_follow_each_other_at_many_distances() -> None:
     """On one-way sidewalks the distances have no spike, a mean of 0.9 to 1.4 m, and nobody is
     nearer than 0.45 m."""
-    ring, tracks = walk_round(Flow(0.2, both_ways=False), seconds=20.0, seed=0, settle_s=15.0)
-    apart_m = following_m(tracks)[on_ground(tracks, ring.straights())]
-    near_m = apart_m[apart_m < FOLLOWING_M]
-    counts, _ = np.histogram(near_m, np.arange(0.0, FOLLOWING_M, FOLLOWING_BIN_M))
-    assert len(near_m) > 1000 and counts.max() < 0.15 * len(near_m)
+    near_m = follow(FOLLOWED, seconds=20.0, seed=0, settle_s=15.0)
+    assert len(near_m) > 1000 and largest_share(near_m) < 0.15
     assert 0.9 < near_m.mean() < 1.4 and near_m.std() > 0.25 and near_m.min() > 0.45

@@ -591,6 +591,8 @@ def _over_the_street(street: OpenCrosswalk, seconds: float, seed: int) -> Entran
 
 
 _FREE: Final = Flow(0.05, both_ways=False)
+FOLLOWED: Final = Flow(0.2, both_ways=False)
+"""Ring on which the distances of people that follow each other are measured."""
 
 
 class Nearest(NamedTuple):
@@ -605,13 +607,15 @@ class Comparison(NamedTuple):
 
     by_density: for each interval of DENSITY_EDGES the speed, m/s, and the person-seconds of it, one
     way and both ways. free_mps: the speed of each person walking alone. nearest: of each loose
-    ring. person_first_s, vehicle_first_s: post-encroachment times. vehicles, people: how many came
+    ring. following_m: distances (K,) to the nearest person ahead, below FOLLOWING_M, on FOLLOWED.
+    person_first_s, vehicle_first_s: post-encroachment times. vehicles, people: how many came
     to the crossing.
     """
 
     by_density: tuple[list[tuple[MeanSd, float]], list[tuple[MeanSd, float]]]
     free_mps: Floats
     nearest: list[Nearest]
+    following_m: Floats
     person_first_s: Floats
     vehicle_first_s: Floats
     people: int
@@ -630,11 +634,13 @@ def watch_people(jobs: int, progress: Progress) -> Comparison:
         walking = [pool.apply_async(_density_speed, (flow, _WALK_S, 0)) for flow in dense]
         near = [pool.apply_async(_nearest, (flow, _WALK_S, 0)) for flow in loose]
         free = [pool.apply_async(_free_mps, (_FREE, _WALK_S, seed)) for seed in range(_FREE_SEEDS)]
+        following = pool.apply_async(follow, (FOLLOWED, _WALK_S, 0))
         found = []
         for k, one in enumerate(tasks := [*walking, *near, *free]):
             progress(f"watching people: street {k + 1} of {len(tasks)}")
             found.append(one.get())
         person_first_s, vehicle_first_s, people, vehicles = crossing.get()
+        behind_m = following.get()
     one_way = found[: len(DENSITIES)]
     both_ways = found[len(DENSITIES) : len(dense)]
     nearest = found[len(dense) :]
@@ -642,6 +648,7 @@ def watch_people(jobs: int, progress: Progress) -> Comparison:
         (_binned(one_way), _binned(both_ways)),
         np.concatenate(nearest[len(loose) :]),
         [Nearest(flow, apart_m) for flow, apart_m in zip(loose, nearest, strict=False)],
+        behind_m,
         person_first_s,
         vehicle_first_s,
         people,
@@ -668,6 +675,19 @@ def _density_speed(flow: Flow, seconds: float, seed: int) -> Floats:
 def _nearest(flow: Flow, seconds: float, seed: int) -> Floats:
     ring, tracks = walk_round(flow, seconds, seed)
     return nearest_m(tracks)[on_ground(tracks, ring.straights())]
+
+
+def follow(flow: Flow, seconds: float, seed: int, settle_s: float = _SETTLE_S) -> Floats:
+    """Return (K,) the distances below FOLLOWING_M to people ahead on straight sidewalks, metres."""
+    ring, tracks = walk_round(flow, seconds, seed, settle_s)
+    apart_m = following_m(tracks)[on_ground(tracks, ring.straights())]
+    return apart_m[apart_m < FOLLOWING_M]
+
+
+def largest_share(near_m: Floats) -> float:
+    """Return the share of distances in their most frequent interval of FOLLOWING_BIN_M."""
+    counts, _ = np.histogram(near_m, np.arange(0.0, FOLLOWING_M, FOLLOWING_BIN_M))
+    return float(counts.max() / len(near_m))
 
 
 def _free_mps(flow: Flow, seconds: float, seed: int) -> Floats:
