@@ -213,7 +213,7 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
         out.print("; ".join(terms), highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
-    if "renderer" in table and any(map(draws_mesh, table["renderer"].dropna())):
+    if "renderer" in table and any(map(draws_mesh, table["renderer"].dropna().astype(str))):
         out.print("scanned places are drawn by their mesh", highlight=False, markup=False)
     if words := injections_in_words(table):
         out.print(f"+ {words}", soft_wrap=True, highlight=False, markup=False)
