@@ -3,6 +3,8 @@
 
 PYTHON ?= python3.11
 JOBS ?= 2
+# Tests often wait for other processes: three of pytest keep two cores busy.
+WORKERS ?= 3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
@@ -10,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 help:
 	@echo "make run    run two long-horizon episodes and print their table"
-	@echo "make test   run every test, the fast ones first"
+	@echo "make test   run every test, the longest first; the fast ones alone: pytest -m 'not engine'"
 	@echo "make check  ruff, mypy, import-linter"
 	@echo "make docs   the documentation as a site in build/docs, every warning an error"
 	@echo "make bench  speed and memory, with ratios"
@@ -21,8 +23,7 @@ run: .venv/run.stamp | machine
 	@$(BIN)/cosim run long-horizon --policy orca --episodes 2 --jobs $(JOBS)
 
 test: .venv/dev.stamp | machine
-	@$(BIN)/python -m pytest -m "not engine" -n $(JOBS) --dist loadfile
-	@$(BIN)/python -m pytest -m engine -n $(JOBS) --dist loadfile
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 check: .venv/dev.stamp | machine
 	@$(BIN)/ruff check .

@@ -41,6 +41,25 @@ settings.register_profile(
 settings.load_profile("tests")
 
 
+LONGEST = (
+    "scenarios/test_hostile.py",
+    "cli/test_cli.py",
+    "scenarios/test_chaos.py",
+    "report/test_page_in_chromium.py",
+    "policies/test_orca_policy.py",
+    "sumo_nets/test_importer.py",
+    "scenarios/test_collect.py",
+    "scenarios/test_setup.py",
+    "scenarios/test_remote.py",
+    "sumo_nets/test_crossings.py",
+    "scenarios/test_cheats.py",
+    "sumo_nets/test_crowd.py",
+    "scenarios/test_verify.py",
+    "scenarios/test_exploit.py",
+)
+"""Files of engine tests that take longest. They are the first of these, so that no worker of
+pytest-xdist is left alone with one of them in the end."""
+
 COLLECTED = pytest.StashKey[list[str]]()
 """The ids of all tests of a session, those that it leaves out included."""
 
@@ -48,6 +67,9 @@ COLLECTED = pytest.StashKey[list[str]]()
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     config.stash[COLLECTED] = [item.nodeid for item in items]
+    slow = {item.path for item in items if item.get_closest_marker("engine")}
+    rank = {ROOT / "tests" / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: (item.path in slow, rank.get(item.path, len(rank))))
 
 
 def still_runs(pid: int) -> bool:
@@ -161,7 +183,9 @@ def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
         os.chdir(before[0])
         sys.argv = before[1]
         sys.path[:] = before[2]
-        for name in {*sys.modules} - before[3]:
+        # Modules of the project and of its environment stay, also where the folder is the project's.
+        others = () if folder == ROOT else {*sys.modules} - before[3]
+        for name in others:
             source = getattr(sys.modules[name], "__file__", None)
             if source and Path(source).is_relative_to(folder):
                 del sys.modules[name]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import COLLECTED, PATIENCE_S
+from tests.conftest import COLLECTED, LONGEST, PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
 COLLECT = (
@@ -68,6 +68,11 @@ def test_two_processes_collect_the_same_tests(
 def test_every_id_can_be_read(elsewhere: list[str]) -> None:
     """No id is made of bytes or of a whole message: it can be typed, and stands in one line."""
     assert [test_id for test_id in elsewhere if unreadable(test_id)] == []
+
+
+def test_the_longest_files_are_files_with_tests() -> None:
+    """A file that was renamed would lose its place at the beginning."""
+    assert [name for name in LONGEST if not (ROOT / "tests" / name).exists()] == []
 
 
 def test_no_test_waits_for_a_time_of_its_own() -> None:

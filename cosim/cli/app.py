@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from typing import Annotated, NoReturn
+from functools import cache
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.markup import escape
@@ -25,6 +26,7 @@ from cosim.cli.places import city_app, map_app
 from cosim.cli.policy import policy_app
 from cosim.cli.results import compare_app, merge_app, report_app, score_app, show_app
 from cosim.cli.run import run_app
+from cosim.cli.scan import scan_app
 from cosim.cli.scenario import scenario_app
 from cosim.cli.suites import list_app, suite_app
 from cosim.cli.train import train_app
@@ -58,6 +60,7 @@ app.add_typer(scenario_app, name="scenario", rich_help_panel=MEASURE)
 app.add_typer(policy_app, name="policy", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)
 app.add_typer(map_app, name="map", rich_help_panel=PLACES)
+app.add_typer(scan_app, name="scan", rich_help_panel=PLACES)
 
 
 def _print_versions(requested: bool) -> None:
@@ -90,13 +93,19 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with guarded_streams():
         try:
-            with_paths_checked(typer.main.get_command(app))()
+            _command()()
         except CosimError as error:
             _end(error)
         except OSError as error:
             if error.filename is None:
                 raise
             _end(file_error(error))
+
+
+@cache
+def _command() -> Any:
+    """Return the Typer command with all subcommands, built once."""
+    return with_paths_checked(typer.main.get_command(app))
 
 
 def _end(error: CosimError) -> NoReturn:

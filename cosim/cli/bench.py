@@ -307,7 +307,8 @@ def bench(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="For `environment` and `camera`: this measurement alone; repeatable.",
+            help="For `environment` and `camera`: this measurement alone; for `exploit --cheats`: "
+            "this cheat alone; repeatable.",
         ),
     ] = None,
     compare: Annotated[
@@ -352,16 +353,18 @@ def bench(
     objective: Annotated[
         str,
         typer.Option(
-            metavar="sr|d", help="For `exploit`: maximize success, or pairs of event and decoy."
+            metavar="sr,d",
+            help="For `exploit`: maximize success, pairs of event and decoy, or each in turn.",
         ),
     ] = "sr",
     seed: Annotated[int, typer.Option(min=0, help="For `exploit`: seed of the search.")] = 0,
     goal: Annotated[
-        str | None,
+        str,
         typer.Option(
-            help="For `exploit`: goal protocol; default: final_point, and for cheats their own."
+            metavar="GOAL,...",
+            help="For `exploit`: goal protocols; default: final_point, and for cheats their own.",
         ),
-    ] = None,
+    ] = "",
     folder: Annotated[
         Path | None,
         typer.Option(
@@ -395,11 +398,13 @@ def bench(
         bench_people(jobs)
         return
     if what == "exploit":
-        named = [kind for kind in kinds.split(",") if kind]
+        named, sought, goals = (
+            [name for name in names.split(",") if name] for names in (kinds, objective, goal)
+        )
         if cheats:
-            bench_cheats(suite, named, jobs, folder, goal)
+            bench_cheats(suite, named, jobs, folder, goals, only or ())
         else:
-            bench_exploit(suite, named, evaluations, jobs, folder, objective, seed, goal, write)
+            bench_exploit(suite, named, evaluations, jobs, folder, sought, seed, goals, write)
         return
     only = only or []
     if compare is not None:

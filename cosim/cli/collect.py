@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cosim.cli.console import err, out, say
-from cosim.cli.generated_options import Fields, configured
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import LEARN, camera_here, check_output, parse_size, replacement_note
 from cosim.cli.progress import doing, stages_in_lines
 from cosim.cli.run_progress import ProgressDisplay
@@ -48,10 +48,14 @@ _OF_COLLECT = Fields(
         "no_decoys",
         "map",
         "policy",
+        "isolated",
+        "policy_data",
+        "policy_memory",
         "robot",
         "goal",
         "seed",
         "camera",
+        "appearance",
         "own_camera",
         "jobs",
         "resume",
@@ -148,6 +152,7 @@ class DemoConfig:
 
 @collect_app.command(
     "collect",
+    cls=ConfiguredCommand,
     rich_help_panel=LEARN,
     epilog="Examples:  \n`cosim collect reactive --cities 900:940 --event gesturing --episodes "
     "500 --jobs 2 --out demos/gesturing`  \n`cosim collect unit --cities 900:980 --episodes 1000 "
@@ -167,19 +172,19 @@ def collect_command(
     Only solved episodes are stored. The bytes are the same for any --jobs. A stopped collection
     continues with --resume.
     """
-    from cosim.spec.options import PolicyHost
     from scenarios.episodes.demonstration import check_parquet
 
     check_parquet()
     from cosim.spec.options import EpisodeOptions
-    from scenarios.runs.policy_host import inspected_driver
+    from scenarios.runs.policy_host import host_of, inspected_driver
     from scenarios.tools.dataset.collect import collect
 
     folder = config.out
     jobs = config.jobs or 1
     assert folder is not None
     collecting = demo.collecting
-    expert = inspected_driver(config.policy, PolicyHost(), jobs)
+    host = host_of(config)
+    expert = inspected_driver(config.policy, host, jobs)
     options = EpisodeOptions.asked(replace(config, camera=camera_here(config.camera)))
     source = _source(config, demo)
     began_s = time.monotonic()
@@ -193,6 +198,7 @@ def collect_command(
             options=options,
             episodes=config.episodes,
             jobs=jobs,
+            host=host,
             resume=config.resume,
             showing=_show_board,
             progress=stages_in_lines(),

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import typer
 from typer.core import TyperCommand
 
-from cosim.spec.run_config import Option, RunConfig, option_of
+from cosim.spec.run_config import Option, RunConfig, annotations_of, option_of
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -90,12 +90,12 @@ def _option_fields(config: Any, fields: Fields) -> Iterator[dataclasses.Field[An
 
 def _as_field_value(value: Any, config: Any, field: str) -> Any:
     """Return the value of an option as its field stores it: repeatable options as a tuple."""
-    several = get_type_hints(config)[field] == tuple[str, ...]
+    several = annotations_of(config)[field].__origin__ == tuple[str, ...]
     return tuple(value or ()) if several else value
 
 
 def _parameters(config: Any, fields: Fields) -> Iterator[inspect.Parameter]:
-    hints = get_type_hints(config, include_extras=True)
+    hints = annotations_of(config)
     for field in _option_fields(config, fields):
         kind = hints[field.name].__origin__
         option = hints[field.name].__metadata__[0]

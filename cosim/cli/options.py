@@ -18,9 +18,12 @@ from cosim.cli.console import err, out
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, path_too_long, unwritable
 from cosim.spec.connection import Connection, Role
-from cosim.spec.run_config import CameraChoice, help_of
+from cosim.spec.run_config import Appearance, CameraChoice, help_of
 
 Camera = Annotated[CameraChoice, typer.Option("--camera", metavar="CAMERA", help=help_of("camera"))]
+Appears = Annotated[
+    Appearance, typer.Option("--appearance", metavar="APPEARANCE", help=help_of("appearance"))
+]
 NO_OPENGL = "No OpenGL here: the bullet camera draws the pictures (`cosim doctor` says why)."
 
 

@@ -10,10 +10,18 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.options import LOOK, Camera, camera_here, check_output, parse_size, replacement_note
+from cosim.cli.options import (
+    LOOK,
+    Appears,
+    Camera,
+    camera_here,
+    check_output,
+    parse_size,
+    replacement_note,
+)
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, listed, unknown
-from cosim.spec.run_config import help_of
+from cosim.spec.run_config import Appearance, help_of
 
 if TYPE_CHECKING:
     from scenarios.tools.viewing.look import Viewpoint
@@ -103,6 +111,10 @@ def film(
     ] = "follow",
     speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
     camera: Camera = "auto",
+    appearance: Annotated[
+        Appearance | None,
+        typer.Option("--appearance", help="Look of a scanned place. Default: the run's."),
+    ] = None,
 ) -> None:
     """Film an episode of a run from behind or above, with camera picture, map and failures."""
     from scenarios.tools.viewing.film import Cut, failure_to_film, make_film
@@ -132,6 +144,7 @@ def film(
             speed,
             camera_here(camera),
             picked,
+            appearance,
         )
         to_s = make_film(folder, episode, output, cut, progress)
     same = (
@@ -191,6 +204,7 @@ def look(
         Path, typer.Option("-o", "--output", help="Where to write the picture.")
     ] = Path("look.png"),
     camera: Camera = "auto",
+    appearance: Appears = "splats",
 ) -> None:
     """Draw one picture of a scenario: by the robot's camera, from behind or from above."""
     from scenarios.suites.catalog import one_scenario, with_crowd, with_robot
@@ -210,7 +224,8 @@ def look(
     (one,) = changed.scenarios
     more = "" if which or of == 1 else f"; 1 of {of} scenarios: --scenario chooses another"
     with doing("choosing the camera") as progress:
-        image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), progress)
+        drawn_by = camera_here(camera)
+        image, time_s = look_at(one, policy, at, picked, pixels, drawn_by, progress, appearance)
     instead = replacement_note(output)
     _save(image, output)
     out.print(

@@ -374,6 +374,17 @@ def endure_map(
         raise typer.Exit(SOME_CRASHED)
 
 
+@map_app.command("delete", epilog="Example:  \n`cosim map delete my-street`")
+def delete(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of an imported map or scan.")],
+) -> None:
+    """Delete an imported map or scan. Runs and scenarios on it need it to be imported again."""
+    from sumo_nets.maps.map_store import delete_map
+
+    folder = delete_map(name)
+    out.print(f"Deleted: {folder}", soft_wrap=True, highlight=False)
+
+
 @map_app.command("list", epilog="Example:  \n`cosim map list`")
 def list_() -> None:
     """List the maps: imported ones, and those that come with SUMO (imported when first used)."""
@@ -402,7 +413,8 @@ def print_check(check: MapCheck, about: About | None, capacity: Capacity | None)
     ]
     if about is not None:
         remarks += [("note", _OUTDATED)] if outdated(about) else []
-        remarks += [("changed", change) for change in about.changes]
+        head = "scan" if about.format == "scan" else "changed"
+        remarks += [(head, change) for change in about.changes]
         remarks += [
             ("licence", licence)
             for licence in about.licences or ("none found: ask where the file comes from",)

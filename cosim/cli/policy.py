@@ -11,10 +11,11 @@ from rich.text import Text
 
 from cosim.cli import tables
 from cosim.cli.console import out
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import Camera, Insecure, Tls, camera_here, check_output, replacement_note
 from cosim.cli.progress import doing
 from cosim.core.errors import SOME_CRASHED, unknown
-from cosim.spec.run_config import run_connections
+from cosim.spec.run_config import RunConfig, run_connections
 
 if TYPE_CHECKING:
     from scenarios.tools.policy_check.checks import CheckedPolicy
@@ -25,6 +26,8 @@ _GOAL_HELP = "Goal protocol (`cosim list`), in place of its manifest's."
 _FRAMES_HELP = "Observations of each drive; more than the policy's history has."
 _OWN_CAMERA_HELP = "Allow a camera that the robot does not have."
 _POLICY_AT_HELP = "Where `cosim serve` listens, for zenoh:NAME; may be repeated."
+_OF_CHECK = Fields(only=("isolated", "policy_data", "policy_memory"))
+"""Options that `cosim policy check` shares with `cosim run`."""
 _COLOURS = {"passed": "green", "warning": "yellow", "failed": "red", "does not apply": "dim"}
 
 
@@ -35,11 +38,14 @@ def policies() -> None:
 
 @policy_app.command(
     "check",
+    cls=ConfiguredCommand,
     epilog="Examples:  \n`cosim policy check my.py:Mine -o check.png`  \n`cosim policy check "
     "onnx:bundle --json`  \n`cosim policy check zenoh:vint --policy-at tcp/gpu:7449 --goal image`",
 )
+@configured
 def check_policy(
     name: Annotated[str, typer.Argument(metavar="NAME", help=_NAME_HELP)],
+    config: Annotated[RunConfig, _OF_CHECK],
     only: Annotated[
         list[str] | None, typer.Option(help="Only this check; may be repeated.")
     ] = None,
@@ -63,13 +69,10 @@ def check_policy(
     Nothing is simulated. A check can pass, fail, doubt (the answer may be right, with the reason)
     or not apply. Exit code 1: a check has failed.
     """
-    from secrets import token_hex
-
     from cosim.episode.manifest_checks import with_goal
     from cosim.report.mapsheet import write_png
     from cosim.spec.goal import goal_called
-    from cosim.spec.options import PolicyHost
-    from scenarios.runs.policy_host import policy_driver
+    from scenarios.runs.policy_host import host_of, inspected_driver, policy_driver
     from scenarios.tools.policy_check.checks import POLICY_CHECKS, checked_policy
     from scenarios.tools.policy_check.drives import drives_for
     from scenarios.tools.policy_check.sheet import check_sheet
@@ -82,7 +85,9 @@ def check_policy(
             raise unknown("check", check, POLICY_CHECKS)
     asked_goal = goal_called(goal) if goal else None
     servers = run_connections(None, None, policy_at or (), tls, insecure).servers
-    driver = policy_driver(name, PolicyHost(servers=servers, run=token_hex(8)))
+    host = host_of(config, servers)
+    expected = inspected_driver(name, host).manifest if host.isolated != "no" else None
+    driver = policy_driver(name, host, expected=expected)
     try:
         manifest = with_goal(driver.manifest, asked_goal)
         with doing(f"checking {name}") as progress:

@@ -13,7 +13,7 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import err, notice, out, say
-from cosim.cli.generated_options import Fields, configured
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import camera_here, check_rerun, replacement_note, write_rerun
 from cosim.cli.progress import doing
 from cosim.core.bounding_box import check_overlap, parse_box
@@ -48,12 +48,16 @@ _FILE_HELP = "A TOML file: `cosim scenario new` writes one."
 _OF_OWN_RUN = Fields(
     only=(
         "policy",
+        "isolated",
+        "policy_data",
+        "policy_memory",
         "jobs",
         "out",
         "resume",
         "seed",
         "frames",
         "camera",
+        "appearance",
         "latency",
         "real_time",
         "rerun",
@@ -206,6 +210,7 @@ def draw_own(
 
 @scenario_app.command(
     "run",
+    cls=ConfiguredCommand,
     epilog="Examples:  \n`cosim scenario run mine.toml --policy orca`  \n"
     "`cosim scenario run sweep.toml --policy social_force --jobs 2 --out runs/sweep`  \n"
     "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`  \n"
@@ -220,8 +225,8 @@ def run_own(
 
     `cosim run FILE.toml` has all other options of runs.
     """
-    from cosim.policies.load import load_policy
     from cosim.results.run_folder import refuse_used
+    from scenarios.runs.policy_host import host_of, inspected_driver
     from scenarios.suites.user_scenarios.check import checked_own
     from scenarios.suites.user_scenarios.read import read_own
 
@@ -232,7 +237,7 @@ def run_own(
             refuse_used(part)
     with doing(f"checking {file}") as progress:
         suite = checked_own(own, progress)
-    manifest = load_policy(config.policy).manifest
+    manifest = inspected_driver(config.policy, host_of(config), config.jobs or 1).manifest
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = config.out or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
     if manifest.camera is not None:
@@ -254,6 +259,7 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
     from cosim.cli.run_progress import EpisodeBars
     from cosim.results.run_folder import read_spec
     from scenarios.runs.planning import seed_of_run
+    from scenarios.runs.policy_host import host_of
     from scenarios.runs.run import RunObjects, execute_run
 
     parts = _parts(own, path)
@@ -270,9 +276,8 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
             config, suite=own.name, scenario=ids, goal=goal or "", out=part, resume=part in begun
         )
         try:
-            tables.append(
-                execute_run(of_part, given=RunObjects(suite=suite), reporter=EpisodeBars())
-            )
+            given = RunObjects(suite=suite, host=host_of(of_part))
+            tables.append(execute_run(of_part, given=given, reporter=EpisodeBars()))
         except KeyboardInterrupt:
             notice(
                 f"Stopped. Finished episodes are stored in {part}: continue with --out {path} "

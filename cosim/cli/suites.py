@@ -114,7 +114,8 @@ suite_app = typer.Typer(
 @suite_app.command(
     "build",
     epilog="Examples:  \n`cosim suite build unit unit.json --jobs 8`  \n"
-    "`cosim suite build reactive few.json --only frontal-001 --only static-001`",
+    "`cosim suite build reactive few.json --only frontal-001 --only static-001`  \n"
+    "`cosim suite build reactive redraw-1.json --redraw 1 --only '*-70??' --jobs 2`",
 )
 def build_one(
     name: Annotated[str, typer.Argument(help="A suite: see `cosim suite list`.")],
@@ -127,21 +128,37 @@ def build_one(
         int, typer.Option(min=1, help="Candidates of each scenario, until the expert solves one.")
     ] = 6,
     only: Annotated[
-        list[str] | None, typer.Option(help="Build only this scenario; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Build only this scenario, or those of a pattern such as `*-70??`; repeatable.",
+        ),
     ] = None,
+    redraw: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=4000,
+            help="Number of a redraw with other seeds, in the same places; 0: the shipped draw.",
+        ),
+    ] = 0,
 ) -> None:
     """Draw the scenarios of a suite and prove each solvable. A stopped build continues."""
+    from fnmatch import filter as matching
+
     from scenarios.suites.recipes import RECIPES
     from scenarios.tools.build.build_suite import build_suite
 
     if name not in RECIPES:
         raise unknown("suite", name, RECIPES)
-    names = {slot.name for slot in RECIPES[name].slots}
-    for one in only or ():
-        if one not in names:
-            raise unknown("scenario", one, names)
+    names = [slot.name for slot in RECIPES[name].slots]
+    wanted: list[str] = []
+    for pattern in only or ():
+        if not (found := matching(names, pattern)):
+            raise unknown("scenario", pattern, names)
+        wanted += found
 
-    suite, proofs = build_suite(name, path, jobs, tries, notice, only or ())
+    suite, proofs = build_suite(name, path, jobs, tries, notice, wanted, redraw)
     out.print(
         f"{path}: {len(suite.scenarios)} scenarios, version {suite.version}, {suite.content_hash}",
         soft_wrap=True,

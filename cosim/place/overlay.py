@@ -52,6 +52,20 @@ def union_all(shapes: Sequence[shapely.Geometry] | Shapes) -> Polygon | MultiPol
     return united
 
 
+def grown(shape: Any, by_m: float) -> Any:
+    """Return a shape grown by a positive distance.
+
+    GEOS loses holes of some large shapes; these are grown side by side.
+    """
+    whole: Any = shapely.buffer(shape, by_m, quad_segs=4)
+    if whole.is_valid and whole.area >= shape.area:
+        return whole
+    rings = [shapely.get_coordinates(ring) for ring in shapely.get_parts(shape.boundary)]
+    sides = np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
+    around = np.asarray(shapely.buffer(shapely.linestrings(sides), by_m, quad_segs=4))
+    return union_all([shape, *around])
+
+
 def where_geos_failed(error: Exception) -> str:
     """Return the place in a GEOS error as text, such as " near (12.3, 45.6)", or ""."""
     found = re.search(rf"at ({_NUMBER}) ({_NUMBER})", str(error))

@@ -39,6 +39,11 @@ class Port(NamedTuple):
         return Port(self.strip, 1 if self.end == 0 else 0)
 
 
+def ports_of(strips: Iterable[str]) -> frozenset[Port]:
+    """Return both ends of each strip."""
+    return frozenset(port for strip in strips for port in (Port(strip, 0), Port(strip, 1)))
+
+
 @dataclass(frozen=True, slots=True)
 class SignalPlan:
     """Fixed-time program of a crossing's signal, repeated after the last phase.
@@ -176,11 +181,13 @@ class StreetMap:
     """A place. Ids are SUMO edge, lane or junction ids; mappings are in the net's order.
 
     bounds: x0, y0, x1, y1 in metres.
-    net_hash: content hash of the net and of its features, if any.
+    net_hash: content hash of the net, of its features, and of its scan, if any.
     features: mapped objects off the walkable area.
     terrain: None if the place is flat.
     elevation: how the net's elevations were processed, None without any.
     planned: whether it is a generated city, whose net names the class of each street.
+    scanned: whether its ground and surroundings are a scan, whose edge is a dead end of the walks.
+    uncrowded: strips that are too narrow for the crowd; robots may use them.
     """
 
     name: str
@@ -195,6 +202,8 @@ class StreetMap:
     terrain: Terrain | None = None
     elevation: Elevation | None = None
     planned: bool = False
+    scanned: bool = False
+    uncrowded: tuple[str, ...] = ()
     _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )

@@ -159,8 +159,8 @@ class WalkGraph:
         strip: first strip.
         forward: whether it is walked along its line.
 
-        The walk avoids dead ends and does not end on a crossing, so it can be shorter, down to one
-        strip.
+        The walk avoids dead ends, unless the place is a scan, whose streets continue beyond its
+        edge. It does not end on a crossing, so it can be shorter, down to one strip.
         """
         strips = self.street_map.strips
         walk = [strip]
@@ -185,8 +185,15 @@ class WalkGraph:
     def _find_next_ports(
         self, port: Port, closed: frozenset[Port]
     ) -> tuple[tuple[Port, ...], tuple[float, ...]]:
-        """Return the next ports of a random walk that are not dead ends, and their weights."""
-        choices = tuple([p for p in self.others(port, closed) if self.others(p.other, closed)])
+        """Return the next ports of a random walk, and their weights."""
+        scanned = self.street_map.scanned
+        choices = tuple(
+            [
+                p
+                for p in self.others(port, closed)
+                if self.others(p.other, closed) or (scanned and p.other not in closed)
+            ]
+        )
         kinds = [self.street_map.strips[p.strip].kind for p in choices]
         return choices, tuple([CROSSING_WEIGHT if kind == "crossing" else 1.0 for kind in kinds])
 

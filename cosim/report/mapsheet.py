@@ -84,7 +84,7 @@ def draw_map(
         if problem.piece in street_map.strips:
             sheet.line(street_map.strips[problem.piece].line[:, :2], colour, 1.0)
         sheet.dot(np.array([[problem.x_m, problem.y_m]]), colour, 4.0, filled=False)
-    _draw_scale_bar(sheet, bounds)
+    draw_scale_bar(sheet, bounds)
     return legend(sheet.image, [*_map_legend(check), *([(credit, TRACK)] if credit else [])])
 
 
@@ -112,7 +112,7 @@ def _map_legend(check: MapCheck) -> list[tuple[str, Rgb255]]:
     return [(words, TRACK), *((MARKS[kind][1], MARKS[kind][0]) for kind in kinds)]
 
 
-def _draw_scale_bar(sheet: Sheet, bounds: Bounds) -> None:
+def draw_scale_bar(sheet: Sheet, bounds: Bounds) -> None:
     """Draw a scale bar of a round number of metres in the lower left corner."""
     width_m = bounds[2] - bounds[0]
     bar_m = max(

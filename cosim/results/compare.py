@@ -269,8 +269,10 @@ def differences_of(
         inside = [name for name in ids if name in members]
         if not inside:
             continue
-        pair = table_before.loc[inside], table_after.loc[inside]
+        rows_of = table_before.loc[inside], table_after.loc[inside]
+        events_of = without_decoys(rows_of[0]), without_decoys(rows_of[1])
         for name in names:
+            pair = rows_of if name == DISCERNED else events_of
             paired = _difference(name, *pair)
             unit, better = _unit_and_direction(name)
             verdict = paired.verdict(better if judged else None)
@@ -300,9 +302,7 @@ def _unit_and_direction(name: str) -> tuple[str, bool | None]:
 
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
     """Return the paired difference of a metric, without pairs if a crash leaves it unknown."""
-    if name in UNKNOWN_WITH_CRASH and any(
-        crashed_in(without_decoys(table)) for table in (before, after)
-    ):
+    if name in UNKNOWN_WITH_CRASH and (crashed_in(before) or crashed_in(after)):
         return _NO_PAIRS
     if name not in POOLED:
         return difference_of_means(*_paired_columns(name, before, after))
@@ -313,7 +313,7 @@ def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedD
 def _paired_columns(name: str, before: pd.DataFrame, after: pd.DataFrame) -> list[Floats]:
     """Return the values (N,) of a metric in both tables; of a rate counts and metres of each.
 
-    N counts scenarios without decoys, or for `discerned` pairs of an event and its decoy.
+    N counts rows, or for `discerned` pairs of an event and its decoy.
     """
     tables = before, after
     if name == DISCERNED:
@@ -321,7 +321,7 @@ def _paired_columns(name: str, before: pd.DataFrame, after: pd.DataFrame) -> lis
         both = solved[0].index.intersection(solved[1].index)
         return [np.asarray(pairs[both], dtype=float) for pairs in solved]
     columns = POOLED.get(name, (name,))
-    return [numeric_column(without_decoys(table), column) for table in tables for column in columns]
+    return [numeric_column(table, column) for table in tables for column in columns]
 
 
 def _counts(name: str, before: pd.DataFrame, after: pd.DataFrame) -> tuple[str, str]:

@@ -8,8 +8,8 @@ renderer and also exists for policies without a camera.
 
 The paper's table has rules beyond the goal: the robot passes around the whole group of `conversing`
 and the whole line of `queueing` (`EventKind.passed_as_group`), never between two people.
-`gesturing` ends its episode at a stop: see the referee. Decoys have the rule of
-`cosim.results.go_on`.
+`gesturing` ends its episode at a stop: see the referee. Decoys, and events that require the robot
+to give way, have the rules of `cosim.results.go_on`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PersonKind, RobotState
 from cosim.episode.loop import Step
-from cosim.results.go_on import Passing, PassingWindow, is_measured, passing_of
+from cosim.results.go_on import (
+    STOP_S,
+    Passing,
+    PassingWindow,
+    is_measured,
+    passing_of,
+    rule_met,
+)
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import Ended
 from cosim.spec.camera import CameraSpec
@@ -110,6 +117,25 @@ class EventMonitor:
             if state.phase == "acting" and self._passed_round[i]:
                 self._went_between[i] |= passed_between(before.xy, after.xy, bodies)
 
+    @property
+    def rule_is_broken(self) -> bool:
+        """Return whether a rule is broken, whatever follows; False before all events were seen."""
+        return all(self._seen) and any(map(self._breaks, range(len(self._events))))
+
+    def _breaks(self, i: int) -> bool:
+        """Return whether the rule of an event is broken for good."""
+        window, first = self._windows[i], self._states[i].triggered_tick
+        if self._went_between[i]:
+            return True
+        if self._go_on_mps <= 0.0 or window is None or first is None:
+            return False
+        passing = self._motion(first, window.end or len(self._v_mps))
+        if passing is None:
+            return False
+        if window.end is not None:
+            return not rule_met(self._events[i], passing, self._go_on_mps)
+        return self._events[i].decoy and passing.stopped_s >= STOP_S
+
     def _sees(self, robot: RobotState, bodies: Floats) -> bool:
         """Return whether the camera sees one of the (N, 2) bodies."""
         eye = camera_position(robot, self._mount)
@@ -136,7 +162,7 @@ class EventMonitor:
         end, passing = self._passing(i, ended)
         rules = [not self._went_between[i]] if self._passed_round[i] else []
         if self._go_on_mps > 0.0:
-            rules.append(passing is not None and passing.goes_on(self._go_on_mps))
+            rules.append(rule_met(event, passing, self._go_on_mps))
         return TriggeredEvent(
             id=event.id,
             kind=event.kind,
@@ -163,9 +189,12 @@ class EventMonitor:
             end = len(self._route_s_m)
         if end is None:
             return None, None
-        tick_s = self._tick_ms / 1000
+        return end, self._motion(first, end)
+
+    def _motion(self, first: int, end: int) -> Passing | None:
+        """Return the motion in the ticks first to end - 1."""
         s_m, v_mps = np.array(self._route_s_m), np.array(self._v_mps)
-        return end, passing_of(s_m, v_mps, tick_s, first, end)
+        return passing_of(s_m, v_mps, self._tick_ms / 1000, first, end)
 
     def _time_s(self, tick: int | None) -> float | None:
         return None if tick is None else tick * self._tick_ms / 1000

@@ -6,10 +6,10 @@ Francis et al. 2306.16740; the SidewalkBench paper).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -407,6 +407,13 @@ it.
 """
 
 
-def compute_metrics(episode: EpisodeFacts) -> dict[str, float | None]:
-    """Compute every metric of an episode."""
-    return {name: metric.of(episode) for name, metric in METRICS.items()}
+BRIEF: Final = ("success", "route_completion", *POOLED["failures_per_100m"])
+"""Metrics of an episode of a search, computed from BRIEF_COLUMNS of the log alone."""
+BRIEF_COLUMNS: Final = ("route_s_m", "travelled_m", "reset_s_m")
+
+
+def compute_metrics(
+    episode: EpisodeFacts, names: Iterable[str] = tuple(METRICS)
+) -> dict[str, float | None]:
+    """Compute metrics of an episode, by default every one."""
+    return {name: METRICS[name].of(episode) for name in names}

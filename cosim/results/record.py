@@ -7,7 +7,7 @@ same bytes.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -241,15 +241,23 @@ class StateHash:
 
 
 class Recorder:
-    """Collects the steps of an episode into a Log."""
+    """Collects the steps of an episode into a Log.
+
+    columns: columns that are recorded; the arrays of all others are empty.
+    """
 
     PEOPLE_EVERY_TICKS = 20
     PEOPLE_WITHIN_M = 30.0
 
-    def __init__(self, tick_s: float, footprint_m: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        tick_s: float,
+        footprint_m: tuple[float, float],
+        columns: Iterable[str] = tuple(COLUMNS),
+    ) -> None:
         self._tick_s = tick_s
         self._footprint_m = footprint_m
-        self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in COLUMNS}
+        self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in columns}
         self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
         self.ticks = 0
@@ -259,8 +267,8 @@ class Recorder:
         self.hash.add(step)
         self.ticks += 1
         tick = Tick(step, verdict, self._footprint_m, road)
-        for name, column in COLUMNS.items():
-            self._values[name].append(column.read(tick))
+        for name, values in self._values.items():
+            values.append(COLUMNS[name].read(tick))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
             people = step.street_after.people
             xy = people.xy - step.motion.robot.pose.xy
@@ -282,7 +290,7 @@ class Recorder:
         plan_sizes, plan_points, plan_index = commands.plans
         return Log(
             tick_s=self._tick_s,
-            **{name: column.array(self._values[name]) for name, column in COLUMNS.items()},
+            **{name: column.array(self._values.get(name, ())) for name, column in COLUMNS.items()},
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_kind=people[:, 3].astype(np.int8),

@@ -17,7 +17,7 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.episode.command_delay import median_ms
 from cosim.episode.loop import ROUTE_WINDOW_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
-from cosim.results.go_on import Passing, is_measured, passing_of
+from cosim.results.go_on import Passing, is_measured, passing_of, rule_met
 from cosim.results.log import Log
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import STOP_S, Ended, FreezeWindow, at_goal, is_loop, near_goal
@@ -194,9 +194,9 @@ def _passings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradi
         if recorded != (shown := (None, None) if passing is None else tuple(passing)):
             yield Contradiction(f"passing_mps, stopped_s of event {event.id}", recorded, shown)
         if scenario.go_on_mps > 0.0:
-            goes_on = passing is not None and passing.goes_on(scenario.go_on_mps)
-            if outcome.rule_met is not goes_on and (event.people == 1 or not goes_on):
-                yield Contradiction(f"rule_met of event {event.id}", outcome.rule_met, goes_on)
+            met = rule_met(event, passing, scenario.go_on_mps)
+            if outcome.rule_met is not met and (event.people == 1 or not met):
+                yield Contradiction(f"rule_met of event {event.id}", outcome.rule_met, met)
 
 
 def _passing(outcome: TriggeredEvent, log: Log) -> Passing | None:

@@ -9,6 +9,8 @@ import hashlib
 import secrets
 from typing import Final, NamedTuple
 
+import msgspec
+
 from cosim.core.errors import UsageError
 from cosim.spec.scenario import Scenario
 
@@ -46,6 +48,15 @@ def seed_for(purpose: str, run_seed: int, scenario: Scenario) -> int:
     Seeds of different purposes are independent.
     """
     return int.from_bytes(_digest(run_seed, scenario, purpose)[:_SEED_BYTES], "big")
+
+
+def drives_second(run_seed: int, scenario: Scenario) -> bool:
+    """Return whether a scenario is driven in the second half of a run with decoys.
+
+    Of an event and its decoy exactly one is, drawn from the run's seed.
+    """
+    pair = msgspec.structs.replace(scenario, id=scenario.decoy_of or scenario.id)
+    return (seed_for("half", run_seed, pair) % 2 == 1) != bool(scenario.decoy_of)
 
 
 def random_run_seed() -> int:

@@ -222,16 +222,29 @@ class SidewalkLayout(NamedTuple):
     after_m: float = 2.0
 
 
+Places = Callable[[Event, int], tuple[tuple[float, float], ...]]
+"""Where person `number` of an event may stay after the trigger: world (x_m, y_m).
+
+One point, the ends of a line on which it stays, or none for a person who walks on.
+"""
+
+
+def walking_on(event: Event, number: int) -> tuple[tuple[float, float], ...]:
+    """Return the places of a person who stays nowhere: none."""
+    return ()
+
+
 class Decoy(NamedTuple):
     """Behaviour of an event with `Event.decoy` from the trigger on, in place of the kind's.
 
-    step, ends: as in `EventKind`.
+    step, ends, stays: as in `EventKind`.
     poses: activities of people who stand; one is chosen by the event's place.
     """
 
     step: Callable[[Event, EventState, int, EventQuery], Walker]
     ends: Callable[[Event, EventState, EventQuery], bool]
     poses: tuple[Doing, ...] = ("stand",)
+    stays: Places = walking_on
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,6 +260,7 @@ class EventKind:
     begin: returns person `number` of an event before the trigger.
     step: returns person `number` one tick later, from the trigger on.
     ends: returns whether the event is over. Then its people walk away and are removed out of sight.
+    stays: returns where person `number` may stay until then, see `Places`.
     pose, age: activity of people who stand during the event, and their age.
     passed_as_group: whether the robot must pass round the whole group.
     ends_at: end of a reactive scenario: the goal, or a stop before the people.
@@ -255,6 +269,7 @@ class EventKind:
     has_free_side: whether a suite draws `Event.free_side`. People who block no side then stand
         next to the robot's way.
     decoy: behaviour of its decoys; None if a decoy is the event with the other side free.
+    gives_way: whether the robot must give way in a reactive scenario, see `Scenario.go_on_mps`.
     """
 
     name: str
@@ -265,6 +280,7 @@ class EventKind:
     begin: Callable[[Event, int], Walker]
     step: Callable[[Event, EventState, int, EventQuery], Walker]
     ends: Callable[[Event, EventState, EventQuery], bool]
+    stays: Places = walking_on
     pose: Doing = "stand"
     age: Age = Age.ADULT
     passed_as_group: bool = False
@@ -272,11 +288,17 @@ class EventKind:
     blocked: Callable[[Event], tuple[float, float]] | None = None
     has_free_side: bool = False
     decoy: Decoy | None = None
+    gives_way: bool = False
 
     def trigger_m_of(self, event: Event) -> float | None:
         """Return the distance before an event at which it begins, in metres: its own, else the
         kind's."""
         return self.trigger_m if event.trigger_m is None else event.trigger_m
+
+    def stays_of(self, event: Event, number: int) -> tuple[tuple[float, float], ...]:
+        """Return where a person of an event or decoy may stay after the trigger, see `Places`."""
+        row = self.decoy if self.decoy is not None and event.decoy else self
+        return row.stays(event, number)
 
     def decoy_of(self, event: Event) -> Event:
         """Return the event's decoy, equal to it until the trigger.

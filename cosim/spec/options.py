@@ -16,6 +16,7 @@ from cosim.spec.injection import Injected, LiveAddress
 from cosim.spec.run_config import (
     MOST_LATENCY_MS,
     POLICY_MEMORY_GB,
+    Appearance,
     CameraChoice,
     Isolation,
     RunConfig,
@@ -86,11 +87,13 @@ class RendererAddress(msgspec.Struct, frozen=True, kw_only=True):
     address: socket on which it listens.
     asks: whether it hosts the policy and queries it in batches (`act_batch`).
     number: number of the renderer in the run, from 1; only the renderer uses it.
+    appearance: of scanned places.
     """
 
     address: str
     asks: bool
     number: int = 0
+    appearance: Appearance = "splats"
 
 
 LEAST_PACE = 0.1
@@ -110,6 +113,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     own_camera: allow a camera that the robot does not have (`cosim.episode.manifest_checks`). It
         marks the record as nonstandard.
     camera: renderer of the pictures.
+    appearance: of scanned places in pictures.
     frames_every_s: interval of saved camera frames in seconds, 0 for none.
     live: address at which the episode is live.
     pace: maximum speed in multiples of real time; 0 for no limit.
@@ -131,6 +135,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     goal: GoalProtocol | None = None
     own_camera: bool = False
     camera: CameraChoice = "auto"
+    appearance: Appearance = "splats"
     frames_every_s: float = 0.0
     live: LiveAddress | None = None
     pace: float = 0.0
@@ -150,6 +155,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
             own_camera=config.own_camera,
             goal=goal_called(config.goal) if config.goal else None,
             camera=config.camera,
+            appearance=config.appearance,
             frames_every_s=config.frames,
             counterfactual=config.counterfactual,
             real_time=config.real_time,

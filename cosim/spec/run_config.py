@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, get_type_hints
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from cosim.core.errors import UsageError
 from cosim.spec.connection import Connection, connecting, listening
 
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 """Renderers of `--camera`; auto selects gl where it works."""
+Appearance = Literal["splats", "mesh"]
+"""Appearances of scanned places in the gl camera; splats are drawn where a scan has them."""
 Isolation = Literal["no", "auto", "namespaces", "landlock", "weak"]
 """Kinds of `--isolated`: "auto" is the strongest sandbox that the kernel offers, "weak" none."""
 POLICY_MEMORY_GB = 16.0
@@ -271,6 +275,15 @@ class RunConfig:
             panel=_PICTURES,
         ),
     ] = "auto"
+    appearance: Annotated[
+        Appearance,
+        Option(
+            "Appearance of scanned places: splats (where the scan has them, with the gl camera) "
+            "or mesh.",
+            metavar="APPEARANCE",
+            panel=_PICTURES,
+        ),
+    ] = "splats"
     own_camera: Annotated[
         bool,
         Option(
@@ -446,8 +459,14 @@ def help_of(field: str) -> str:
 
 def option_of(config: type, field: str) -> Option:
     """Return the command-line option of a config's field."""
-    found: Option = get_type_hints(config, include_extras=True)[field].__metadata__[0]
+    found: Option = annotations_of(config)[field].__metadata__[0]
     return found
+
+
+@cache
+def annotations_of(config: type) -> Mapping[str, Any]:
+    """Return the resolved annotations of a config's fields, computed once per config."""
+    return MappingProxyType(get_type_hints(config, include_extras=True))
 
 
 class RunConnections(NamedTuple):

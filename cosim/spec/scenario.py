@@ -235,8 +235,9 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         static, route, or "".
     decoy_of: id of the scenario whose decoy this is, or "". A decoy equals it until its event
         begins, and then needs another response of the robot.
-    go_on_mps: least mean speed of the robot from the trigger to 1 m past the person, in a decoy in
-        which it has no reason to stop; 0 without this rule.
+    go_on_mps: mean speed of the robot from the trigger to 1 m past the person. A decoy without a
+        reason to stop requires at least this speed and no stop. An event requires the opposite,
+        that the robot gives way. 0 without these rules.
 
     >>> Scenario(
     ...     id="a", suite="mine", place=City(seed=1, size_m=500.0), seed=0,

@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING
 
 from cosim.spec.camera import CameraSpec
 from cosim.spec.options import CameraName
-from cosim.spec.run_config import CameraChoice
+from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Light
 from physics.cameras.gl import context
+
+_MESH = ", mesh"
+"""End of a renderer's name with the mesh's look of scanned places."""
 
 if TYPE_CHECKING:
     from physics.cameras.bullet_camera import BulletCamera
@@ -32,16 +35,21 @@ def camera_of_choice(choice: CameraChoice) -> CameraName:
     return choice
 
 
-def renderer_of(name: CameraName) -> str:
+def renderer_of(name: CameraName, appearance: Appearance = "splats") -> str:
     """Return the renderer's name for records.
+
+    appearance: of scanned places, which only the gl camera draws in several ways
 
     Pictures have the same bits on the same renderer only.
     """
-    return (
-        context.renderer()
-        if name == "gl"
-        else {"bullet": "bullet-tiny", "bullet-egl": "bullet-egl"}[name]
-    )
+    if name == "gl":
+        return context.renderer() + (_MESH if appearance == "mesh" else "")
+    return {"bullet": "bullet-tiny", "bullet-egl": "bullet-egl"}[name]
+
+
+def appearance_of(renderer: str) -> Appearance:
+    """Return the appearance of scanned places in pictures, by the renderer's name in a record."""
+    return "mesh" if renderer.endswith(_MESH) else "splats"
 
 
 def camera_of(
@@ -51,15 +59,17 @@ def camera_of(
     *,
     light: Light | None = None,
     depth: bool = False,
+    appearance: Appearance = "splats",
 ) -> GlCamera | BulletCamera:
     """Create a camera in a world, for use in a `with` block.
 
     light: for the gl camera; the other's light is always day
+    appearance: of a scanned place in the gl camera; the other draws its mesh
     """
     if name == "gl":
         from physics.cameras.gl.camera import GlCamera
 
-        return GlCamera(world, spec, depth, light or Light())
+        return GlCamera(world, spec, depth, light or Light(), appearance)
     from physics.cameras.bullet_camera import BulletCamera
 
     return BulletCamera(world, spec, depth, egl=name == "bullet-egl")

@@ -28,6 +28,7 @@ from physics.robots import urdf_path
 from physics.street import props, vehicles
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
+from physics.street.scan_surface import posterized
 from physics.street.surface import grounded_obstacles
 from physics.textures.layers import Colour
 
@@ -127,10 +128,11 @@ class BulletScene:
         x0, y0, x1, y1 = tile_bounds(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
         chunk, posts = self._surface.chunk(key), self._surface.posts(key)
-        parts = [
-            (patch.mesh, patch.colour, patch.label)
-            for patch in (*chunk.ground, *self._surface.covers(key))
-        ]
+        if self._surface.scan is not None:
+            parts = posterized(self._surface.scanned(key))
+        else:
+            patches = (*chunk.ground, *self._surface.covers(key))
+            parts = [(patch.mesh, patch.colour, patch.label) for patch in patches]
         for facade, mesh in facade_meshes(chunk.buildings).items():
             parts.append((mesh, WINDOW_COLOUR if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)
@@ -158,7 +160,8 @@ class BulletScene:
             who.ids, who.age.tolist(), parts.at_m.tolist(), parts.turn.tolist(), strict=True
         ):
             bodies = self._walkers[family_of(name, age)].lend()
-            for k, (body, colour) in enumerate(zip(bodies, part_colours(name, age), strict=True)):
+            colours = part_colours(name, age, self._surface.seed)
+            for k, (body, colour) in enumerate(zip(bodies, colours, strict=True)):
                 self._canvas.put_at(body, at[k], turn[k])
                 if self._painted.get(body) != colour:
                     self._painted[body] = colour

@@ -88,14 +88,17 @@ class Sky:
 
 
 @lru_cache(maxsize=8)
-def sky_of(light: Light, seed: int = 0) -> Sky:
-    """Compute the sky of a light. seed: of the clouds.
+def sky_of(light: Light, seed: int = 0, to_sun: tuple[float, float, float] | None = None) -> Sky:
+    """Compute the sky of a light.
+
+    seed: of the clouds
+    to_sun: direction of the sun in place of that of the light's hour
 
     The sky of a scenario's default light is baked.
     Raises SpecError naming a broken picture of the user's.
     """
-    if light != Light():
-        return _photographed(light) if light.hdri else _procedural(light, seed)
+    if light != Light() or to_sun is not None:
+        return _photographed(light) if light.hdri else _procedural(light, seed, to_sun)
 
     def make() -> dict[str, NDArray[Any]]:
         return {
@@ -129,8 +132,10 @@ def irradiance(radiance: NDArray[np.floating], towards: Floats) -> Floats:
     return np.asarray(np.tensordot(weight, radiance.astype(float), axes=2))
 
 
-def _procedural(light: Light, seed: int) -> Sky:
+def _procedural(light: Light, seed: int, to_sun: tuple[float, float, float] | None = None) -> Sky:
     sun = sun_direction(light.hour, light.day_of_year, light.latitude_deg)
+    if to_sun is not None:
+        sun = np.array(to_sun)
     rise = math.asin(float(np.clip(sun[2], -1.0, 1.0)))
     ways = directions(SKY_SIZE[0])
     beam = transmittance(rise, TURBIDITY)

@@ -129,18 +129,24 @@ class Bodies:
             of_friction.setdefault(patch.friction, []).append(patch.mesh)
         ground = [self._add_ground(join(meshes), value) for value, meshes in of_friction.items()]
         houses = [body for b in chunk.buildings for body in self._add_building(b)]
-        return [*ground, *houses, *(self.add_prop(prop, z) for prop, z in chunk.props)]
+        scanned = [self._add_concave(mesh) for mesh in chunk.standing]
+        self._identities |= dict.fromkeys(scanned, ("wall", "scan"))
+        props = [self.add_prop(prop, z) for prop, z in chunk.props]
+        return [*ground, *houses, *scanned, *props]
 
     def _add_ground(self, mesh: Mesh, value: float) -> int:
+        ground = self._add_concave(mesh)
+        self._call("changeDynamics", ground, -1, lateralFriction=value)
+        return ground
+
+    def _add_concave(self, mesh: Mesh) -> int:
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
         flags = p.GEOM_FORCE_CONCAVE_TRIMESH
         with pybullet_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
             shape = self._call(
                 "createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags
             )
-        ground = self._create_body(shape, middle)
-        self._call("changeDynamics", ground, -1, lateralFriction=value)
-        return ground
+        return self._create_body(shape, middle)
 
     def _add_building(self, building: Building) -> list[int]:
         height = building.size_m[2] + building.floor_m - building.base_m

@@ -175,9 +175,9 @@ def _joints(family: Family) -> Floats:
 
 
 @lru_cache(maxsize=4096)
-def part_colours(name: str, age: int) -> tuple[Colour, ...]:
+def part_colours(name: str, age: int, seed: int) -> tuple[Colour, ...]:
     """Return the colours of the parts of the person of this `Age` called `name`."""
-    who = look_of(name, age)
+    who = look_of(name, age, seed)
     outfit = ALL[who.outfit]
     red, green, blue = (who.colours / 255.0).T.tolist()
     colours = dict(zip(COATS, zip(red, green, blue, strict=True), strict=True))

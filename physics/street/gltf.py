@@ -18,6 +18,7 @@ from physics.ground.tiles import Key
 from physics.street import props
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
+from physics.street.scan_surface import posterized
 from physics.street.surface import Patch, Surface, grounded_obstacles
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Colour, linear_to_srgb, srgb_to_linear
@@ -75,7 +76,11 @@ class _Parts:
 
     def add_square(self, surface: Surface, key: Key) -> None:
         chunk, finish = surface.chunk(key), surface.finish(key)
-        for patch in (*chunk.ground, *finish.laid, *finish.painted):
+        scanned = posterized(surface.scanned(key))
+        for mesh, colour, label in scanned:
+            self.add("surfaces", label, mesh, colour)
+        ground = (*chunk.ground, *finish.laid, *finish.painted) if surface.scan is None else ()
+        for patch in ground:
             self.add("surfaces", patch.name, patch.mesh, self._mean_colour(patch))
         for facade, mesh in facade_meshes(chunk.buildings).items():
             name, colour = ("windows", WINDOW_COLOUR) if facade < 0 else ("walls", FACADES[facade])

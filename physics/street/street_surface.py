@@ -26,7 +26,7 @@ from physics.street.mapped import MappedObjects
 from physics.street.paint import tile_markings
 from physics.street.placement import PropPlacement
 from physics.street.props import SignalPost, signals_in_tile
-from physics.street.surface import Chunk, Patch, Surface, TexturedDetails
+from physics.street.surface import Chunk, Patch, PlaceSurface, TexturedDetails
 from physics.street.tile_cache import (
     TileObjects,
     covers_as_arrays,
@@ -43,7 +43,7 @@ _CACHED_TILES: Final = 100
 """Number of tiles in the in-memory LRU cache."""
 
 
-class StreetSurface(Surface):
+class StreetSurface(PlaceSurface):
     """Surface of a street map for a seed.
 
     roughness: unevenness of the ground, 0 (flat) to 1
@@ -145,7 +145,6 @@ class StreetSurface(Surface):
         return self._cache.get(f"{kind}_{key[0]}_{key[1]}", make)
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
-        """Return the buildings whose centre lies in the tile, placed on the land."""
         return self._things_in(key).buildings
 
     def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
@@ -166,7 +165,6 @@ class StreetSurface(Surface):
         )
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
-        """Return the props in the tiles that an area touches."""
         return [prop for key in tiles_touching(area) for prop in self._things_in(key).props]
 
     def _things_in(self, key: Key) -> TileObjects:

@@ -14,10 +14,13 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
 
 from cosim.core.cache import Arrays
 from cosim.core.geometry import Floats, Pose
+from cosim.place.scan import Scan
+from cosim.place.street_map import StreetMap
 from cosim.spec.obstacle import Obstacle
 from physics.ground.mesh import Mesh
 from physics.ground.tiles import Key
@@ -50,13 +53,29 @@ class Patch(NamedTuple):
     tinted: bool = True
 
 
+class ScannedPatch(NamedTuple):
+    """Scanned triangles, whose colours contain their light.
+
+    colours: (V, 3) sRGB, 0 to 1
+    label: one of `cosim.core.state.LABELS`
+    """
+
+    mesh: Mesh
+    colours: Floats
+    label: str
+
+
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Contents of a tile: ground, buildings, and props with the height of their foot in metres."""
+    """Contents of a tile: ground, buildings, and props with the height of their foot in metres.
+
+    standing: scanned obstacles, without a look of their own
+    """
 
     ground: tuple[Patch, ...]
     buildings: tuple[Building, ...] = ()
     props: tuple[tuple[Prop, float], ...] = ()
+    standing: tuple[Mesh, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +97,12 @@ class Surface(ABC):
 
     seed: seed of random details such as clouds and lens noise
     level: whether the land is flat at height 0
+    scan: the scan of a scanned place
     """
 
     seed: int = 0
     level: bool = False
+    scan: Scan | None = None
     _last_lean: tuple[Pose, tuple[float, float], tuple[float, float, float]] | None = None
 
     @abstractmethod
@@ -106,6 +127,10 @@ class Surface(ABC):
     def finish(self, key: Key) -> TexturedDetails:
         """Return the details of a tile for cameras with textures."""
         return TexturedDetails()
+
+    def scanned(self, key: Key) -> tuple[ScannedPatch, ...]:
+        """Return the scanned triangles of a tile, which are drawn in place of its ground."""
+        return ()
 
     def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
         """Return the cached arrays of a tile, or compute them with `make`.
@@ -199,6 +224,23 @@ class Surface(ABC):
         pitch = math.atan2(rear_left + rear_right - front_left - front_right, 4.0 * ahead)
         roll = math.atan2(front_left + rear_left - front_right - rear_right, 4.0 * aside)
         return 0.25 * (front_left + front_right + rear_left + rear_right), roll, pitch
+
+
+class PlaceSurface(Surface):
+    """Surface of a place.
+
+    street_map: map of the place
+    """
+
+    street_map: StreetMap
+
+    def buildings(self, key: Key) -> tuple[Building, ...]:
+        """Return the buildings whose centre lies in the tile, placed on the land."""
+        return ()
+
+    def standing(self, area: shapely.Geometry) -> list[Prop]:
+        """Return the props in the tiles that an area touches."""
+        return []
 
 
 def grounded_obstacles(obstacles: Sequence[Obstacle], surface: Surface) -> list[tuple[Prop, float]]:

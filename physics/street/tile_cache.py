@@ -32,7 +32,7 @@ _SOURCE_FOLDERS: Final = (
 )
 """Folders whose source code determines the cached arrays."""
 
-_SOURCES_KEY: Final = f"{sources_hash(*_SOURCE_FOLDERS)} {shapely.geos_version_string}"
+SOURCES_KEY: Final = f"{sources_hash(*_SOURCE_FOLDERS)} {shapely.geos_version_string}"
 """Cache key part: hash of the sources and version of GEOS."""
 
 _Name = TypeVar("_Name", bound=str)
@@ -61,7 +61,7 @@ class _TileFields(msgspec.Struct, array_like=True):
 
 def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache:
     """Return the cache of a map's tiles."""
-    key_text = f"{street_map.made_of} {seed} {roughness!r} {_SOURCES_KEY}"
+    key_text = f"{street_map.made_of} {seed} {roughness!r} {SOURCES_KEY}"
     return ArrayCache(
         "tiles", hashlib.sha256(key_text.encode()).hexdigest()[:32] if street_map.made_of else ""
     )

@@ -19,8 +19,9 @@ from cosim.results.run_folder import read_records
 from cosim.results.traffic import RoadState
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
-from cosim.spec.run_config import CameraChoice
+from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
+from physics.cameras.choice import appearance_of
 from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.run_episode import drive
@@ -56,13 +57,18 @@ def replay_episode(
     camera: CameraChoice = "auto",
     *watches: Watch,
     judged_alone: bool = False,
+    appearance: Appearance | None = None,
 ) -> tuple[Episode, Replay]:
     """Return a new Episode for a replay, and the policy that repeats the recorded commands.
 
     judged_alone: compute no measures, for a replay whose result is not needed.
+    appearance: of scanned places in pictures, by default that of the recorded episode.
     """
     options = EpisodeOptions(
-        seed=original.record.setup.seed, camera=camera, injections=original.record.injections
+        seed=original.record.setup.seed,
+        camera=camera,
+        appearance=appearance or appearance_of(original.record.setup.renderer),
+        injections=original.record.injections,
     )
     policy = Replay(original.log.command)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -20,6 +20,7 @@ from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.counterfactual import CounterfactualTracker
 from scenarios.episodes.episode import Episode, Watch
+from scenarios.episodes.wiring import StagedScenario
 from scenarios.ipc.command_log import CommandLog
 from scenarios.ipc.faults import verdict_on
 
@@ -31,12 +32,14 @@ class Outcome:
     log: None if the episode crashed.
     traceback: of a crash, or of a failed comparison.
     again: whether an engine failed, so that another attempt may succeed.
+    ended_early: whether the caller ended it; its record has no end and no measures.
     """
 
     record: Record
     log: Log | None
     traceback: str = ""
     again: bool = False
+    ended_early: bool = False
 
 
 def run_episode(
@@ -50,13 +53,16 @@ def run_episode(
     waiting: Progress = ignore,
     comparing: Progress = ignore,
     commands: CommandLog | None = None,
+    through: Callable[[StagedScenario], None] | None = None,
+    ends_early: Callable[[Episode], bool] | None = None,
 ) -> Outcome:
     """Run one scenario to its end, and return its record and log.
 
     An error becomes a record: `crashed` if the policy failed, `invalid` otherwise. An episode whose
     policy server is lost is `crashed` unless it is run again.
 
-    setup, renderer, watches, waiting, commands: see `Episode`.
+    setup, renderer, watches, waiting, commands, through: see `Episode`.
+    ends_early: whether to end the episode now, called before each observation.
     comparing: progress callback of the comparison with the street without the robot.
     Raises RendererLost if the shared renderer has ended, MachineError if the machine lacks
     something.
@@ -76,10 +82,13 @@ def run_episode(
         setup=setup,
         renderer=renderer,
         commands=commands,
+        through=through,
     )
     try:
         with episode:
-            drive(episode, driver)
+            drive(episode, driver, ends_early)
+            if not episode.over:
+                return Outcome(episode.driven(), None, ended_early=True)
             record, log = episode.result()
             record = msgspec.structs.replace(record, clock=record.clock | driver.clock)
             entrances = episode.entrances
@@ -106,11 +115,13 @@ def run_episode(
     return Outcome(record, log, comparison_error)
 
 
-def drive(episode: Episode, policy: Policy) -> None:
-    """Drive an episode to its end with a policy."""
+def drive(
+    episode: Episode, policy: Policy, ends_early: Callable[[Episode], bool] | None = None
+) -> None:
+    """Drive an episode to its end with a policy, or until `ends_early` returns True."""
     policy.reset(episode.id, episode.seed)
     observation = episode.reset()
-    while not episode.over:
+    while not episode.over and not (ends_early is not None and ends_early(episode)):
         observation = episode.advance(policy.act(observation))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 
 from cosim.core.clock import Clock
@@ -11,7 +13,7 @@ from cosim.episode.loop import Step
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.results.event_monitor import EventMonitor, OcclusionTest, why_invalid
 from cosim.results.log import Log
-from cosim.results.metrics import EpisodeFacts, compute_metrics
+from cosim.results.metrics import BRIEF, BRIEF_COLUMNS, METRICS, EpisodeFacts, compute_metrics
 from cosim.results.record import Record, Recorder, RedLightEntry, Status
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.traffic import TrafficMonitor
@@ -40,7 +42,7 @@ class Scorer:
     ) -> None:
         self._scenario = scenario
         self._clock = clock
-        footprint_m = robot.footprint_m
+        footprint_m = self._footprint_m = robot.footprint_m
         self._referee = Referee(scenario, area, footprint_m, clock)
         self._recorder = Recorder(clock.tick_s, footprint_m)
         self._monitor = EventMonitor(scenario, kinds, robot, hidden, clock.tick_ms)
@@ -49,11 +51,21 @@ class Scorer:
         self._walked_into: list[Failure] = []
         self._red_lights: list[RedLightEntry] = []
         self._verdict = Verdict()
-        self._measures = True
+        self._measures: Sequence[str] = tuple(METRICS)
 
     def skip_measures(self) -> None:
         """Record no measures from now on, so that there is no result: only the referee judges."""
-        self._measures = False
+        self._measures = ()
+
+    def measure_briefly(self) -> None:
+        """Record only what the measures of a search need. Call it before the first Step."""
+        self._measures = BRIEF
+        self._recorder = Recorder(self._clock.tick_s, self._footprint_m, BRIEF_COLUMNS)
+
+    @property
+    def is_lost(self) -> bool:
+        """Return whether the episode fails or breaks a rule, whatever follows."""
+        return bool(self._failures) or self._monitor.rule_is_broken
 
     def score(self, step: Step) -> Verdict:
         """Return the referee's verdict on the next Step, and record both."""
@@ -100,7 +112,7 @@ class Scorer:
             )
         driven = self.driven(begun)
         record = msgspec.structs.replace(driven, ended=self._verdict.ended, setup=setup)
-        measures = compute_metrics(EpisodeFacts.of(record, scenario, log))
+        measures = compute_metrics(EpisodeFacts.of(record, scenario, log), self._measures)
         reason = why_invalid(record, scenario)
         status: Status = "invalid" if reason else "done"
         return msgspec.structs.replace(record, status=status, reason=reason, measures=measures), log

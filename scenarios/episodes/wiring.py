@@ -117,6 +117,7 @@ def staged(
                 spec,
                 light=scenario.light,
                 depth=spec.depth,
+                appearance=options.appearance,
             )
 
         camera: Camera | None = None
@@ -128,7 +129,7 @@ def staged(
                 renderer = shared_camera.renderer
         elif manifest.camera is not None:
             camera = stack.enter_context(eyes(manifest.camera))
-            renderer = renderer_of(camera_of_choice(options.camera))
+            renderer = renderer_of(camera_of_choice(options.camera), options.appearance)
         cameras = {name: stack.enter_context(eyes(spec)) for name, spec in manifest.cameras.items()}
         look = None if camera is None else partial(draw_empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))

@@ -32,7 +32,7 @@ from physics.ground.tiles import tile_at
 from physics.street.furniture import footprints
 from physics.street.interaction_spots import InteractionSpot, SpotKind, spots
 from physics.street.placement import CLEAR_HALF_M
-from physics.street.street_surface import StreetSurface
+from physics.street.surface import PlaceSurface
 
 _REACH_M: Final = 55.0
 """Metres from the route within which sidewalks are in the graph."""
@@ -140,7 +140,7 @@ class BehaviorGraph:
 
 def behavior_graph(
     street_map: StreetMap,
-    ground: StreetSurface,
+    ground: PlaceSurface,
     route: Sequence[tuple[float, float]],
     barriers: Sequence[Barrier] = (),
     obstacles: Sequence[Obstacle] = (),

@@ -104,13 +104,21 @@ def _decoy_step(event: Event, state: EventState, number: int, query: EventQuery)
     walker = state.walkers[number]
     if state.phase == "over" or not from_front(number):
         return walker
-    side = event.side if number == 0 else -event.side
-    aside = world_point(event, event.half_length_m + _BEFORE_M, side * edge_m(event))
+    (aside,) = _decoy_stays(event, number)
     if (walker.x_m, walker.y_m) != aside:
         sight = sight_of(event, number, query)
         return walk_to(walker, *aside, event.speed_mps, sight)
     heading_rad = turn_towards(walker.heading_rad, event.heading_rad, query.tick_ms / 1000)
     return msgspec.structs.replace(walker, heading_rad=heading_rad)
+
+
+def _decoy_stays(event: Event, number: int) -> tuple[tuple[float, float], ...]:
+    """Return the edge of the way for people from the front, and where the others wait."""
+    if not from_front(number):
+        waits = _begin(event, number)
+        return ((waits.x_m, waits.y_m),)
+    side = event.side if number == 0 else -event.side
+    return (world_point(event, event.half_length_m + _BEFORE_M, side * edge_m(event)),)
 
 
 def _decoy_ends(event: Event, state: EventState, query: EventQuery) -> bool:
@@ -140,5 +148,5 @@ PED_CROSSING: Final = EventKind(
     begin=_begin,
     step=_step,
     ends=_ends,
-    decoy=Decoy(_decoy_step, _decoy_ends),
+    decoy=Decoy(_decoy_step, _decoy_ends, stays=_decoy_stays),
 )

@@ -139,6 +139,11 @@ def _decoy_step(event: Event, state: EventState, number: int, query: EventQuery)
     return walk_to(walker, *world_point(event, 0.0, event.side * short_m), pace_mps, sight)
 
 
+def _decoy_stays(event: Event, number: int) -> tuple[tuple[float, float], ...]:
+    """Return the ends of the line on which it stops, by the robot's line."""
+    return world_point(event, 0.0, 0.0), world_point(event, 0.0, event.side * edge_m(event))
+
+
 def _passed(event: Event, state: EventState, query: EventQuery) -> bool:
     return query.route_s_m - event.route_s_m >= 1.0
 
@@ -150,5 +155,5 @@ LATERAL: Final = EventKind(
     begin=_begin,
     step=_step,
     ends=_ends,
-    decoy=Decoy(_decoy_step, _passed),
+    decoy=Decoy(_decoy_step, _passed, stays=_decoy_stays),
 )

@@ -3,7 +3,8 @@
 It follows the robot's line, also after it has cut in, and waits beside a robot that stands. In
 front of the robot it slows down to half of the robot's current speed. A robot that keeps its course
 at any speed collides. A robot that slows down until the person is let in does not. Then the person
-continues at its own pace.
+continues at its own pace. In a reactive scenario the robot must give way like this: to pass the
+person again without slowing down breaks a rule.
 
 The person of a decoy overtakes in the same way, and walks on without cutting in.
 """
@@ -186,4 +187,5 @@ OVERTAKING: Final = EventKind(
     step=_step,
     ends=_ends,
     decoy=Decoy(_decoy_step, _decoy_ends),
+    gives_way=True,
 )

@@ -21,7 +21,7 @@ from cosim.people.steering import STEERING_NEAR_M, Neighbour
 from cosim.place.street_map import StreetMap
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.scenario import Scenario
-from physics.street.street_surface import StreetSurface
+from physics.street.surface import PlaceSurface
 from scenarios.events.behaviour_graph import BehaviorGraph, behavior_graph
 from scenarios.events.resident import (
     SPEED_MPS,
@@ -59,7 +59,7 @@ def with_residents(
     director: Director,
     scenario: Scenario,
     street_map: StreetMap,
-    ground: StreetSurface,
+    ground: PlaceSurface,
     people: Callable[[], People],
 ) -> Director:
     """Wrap a director to add the scenario's residents; unchanged if the scenario has none."""

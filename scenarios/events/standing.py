@@ -28,6 +28,7 @@ from cosim.spec.events import (
     EventKind,
     EventQuery,
     EventState,
+    Places,
     SidewalkLayout,
     Walker,
 )
@@ -174,6 +175,16 @@ def _blocked(places: _Places) -> Callable[[Event], tuple[float, float]]:
     return interval
 
 
+def _stays(places: _Places) -> Places:
+    """Build the function of where people at `places` stay, for any robot."""
+
+    def stays(event: Event, number: int) -> tuple[tuple[float, float], ...]:
+        ends = {places(event, lane_m)[number] for lane_m in (-math.inf, math.inf)}
+        return tuple(world_point(event, *place) for place in sorted(ends))
+
+    return stays
+
+
 def _waiting(aside: _Asides) -> Callable[[Event, int], Walker]:
     return lambda event, number: walker_at(event, *aside(event, number), math.pi)
 
@@ -269,6 +280,7 @@ OBSTRUCTING: Final = EventKind(
     begin=_waiting(_aside),
     step=_standing(obstructing_places, _about),
     ends=_ends,
+    stays=_stays(obstructing_places),
     pose="look",
     blocked=_blocked(obstructing_places),
     has_free_side=True,
@@ -283,6 +295,7 @@ CONVERSING: Final = EventKind(
     begin=_waiting(_aside),
     step=_standing(talking_places, _inward),
     ends=_ends,
+    stays=_stays(talking_places),
     pose="talk",
     passed_as_group=True,
     blocked=_blocked(talking_places),
@@ -297,6 +310,7 @@ QUEUEING: Final = EventKind(
     begin=_waiting(_aside),
     step=_standing(queue_places, _forward),
     ends=_ends,
+    stays=_stays(queue_places),
     pose="queue",
     passed_as_group=True,
     blocked=_blocked(queue_places),
@@ -310,8 +324,9 @@ GESTURING: Final = EventKind(
     begin=_waiting(_beside_way),
     step=_with_hand(_GESTURES),
     ends=_obeyed,
+    stays=_stays(gesturing_places),
     pose="stop",
     ends_at="stop",
     has_free_side=True,
-    decoy=Decoy(_GESTURES, _ends, ("wave", "call", "point", "scratch")),
+    decoy=Decoy(_GESTURES, _ends, ("wave", "call", "point", "scratch"), _stays(gesturing_places)),
 )

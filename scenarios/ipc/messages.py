@@ -41,6 +41,7 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     setup: of the run; without one it follows from options and policy.
     net_hash: hash of its street net, if the worker is on another machine; else "".
     last_attempt: whether a failure of this attempt is recorded, so that its cause must be found.
+    second: half of a run with decoys. No process of a policy runs episodes of both halves.
     """
 
     scenario: Scenario
@@ -48,6 +49,7 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     setup: RunSetup | None = None
     net_hash: str = ""
     last_attempt: bool = False
+    second: bool = False
 
 
 class Repeat(msgspec.Struct, frozen=True, tag=True):

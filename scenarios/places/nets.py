@@ -5,10 +5,14 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from cosim.core.cache import cache_folder
 from cosim.core.errors import MachineError, MapError, SpecError, UsageError
+from cosim.place.scan import Scan, has_scan, read_scan
 from cosim.place.street_map import StreetMap
-from cosim.spec.scenario import City, Place
+from cosim.spec.scenario import City, CityMap, Place
+from physics.street.scan_surface import ScanSurface
 from physics.street.street_surface import StreetSurface
+from physics.street.surface import PlaceSurface
 from sumo_nets.city.store import city_net
 from sumo_nets.net.snapshot import street_map_of
 
@@ -42,6 +46,22 @@ def check_place(where: Place, net_hash: str) -> None:
 
 
 @lru_cache(maxsize=1)
-def surface_of_place(where: Place) -> StreetSurface:
+def surface_of_place(where: Place) -> PlaceSurface:
     """Return the surface of a place with its tiles; the last one is cached."""
-    return StreetSurface(place(where)[1], where.seed, where.roughness)
+    return make_surface(where, place(where)[1])
+
+
+def make_surface(where: Place, street_map: StreetMap) -> PlaceSurface:
+    """Return a new surface of a place: of its scan if it has one, otherwise of its street map."""
+    scan = scan_of(where)
+    if scan is not None:
+        return ScanSurface(street_map, scan, where.seed)
+    return StreetSurface(street_map, where.seed, where.roughness)
+
+
+def scan_of(where: Place) -> Scan | None:
+    """Return the scan of a place, None if it has none."""
+    folder = cache_folder() / "maps" / where.map if isinstance(where, CityMap) else None
+    if folder is None or not has_scan(folder):
+        return None
+    return read_scan(folder)

@@ -91,6 +91,7 @@ class EnvironmentSlot:
         self._failed_starts = 0
         self._ran = False
         self._given_s = 0.0
+        self._second: bool | None = None
         self._suspect: _Suspect | None = None
         self._reported: Done | Repeated | None = None
 
@@ -120,7 +121,12 @@ class EnvironmentSlot:
         return process
 
     def give(self, job: Job) -> None:
-        """Run a job, in a new process if there is none."""
+        """Run a job, in a new process if there is none, or if the job is of the other half of its
+        run."""
+        if self._second is not None and self._second != job.second:
+            self.stop()
+            self.end()
+        self._second = job.second
         self.job = job
         if self._watchdog is None:
             self.start()

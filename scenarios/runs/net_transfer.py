@@ -6,7 +6,9 @@ coordinator's hash before an episode runs on it.
 
 from __future__ import annotations
 
+import re
 import zlib
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -14,10 +16,12 @@ import msgspec
 from bridge.codec import decode, encode
 from cosim.core.errors import EngineError, unwritable
 from cosim.core.files import atomic_folder
+from cosim.place.scan import SCAN_FOLDER
 from cosim.spec.scenario import CityMap, Place
 from scenarios.places.nets import place
 from scenarios.runs.protocol import NetPart
 from sumo_nets.maps.feature_file import FEATURES_FILE
+from sumo_nets.maps.ground_file import GROUND_FILE
 from sumo_nets.maps.map_store import (
     ABOUT,
     MAP_NAME_PATTERN,
@@ -32,7 +36,9 @@ _PART_BYTES: Final = 2 << 20
 _MOST_BYTES: Final = 1 << 30
 """Size limit in bytes of a map, packed and unpacked."""
 _NET: Final = "net.xml"
-_FILES: Final = (_NET, ABOUT, FEATURES_FILE)
+_FILES: Final = (_NET, ABOUT, FEATURES_FILE, GROUND_FILE)
+_SCAN_FILE: Final = re.compile(SCAN_FOLDER + r"/[a-z0-9-]+\.[a-z0-9]+", re.ASCII)
+"""Pattern of the files of a scan, as they are sent."""
 
 
 def travels(where: Place) -> bool:
@@ -71,9 +77,7 @@ class Nets:
             raise EngineError(f"this run has no map '{digest}' to hand out")
         if digest not in self._packed:
             folder = map_net(where).parent
-            files = {
-                name: (folder / name).read_bytes() for name in _FILES if (folder / name).exists()
-            }
+            files = {name: (folder / name).read_bytes() for name in _files_in(folder)}
             self._packed[digest] = zlib.compress(msgspec.msgpack.encode(files), 1)
         return self._packed[digest]
 
@@ -83,6 +87,13 @@ class Nets:
         packed = self.packed(digest)
         begin = decode(payload, NetPart).begin
         return encode(NetPart(begin, len(packed), packed[begin : begin + _PART_BYTES]))
+
+
+def _files_in(folder: Path) -> list[str]:
+    """Return the names of the files of a map that are sent."""
+    scan = sorted(f"{SCAN_FOLDER}/{path.name}" for path in (folder / SCAN_FOLDER).glob("*.*"))
+    names = [*_FILES, *(name for name in scan if _SCAN_FILE.fullmatch(name))]
+    return [name for name in names if (folder / name).is_file()]
 
 
 class Fetched:
@@ -125,11 +136,13 @@ class Fetched:
             files = decode(opened.decompress(packed, _MOST_BYTES), dict[str, bytes])
         except zlib.error as error:
             raise EngineError(f"map '{name}' was damaged on its way: {error}") from error
-        if not MAP_NAME_PATTERN.fullmatch(name) or not {_NET, ABOUT} <= files.keys() <= set(_FILES):
+        known = all(name in _FILES or _SCAN_FILE.fullmatch(name) for name in files)
+        if not (MAP_NAME_PATTERN.fullmatch(name) and known and {_NET, ABOUT} <= files.keys()):
             raise EngineError(f"what came as map '{name}' is none")
         try:
             with atomic_folder(folder / name, existing="keep") as ready:
                 for file, data in files.items():
+                    (ready / file).parent.mkdir(exist_ok=True)
                     (ready / file).write_bytes(data)
                 if (found := map_hash(ready / _NET)) != self.digest:
                     raise EngineError(

@@ -172,7 +172,8 @@ def run_spec(
         policy_runs=driver.runs,
     )
     if manifest.camera is not None:
-        setup = msgspec.structs.replace(setup, renderer=renderer_of(chosen_camera(options.camera)))
+        drawn_by = renderer_of(chosen_camera(options.camera), options.appearance)
+        setup = msgspec.structs.replace(setup, renderer=drawn_by)
     return RunSpec(
         suite=whole.name,
         robots={robot.name: robot_hash(robot) for robot in robots},

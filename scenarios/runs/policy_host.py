@@ -3,6 +3,9 @@ renderer."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from secrets import token_hex
+
 import msgspec
 
 from bridge.policy_server import ActRequest, EndRequest, PackedArray, ResetRequest, pack_array
@@ -10,8 +13,10 @@ from cosim.core.errors import UsageError
 from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer, when
 from cosim.policies.load import REMOTE_SCHEME, load_policy
 from cosim.policies.user_module import importable_name
+from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import PolicyHost, RendererAddress
+from cosim.spec.run_config import RunConfig
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_link import RendererLink, link_to
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
@@ -47,6 +52,18 @@ def policy_driver(
     if host.isolated != "no":
         return isolated_driver(name, timer, expected, host, start_s)
     return load_policy(name, timer, start_s)
+
+
+def host_of(config: RunConfig, servers: tuple[Connection, ...] = ()) -> PolicyHost:
+    """Return where the policy of a run or check is queried. servers: of a remote policy."""
+    return PolicyHost(
+        isolated=config.isolated,
+        data=tuple(str(Path(path).absolute()) for path in config.policy_data),
+        memory_gb=config.policy_memory,
+        hidden=() if config.out is None else (str(config.out.absolute()),),
+        servers=servers,
+        run=token_hex(8),
+    )
 
 
 def settled_host(host: PolicyHost, driver: PolicyCaller) -> PolicyHost:

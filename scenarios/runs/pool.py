@@ -23,7 +23,7 @@ from cosim.episode.manifest_checks import with_goal
 from cosim.results.record import Record, Status
 from cosim.results.run_folder import FailedAttempt, RunFolder
 from cosim.results.run_setup import NO_RENDERER
-from cosim.spec.episode_id import episode_id_of
+from cosim.spec.episode_id import drives_second, episode_id_of
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.faults import RULES, Failure, failure_of_result
@@ -114,8 +114,8 @@ class _Pool:
         worker = next(idle, None) or self._transport.start(self._hello)
         self._workers[worker] = scenario
         self._folder.forget(scenario.id)
-        last = self._queue.on_last_attempt(scenario)
-        worker.give(Job(scenario, self._options, self._setup, last_attempt=last))
+        last, second = self._queue.on_last_attempt(scenario), self._queue.is_second(scenario)
+        worker.give(Job(scenario, self._options, self._setup, last_attempt=last, second=second))
         log_event("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
@@ -290,12 +290,17 @@ class _AttemptQueue:
     """Queue of the scenarios of a run, with a count of their failed attempts.
 
     They are sorted by pseudonym, so that a policy cannot identify a scenario by counting episodes.
+    With decoys they have two halves, with one of each pair, because both begin with the same view:
+    a policy must not remember the first one.
     Failed attempts are stored in the run folder, so that a resumed run continues the count.
     """
 
     def __init__(self, folder: RunFolder, scenarios: Sequence[Scenario]) -> None:
         self._folder = folder
-        self._waiting = deque(sorted(scenarios, key=partial(episode_id_of, folder.spec.setup.seed)))
+        self._seed = folder.spec.setup.seed
+        self._has_decoys = any(one.decoy_of for one in scenarios)
+        by_pseudonym = sorted(scenarios, key=partial(episode_id_of, self._seed))
+        self._waiting = deque(sorted(by_pseudonym, key=self.is_second))
         self._failed = folder.failed_attempts()
 
     def __len__(self) -> int:
@@ -312,6 +317,10 @@ class _AttemptQueue:
     def remove(self, scenario: Scenario) -> None:
         """Remove a scenario that waits."""
         self._waiting.remove(scenario)
+
+    def is_second(self, scenario: Scenario) -> bool:
+        """Return whether a scenario belongs to the second half."""
+        return self._has_decoys and drives_second(self._seed, scenario)
 
     def on_last_attempt(self, scenario: Scenario) -> bool:
         """Return whether the next failure of a scenario is its last, unless its machine is lost."""

@@ -38,7 +38,7 @@ from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Place, Scenario
 from physics.cameras.choice import renderer_of
 from physics.dynamics.world import BulletWorld
-from physics.street.street_surface import StreetSurface
+from physics.street.surface import PlaceSurface
 from scenarios.ipc.deadlines import PendingCallMemory
 from scenarios.ipc.messages import Ready, decode_hello
 from scenarios.ipc.observation_codec import ObservationDecoder
@@ -52,7 +52,7 @@ from scenarios.ipc.render_protocol import (
     encode_exchange,
 )
 from scenarios.ipc.shared_memory import SharedMemory, room_for
-from scenarios.places.nets import place
+from scenarios.places.nets import make_surface, place
 from scenarios.runs.worker import load_run_policy, send_to_run
 
 if TYPE_CHECKING:
@@ -89,8 +89,9 @@ def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
         if (spec := hello.manifest.camera) is not None:
             from physics.cameras.gl.atlas import Atlas  # needs OpenGL
 
-            atlas = stack.enter_context(Atlas(spec))
-            drawn_by = renderer_of("gl")
+            appearance = hello.renderer.appearance
+            atlas = stack.enter_context(Atlas(spec, appearance))
+            drawn_by = renderer_of("gl", appearance)
         rendered = Rendered(hello.renderer.number, drawn_by)
         renderer = _Renderer(rendered, room_for(hello.manifest), atlas, desk, partial(say, Ready()))
         renderer.serve(socket.socket(fileno=listening), pipe)
@@ -325,7 +326,6 @@ def _refused(error: Exception) -> Refusal:
 
 
 @lru_cache(maxsize=_PLACES_KEPT)
-def _surface(where: Place) -> StreetSurface:
+def _surface(where: Place) -> PlaceSurface:
     """Return the surface of a place, shared by all environments in it."""
-    _, street_map = place(where)
-    return StreetSurface(street_map, where.seed, where.roughness)
+    return make_surface(where, place(where)[1])

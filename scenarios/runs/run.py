@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from secrets import token_hex
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
@@ -33,6 +32,7 @@ from cosim.spec.selection import select_scenarios
 from scenarios.ipc.messages import MessageHandler
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
+from scenarios.runs.policy_host import host_of
 from scenarios.runs.pool import run_all
 from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import HeldRun, TransportFactory
@@ -283,15 +283,7 @@ def _planned(
         return planned_run(
             config, whole, of_run, policy=given.policy, options=given.options, host=given.host
         )
-    host = PolicyHost(
-        isolated=config.isolated,
-        data=tuple(str(Path(path).absolute()) for path in config.policy_data),
-        memory_gb=config.policy_memory,
-        hidden=() if config.out is None else (str(config.out.absolute()),),
-        servers=ends.servers,
-        run=token_hex(8),
-    )
-    return planned_run(config, whole, of_run, host=host)
+    return planned_run(config, whole, of_run, host=host_of(config, ends.servers))
 
 
 def _default_folder(plan: PlannedRun, stack: ExitStack, *, temporary: bool) -> Path:
@@ -372,6 +364,7 @@ def measured_latency(
         goal=options.goal,
         own_camera=options.own_camera,
         camera=options.camera,
+        appearance=options.appearance,
         real_time=True,
     )
     row = run(whole, policy, scenarios=[first.id], options=real_time, host=host).iloc[0]
@@ -442,7 +435,12 @@ def _run_todo(
         renderer = None
         if plan.config.shared_renderer:
             logs = run.held.path / "logs"
-            renderer = SharedRenderer(logs, run.hello, asks=plan.driver.batches)
+            renderer = SharedRenderer(
+                logs,
+                run.hello,
+                asks=plan.driver.batches,
+                appearance=plan.options.appearance,
+            )
             stack.enter_context(renderer)
         transport, tell = stack.enter_context(create_transport(run, tell))
         run_all(

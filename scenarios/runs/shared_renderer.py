@@ -19,6 +19,7 @@ import msgspec
 from cosim.core.errors import MachineError, UsageError
 from cosim.episode.policy_caller import PolicyCaller
 from cosim.spec.options import CameraName, RendererAddress
+from cosim.spec.run_config import Appearance
 from scenarios.ipc.child_process import ChildProcess, Watchdog
 from scenarios.ipc.messages import Hello, encode_message
 
@@ -48,12 +49,16 @@ class SharedRenderer:
     logs: folder for the output of renderers.
     hello: introduces the policy of the run.
     asks: whether the renderer also queries the policy.
+    appearance: of scanned places.
     at: its address for environments.
     """
 
-    def __init__(self, logs: Path, hello: Hello, *, asks: bool) -> None:
+    def __init__(
+        self, logs: Path, hello: Hello, *, asks: bool, appearance: Appearance = "splats"
+    ) -> None:
         self._logs = logs
-        self.at = RendererAddress(address=f"cosim-renderer-{secrets.token_hex(8)}", asks=asks)
+        address = f"cosim-renderer-{secrets.token_hex(8)}"
+        self.at = RendererAddress(address=address, asks=asks, appearance=appearance)
         self._hello = msgspec.structs.replace(hello, renderer=self.at)
         self._listening = socket.socket(socket.AF_UNIX)
         self._watchdog: Watchdog | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
@@ -37,6 +38,12 @@ def load_suite(name: str) -> Suite:
         return _own(Path(name))
     if name not in SUITES:
         raise unknown("suite", name, [*SUITES, "path/to/suite.json", "path/to/own.toml"])
+    return _shipped(name)
+
+
+@cache
+def _shipped(name: str) -> Suite:
+    """Read a shipped suite, once per process."""
     return read_suite(SUITES[name], EVENT_KINDS)
 
 

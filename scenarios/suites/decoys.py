@@ -1,13 +1,17 @@
-"""Decoys of reactive scenarios, and the limits that follow from the proofs of the expert."""
+"""Decoys of reactive scenarios, where their people stay, and limits by the proofs of the expert."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Final
 
 import msgspec
+import shapely
 
+from cosim.core.state import PERSON_RADIUS_M
 from cosim.spec.events import EventKinds
+from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 from scenarios.events import EVENT_KINDS
 
@@ -43,6 +47,11 @@ def has_decoy(scenario: Scenario) -> bool:
     return scenario.ends_on_failure and bool(scenario.events) and not scenario.decoy_of
 
 
+def must_give_way(scenario: Scenario, kinds: EventKinds = EVENT_KINDS) -> bool:
+    """Return whether the robot must give way in a scenario, at the pace that its decoy requires."""
+    return has_decoy(scenario) and any(kinds[event.kind].gives_way for event in scenario.events)
+
+
 def differing_fields(scenario: Scenario, decoy: Scenario) -> list[str]:
     """Return the fields in which a decoy differs from its scenario, but must not."""
     should = msgspec.structs.replace(
@@ -51,6 +60,19 @@ def differing_fields(scenario: Scenario, decoy: Scenario) -> list[str]:
     return [
         name for name in decoy.__struct_fields__ if getattr(decoy, name) != getattr(should, name)
     ]
+
+
+def people_in_obstacles(scenario: Scenario, kinds: EventKinds = EVENT_KINDS) -> Iterator[str]:
+    """Yield the people of a short scenario who may stay inside an obstacle after the trigger."""
+    if not scenario.ends_on_failure or not scenario.obstacles:
+        return
+    obstacles = shapely.union_all([footprint(one) for one in scenario.obstacles])
+    for event in scenario.events:
+        for number in range(event.people):
+            places = kinds[event.kind].stays_of(event, number)
+            inside_m = PERSON_RADIUS_M - obstacles.distance(shapely.MultiPoint(places).convex_hull)
+            if places and inside_m > 0.0:
+                yield f"person '{event.names[number]}' stays {inside_m:.2f} m inside an obstacle"
 
 
 def time_limit_s(scenario: Scenario, expert_s: float) -> float:
@@ -63,8 +85,11 @@ def time_limit_s(scenario: Scenario, expert_s: float) -> float:
 def least_pace_mps(scenario: Scenario, expert_mps: float | None) -> float:
     """Return `go_on_mps` of a scenario past whose person the expert drives at expert_mps.
 
-    It is 0 for all scenarios but decoys in which nothing happens.
+    It follows from this speed in decoys in which nothing happens. A scenario in which the robot
+    must give way has that of its decoy already. It is 0 for all others.
     """
+    if must_give_way(scenario):
+        return scenario.go_on_mps
     if expert_mps is None or not any(event.decoy for event in scenario.events):
         return 0.0
     return round(GO_ON_SHARE * expert_mps, _GO_ON_DIGITS)

@@ -20,7 +20,7 @@ from cosim.place.barriers import barrier_at, ground_around, ports_to_close, prov
 from cosim.place.car_paths import CAR_WIDTH_M, distance_to_car_paths_m
 from cosim.place.map_check import on_road_shares
 from cosim.place.route_line import ROUTE_M, START_M, way_line
-from cosim.place.street_map import Lane, Port, StreetMap
+from cosim.place.street_map import Lane, Port, StreetMap, ports_of
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventKinds
 from cosim.spec.robot import COURIER, Robot
@@ -61,10 +61,20 @@ _KERB_M = 0.5
 _SAMPLE_M = 0.5
 
 CROSSING_EVERY_M = 160.0
+SCAN_ROUTE_M = (60.0, ROUTE_M[1])
+"""Minimum and maximum length of a route on a scan, in metres; it need not cross a street."""
 LENGTH_SLACK_M = 3.0
 """Largest deviation of a way from its wanted length, in metres."""
 _END_M = 8.0
 """Least distance of a goal from the ends of its sidewalk, in metres."""
+_SHARES = (0.4, 0.7)
+"""Range of the shares of the first and last sidewalk that a route uses."""
+_SCAN_END_M = 1.5
+"""The same as _END_M on a scan, where streets are short."""
+_SCAN_SHARES = (0.4, 0.95)
+"""The same as _SHARES on a scan."""
+_SCAN_START_M = 5.0
+"""Minimum length of the first and last sidewalk of a route on a scan, in metres."""
 
 SEARCHES = 150
 """Number of ways that are searched if no draw fits."""
@@ -179,11 +189,12 @@ def _on_wide_sidewalks(draft: _Draft, candidates: Sequence[str]) -> Scenario | N
 
 def starts(street_map: StreetMap, graph: WalkGraph) -> list[str]:
     """Return the sidewalks on which long ways start and end."""
+    least_m = _SCAN_START_M if street_map.scanned else START_M
     return sorted(
         strip_id
         for strip_id in graph.main_strips
         if street_map.strips[strip_id].kind == "sidewalk"
-        and street_map.strips[strip_id].length_m >= START_M
+        and street_map.strips[strip_id].length_m >= least_m
         if strip_id not in street_map.steep
     )
 
@@ -238,12 +249,14 @@ def lone_route(
     if length_m is not None:
         # Corners are cut; the last sidewalk is walked farther by the distance saved.
         ends_m[1] += length_m - route.length_m
-        if not _END_M <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - _END_M:
+        end_m = _SCAN_END_M if street_map.scanned else _END_M
+        if not end_m <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - end_m:
             raise SpecError("no goal at the wanted distance")
         route = _line(street_map, way, *ends_m)
         if abs(route.length_m - length_m) > LENGTH_SLACK_M:
             raise SpecError("the line is not of the wanted length")
-    if not ROUTE_M[0] <= route.length_m <= 1.2 * ROUTE_M[1]:
+    low_m, high_m = _lengths_m(street_map)
+    if not low_m <= route.length_m <= 1.2 * high_m:
         raise SpecError("length of the line does not fit")
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
@@ -339,11 +352,11 @@ def draw_way(
 
     Returns (way, start_m, goal_m), as for `way_line`.
     """
-    target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
+    target_m = rng.uniform(*_lengths_m(street_map)) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
-    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
-    closed = street_map.too_steep | {leave.other} | _ports_of(avoided)
+    start_m = float(rng.uniform(*_shares(street_map))) * strip.length_m
+    closed = street_map.too_steep | {leave.other} | ports_of(avoided)
     reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
     goals = [
         port
@@ -361,12 +374,12 @@ def draw_way(
     if any(street_map.strips[port.strip].short_green for port in way):
         raise SpecError("the way crosses at a signal whose green is too short to walk")
     crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
-    if crossed < max(1, round(target_m / CROSSING_EVERY_M)):
+    if crossed < _least_crossings(street_map, target_m):
         raise SpecError("the way crosses too few streets")
     goal_strip = street_map.strips[goal.strip]
     if length_m is not None:
         return way, start_m, length_m - start_m - reach.to(goal)
-    return way, start_m, float(rng.uniform(0.4, 0.7)) * goal_strip.length_m
+    return way, start_m, float(rng.uniform(*_shares(street_map))) * goal_strip.length_m
 
 
 def search_way(
@@ -380,11 +393,11 @@ def search_way(
     """Search a way as `draw_way` does, but without the `avoided` strips and to any reachable
     goal.
     """
-    target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
+    target_m = rng.uniform(*_lengths_m(street_map)) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
-    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
-    closed = street_map.too_steep | {leave.other} | _ports_of(avoided)
+    start_m = float(rng.uniform(*_shares(street_map))) * strip.length_m
+    closed = street_map.too_steep | {leave.other} | ports_of(avoided)
     reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
     ends = set(candidates)
     goals = [
@@ -397,20 +410,34 @@ def search_way(
         if way is None or len({port.strip for port in way}) * 2 != len(way) + 2:
             continue
         crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
-        if crossed >= max(1, round(target_m / CROSSING_EVERY_M)):
+        if crossed >= _least_crossings(street_map, target_m):
             if length_m is not None:
                 return way, start_m, length_m - start_m - reach.to(goals[i])
             return (
                 way,
                 start_m,
-                float(rng.uniform(0.4, 0.7)) * street_map.strips[goals[i].strip].length_m,
+                float(rng.uniform(*_shares(street_map)))
+                * street_map.strips[goals[i].strip].length_m,
             )
     raise SpecError("no way of the drawn length crosses a street every 160 m")
 
 
-def _ports_of(strips: Set[str]) -> set[Port]:
-    """Return both ends of each strip."""
-    return {port for strip in strips for port in (Port(strip, 0), Port(strip, 1))}
+def _lengths_m(street_map: StreetMap) -> tuple[float, float]:
+    """Return the minimum and maximum length of a drawn route, in metres."""
+    if not street_map.scanned:
+        return ROUTE_M
+    low_m, high_m = SCAN_ROUTE_M
+    whole_m = sum(strip.length_m for strip in street_map.strips.values())
+    return low_m, min(max(whole_m, low_m), high_m)
+
+
+def _shares(street_map: StreetMap) -> tuple[float, float]:
+    return _SCAN_SHARES if street_map.scanned else _SHARES
+
+
+def _least_crossings(street_map: StreetMap, length_m: float) -> int:
+    """Return the least number of crossings on a route of a length."""
+    return 0 if street_map.scanned else max(1, round(length_m / CROSSING_EVERY_M))
 
 
 def route_crossings(

@@ -35,7 +35,7 @@ from cosim.spec.robot import Robot, robot_called
 from cosim.spec.scenario import Scenario
 from physics.street.furniture import footprints
 from physics.street.placement import driveway_ground
-from physics.street.street_surface import StreetSurface
+from scenarios.places.nets import make_surface
 
 PER_100M: Final = (4.0, 8.0)
 """Least and largest number of obstacles along 100 m of sidewalk. Each scenario draws its own
@@ -214,8 +214,7 @@ class Room:
         self._width_m = robot.width_m
         self._start = Point(scenario.start[:2])
         self._goal = Point(scenario.goal)
-        surface = StreetSurface(street_map, scenario.place.seed)
-        standing = footprints(surface.standing(area))
+        standing = footprints(make_surface(scenario.place, street_map).standing(area))
         self.props = [ground for ground in standing if area.intersects(ground)]
         walkable = without_barriers(street_map.walkable_near(area), scenario.barriers)
         self._free = overlay.difference(

@@ -48,6 +48,8 @@ _REAL_ROUTES: Final = {
 ALL_ROUTES_M: Final = 36_500.0
 _SHORTEST_M: Final = 120.0
 _DIGITS: Final = 4
+_REDRAW_SEEDS: Final = 1_000_000
+"""Number of seeds of each redraw of a suite. About 4,000 redraws fit into the range of seeds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +62,7 @@ class Slot:
     like: name of the slot whose scenario it repeats without its events.
     decoy_of: name of the slot with whose scenario its own is drawn and proved.
     wanted: what is drawn before the place of a reactive scenario.
+    redraw: number of the draw; 0 is that of the shipped suite.
     """
 
     name: str
@@ -72,6 +75,11 @@ class Slot:
     like: str = ""
     decoy_of: str = ""
     wanted: Wanted | None = None
+    redraw: int = 0
+
+    def seed(self, attempt: int) -> int:
+        """Return the seed of a candidate."""
+        return _REDRAW_SEEDS * self.redraw + 1000 * attempt + self.number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +91,27 @@ class SuiteRecipe:
     purpose: str
     slots: Sequence[Slot] = field(repr=False)
     draw: Callable[[Slot, StreetMap, WalkGraph, int], Scenario]
+
+
+def recipe_of(name: str, redraw: int = 0) -> SuiteRecipe:
+    """Return the recipe of a suite, or that of a redraw with other seeds.
+
+    redraw: its number, at most 4000; 0 for the shipped suite.
+    """
+    recipe = RECIPES[name]
+    if not redraw:
+        return recipe
+    return replace(
+        recipe,
+        version=f"{recipe.version}-redraw-{redraw}",
+        slots=[_redrawn(slot, redraw) for slot in recipe.slots],
+    )
+
+
+def _redrawn(slot: Slot, redraw: int) -> Slot:
+    if slot.wanted is None:
+        return replace(slot, redraw=redraw)
+    return replace(slot, redraw=redraw, wanted=_wanted(slot.structure, redraw)[slot.where.seed])
 
 
 def candidate(slot: Slot, seed: int) -> Scenario:
@@ -175,7 +204,8 @@ def _reactive_slots() -> list[Slot]:
     return found
 
 
-def _wanted(kind: str) -> dict[int, Wanted]:
+@lru_cache(maxsize=len(EVENT_KINDS))
+def _wanted(kind: str, redraw: int = 0) -> Mapping[int, Wanted]:
     """Return what is drawn before the place, by the seed of the city.
 
     In each split, lengths and positions are evenly spread, and sides equally frequent. Each
@@ -185,7 +215,8 @@ def _wanted(kind: str) -> dict[int, Wanted]:
     for split in get_args(Split):
         seeds = [city.seed for _, city in _cities() if _split_of(city) == split]
         named = zlib.crc32(f"{kind} {split}".encode())
-        rngs = [np.random.default_rng([named, purpose]) for purpose in range(4)]
+        other = (redraw,) if redraw else ()
+        rngs = [np.random.default_rng([named, purpose, *other]) for purpose in range(4)]
         count = len(seeds)
         lengths_m = WAY_M[0] + (WAY_M[1] - WAY_M[0]) * _even(rngs[0].permutation(count))
         shares = _even(rngs[1].permutation(count))

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from cosim.core.errors import MapError, SpecError, unknown
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import EventKind, EventKinds
+from cosim.spec.events import EventKinds
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
-from scenarios.suites import long_horizon, reactive
+from scenarios.suites import long_horizon, reactive, unit
 from scenarios.suites.drawing import passable
+from scenarios.suites.unit import STRUCTURES
 from sumo_nets.maps.place_names import resolve_place
 
-_KINDS = ("long-horizon", "reactive")
+_KINDS = ("long-horizon", "reactive", "unit")
 
 
 def suite_on_map(
@@ -34,14 +35,16 @@ def suite_on_map(
 ) -> Suite:
     """Draw a suite on a place; the same arguments and net give the same suite.
 
-    count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one
-    of each by default. events: which of them; those for which the place has no room are left out,
-    and the description says so, unless they were asked for. Where sidewalks are few or narrow,
-    fewer people walk, and none in groups; long routes prefer wide sidewalks: see `passable` and
-    `build_long_horizon`. roughness: of the ground, from 0 (flat) to 1. kinds: the table of events
-    that there are. robot: which one the ways are wide enough for.
+    count: of long-horizon scenarios, 1 by default; of reactive and unit ones, whose events or
+        structures take turns, one of each by default.
+    roughness: of the ground, from 0 (flat) to 1.
+    events: draw only these. Without them, an event or structure for which the place has no room is
+        left out, and the description says so.
+    kinds: table of the existing events.
+    robot: robot for which the ways are wide enough.
 
-    Fewer people walk where sidewalks are few or narrow, and none in groups: a robot could not pass.
+    Where sidewalks are few or narrow, fewer people walk, and none in groups: a robot could not
+    pass. Long routes prefer wide sidewalks (`build_long_horizon`).
 
     Raises UsageError for another kind of suite, and the errors of the place and the builder.
     """
@@ -54,9 +57,12 @@ def suite_on_map(
     _, street_map = place(where)
     name = where.map if isinstance(where, CityMap) else where.name
     drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed, kinds, robot)
-    scenarios, left_out = (
-        drawn.long(count or 1) if kind == "long-horizon" else drawn.reactive(count, events)
-    )
+    if kind == "long-horizon":
+        scenarios, left_out = drawn.long(count or 1), list[str]()
+    elif kind == "reactive":
+        scenarios, left_out = drawn.in_turns(kind, kinds, drawn.event, count, events)
+    else:
+        scenarios, left_out = drawn.in_turns(kind, STRUCTURES, drawn.unit, count)
     return Suite(
         name=kind,
         version=f"map-{name}-{seed}" + (f"-rough{roughness:g}" if roughness else ""),
@@ -76,8 +82,8 @@ class _Drawn(NamedTuple):
     kinds: EventKinds
     robot: Robot
 
-    def long(self, count: int) -> tuple[list[Scenario], list[str]]:
-        """Draw `count` long-horizon scenarios; the list of sentences is empty."""
+    def long(self, count: int) -> list[Scenario]:
+        """Draw `count` long-horizon scenarios."""
         seeds = range(self.seed, self.seed + count)
         ids = [f"{self.name}-{seed:03d}" for seed in seeds]
         build = partial(
@@ -85,35 +91,61 @@ class _Drawn(NamedTuple):
         )
         return [
             build(seed, name, self.robot, self.kinds) for seed, name in zip(seeds, ids, strict=True)
-        ], []
+        ]
 
-    def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
-        """Draw `count` reactive scenarios, whose events take turns.
+    def in_turns(
+        self,
+        suite: str,
+        names: Iterable[str],
+        draw: Callable[[str, int], Scenario],
+        count: int | None,
+        asked: Sequence[str] = (),
+    ) -> tuple[list[Scenario], list[str]]:
+        """Draw `count` scenarios by name, which take turns.
 
-        Returns the scenarios, and a sentence for each event without room.
+        asked: only these names, each of which must have room.
+        Returns the scenarios, and a sentence for each name without room.
         """
-        kinds = [kind for kind in self.kinds.values() if kind.name in asked or not asked]
+        left = [name for name in names if name in asked or not asked]
         found: list[Scenario] = []
         left_out: list[str] = []
         for seed in itertools.count(self.seed):
-            for kind in list(kinds):
+            for name in list(left):
                 try:
-                    found.append(self._one(kind, seed))
+                    found.append(draw(name, seed))
                 except (SpecError, MapError) as refusal:
                     if asked:
                         raise
-                    kinds.remove(kind)
-                    left_out.append(f"No '{kind.name}': {refusal}.")
+                    left.remove(name)
+                    left_out.append(f"No '{name}': {refusal}.")
                 if count is not None and len(found) == count:
                     return found, left_out
-            if count is None or not kinds:
+            if count is None or not left:
                 break
         if not found:
-            raise SpecError(f"no reactive scenario fits on '{self.name}': {' '.join(left_out)}")
+            raise SpecError(f"no {suite} scenario fits on '{self.name}': {' '.join(left_out)}")
         return found, left_out
 
-    def _one(self, kind: EventKind, seed: int) -> Scenario:
-        scenario_id = f"{kind.name}-{self.name}-{seed:03d}"
+    def event(self, kind: str, seed: int) -> Scenario:
+        """Draw a reactive scenario with an event of a kind."""
         return reactive.build_reactive(
-            kind, self.where, self.street_map, self.graph, seed, scenario_id, self.robot
+            self.kinds[kind],
+            self.where,
+            self.street_map,
+            self.graph,
+            seed,
+            f"{kind}-{self.name}-{seed:03d}",
+            self.robot,
+        )
+
+    def unit(self, structure: str, seed: int) -> Scenario:
+        """Draw a unit scenario of a structure."""
+        return unit.build_unit(
+            cast(unit.Structure, structure),
+            self.where,
+            self.street_map,
+            self.graph,
+            seed,
+            f"{structure}-{self.name}-{seed:03d}",
+            self.robot,
         )

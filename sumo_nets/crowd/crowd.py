@@ -32,7 +32,7 @@ from cosim.people.yielding import (
     StandingObstacles,
     outline_mps,
 )
-from cosim.place.street_map import Port, StreetMap
+from cosim.place.street_map import Port, StreetMap, ports_of
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
@@ -49,6 +49,7 @@ from sumo_nets.crowd.demand import (
 from sumo_nets.crowd.demand_log import Entrances
 from sumo_nets.crowd.empty_street import TICK_MS, sumo_start
 from sumo_nets.crowd.following_gaps import FollowingGaps
+from sumo_nets.crowd.free_space import InnerGround
 from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.lights import Signals, SumoLights, WaitingSpots
 from sumo_nets.crowd.proxy import Proxy, Walks
@@ -103,7 +104,8 @@ class SumoCrowd(Crowd):
         self._map = street_map
         self._spec = spec
         self._seed = seed
-        self._closed = closed
+        self._closed = closed | ports_of(street_map.uncrowded)
+        self._ground = InnerGround(street_map) if street_map.scanned else None
         self._start_xy = start_xy
         self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
         self._before = before
@@ -272,6 +274,8 @@ class SumoCrowd(Crowd):
         if red := self._signals.red(persons.ahead):
             xy = xy.copy()
             xy[red] = self._kerbs.behind([persons.ahead[i] for i in red], xy[red])
+        if self._ground is not None:
+            xy = self._ground.nearest(xy)
         shown = self._poses.update(
             persons.names, xy, persons.mps, _facing, body, positions_of(cast)
         )

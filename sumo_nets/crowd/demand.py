@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import groupby
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -38,6 +38,8 @@ _PERSONAL_SPACE_M = 1.5
 """Smallest distance of an entering person from others, metres."""
 _WALK_EDGES = 30
 """Number of edges of a random walk."""
+_END_SHARES: Final[Mapping[int | None, float]] = {None: 0.5, 0: 0.01, 1: 0.99}
+"""Share of the last edge's length at which a walk ends, by the dead end of that edge."""
 BARRIER_MARGIN_M = 1.0
 """Additional distance of entries from a closed port, metres."""
 PERSONS_AT_ONCE = 8
@@ -101,10 +103,11 @@ class Pedestrians:
             (
                 (s.id, s.line, self._margin_m(Port(s.id, 0)), self._margin_m(Port(s.id, 1)))
                 for s in street_map.strips.values()
-                if s.kind == "sidewalk"
+                if s.kind == "sidewalk" and s.id not in street_map.uncrowded
             ),
             step_m=2.0,
         )
+        self._edge_spots = Spots(_at_edge(street_map) if street_map.scanned else (), step_m=2.0)
         self._room = None if spec.density is None else LocalWalkableArea(street_map, spec.radius_m)
         rng_groups, self._rng_gaps = rng.spawn(2)
         self._groups = GroupDraws(spec, rng_groups)
@@ -176,14 +179,15 @@ class Pedestrians:
     def _enter(
         self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]
     ) -> None:
-        if count <= 0 or not (ring := self._spots.ring(x_m, y_m, low_m, self._spec.radius_m)):
+        if count <= 0 or not (ring := self._ring(x_m, y_m, low_m)):
             return
         taken = np.array([(p.x_m, p.y_m) for p in seen.values()], dtype=float).reshape(-1, 2)
         for _ in range(4 * count):
             group = self._groups.coming
             if 2 * count < group.size:
                 return
-            spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
+            spots, place = ring[int(self._rng.integers(len(ring)))]
+            spot = spots[place]
             forward = bool(self._rng.random() < 0.5)
             drawn_mps = float(self._rng.uniform(*group.pace_mps))
             width_m = self._widths_m[spot.edge]
@@ -215,6 +219,13 @@ class Pedestrians:
             if count <= 0:
                 return
 
+    def _ring(self, x_m: float, y_m: float, low_m: float) -> list[tuple[Spots, tuple[int, int]]]:
+        """Return the spots where persons may enter; at the edge of a scan also in sight."""
+        far_m = self._spec.radius_m
+        found = [(self._spots, spot) for spot in self._spots.ring(x_m, y_m, low_m, far_m)]
+        near = self._edge_spots.ring(x_m, y_m, FIRST_FILL_CLEAR_M, low_m)
+        return found + [(self._edge_spots, spot) for spot in near]
+
     def _one_way(self, walk: list[str], forward: bool) -> list[str]:
         """Return a walk with a unique direction for SUMO.
 
@@ -244,13 +255,14 @@ class Pedestrians:
         gap_m: float,
     ) -> None:
         first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
+        until_m = _END_SHARES[self._dead_end(walk[-1])] * last_m
         angle_deg = heading_to_sumo(spot.pose.heading_rad)
         entry = PersonEntry(
             name,
             spot.edge,
             spot.share * first_m,
             tuple(walk),
-            last_m / 2,
+            until_m,
             speed_mps,
             xy,
             angle_deg,
@@ -262,6 +274,24 @@ class Pedestrians:
     def _let_in(self, entry: PersonEntry) -> None:
         entry.enter(self._engine)
         self._gaps.enter(entry.name, entry.gap_m)
+
+    def _dead_end(self, edge: str) -> int | None:
+        """Return the end of a walk's last edge at the edge of a scan; None elsewhere."""
+        strip = self._graph.street_map.strips.get(edge)
+        if strip is None or not self._graph.street_map.scanned or None not in strip.corners:
+            return None
+        return strip.corners.index(None)
+
+
+def _at_edge(street_map: StreetMap) -> Iterator[tuple[str, Floats, float, float]]:
+    """Yield lines as for `Spots`, with a spot at each dead end."""
+    for strip in street_map.strips.values():
+        room_m = strip.length_m - 2.0 * _EDGE_M
+        if strip.kind == "sidewalk" and strip.id not in street_map.uncrowded and room_m > _EDGE_M:
+            if strip.corners[0] is None:
+                yield strip.id, strip.line, _EDGE_M, room_m
+            if strip.corners[1] is None:
+                yield strip.id, strip.line, room_m, _EDGE_M
 
 
 class Drivers:

@@ -13,6 +13,8 @@ import shapely
 from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import StreetMap
 
+INSET_M: Final = 0.2
+"""Distance of the middles of people from the edge of a scan's ground, metres."""
 REMEASURE_M: Final = 5.0
 """Distance that the point moves before the area is measured again, metres."""
 
@@ -38,6 +40,24 @@ class LocalWalkableArea:
             near = self._polygons[self._tree.query(disk, predicate="intersects")]
             self._area_m2 = float(shapely.area(shapely.intersection(near, disk)).sum())
         return self._area_m2
+
+
+class InnerGround:
+    """Walkable ground of a scan, without its outermost part."""
+
+    def __init__(self, street_map: StreetMap) -> None:
+        self._inner = shapely.buffer(street_map.walkable, -INSET_M)
+        shapely.prepare(self._inner)
+
+    def nearest(self, xy: Floats) -> Floats:
+        """Return points (N, 2) inside, the nearest to each point that is outside, metres."""
+        outside = ~shapely.contains_xy(self._inner, xy[:, 0], xy[:, 1])
+        if not outside.any() or self._inner.is_empty:
+            return xy
+        xy = xy.copy()
+        lines = shapely.shortest_line(shapely.points(xy[outside]), self._inner)
+        xy[outside] = shapely.get_coordinates(lines)[1::2]
+        return xy
 
 
 class EntrySpot(NamedTuple):

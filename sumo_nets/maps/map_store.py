@@ -6,6 +6,8 @@ import dataclasses
 import gzip
 import hashlib
 import re
+import shutil
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -23,6 +25,7 @@ from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap, Place
 from sumo_nets.maps.feature_file import FEATURES_FILE, read_features, with_features, write_features
+from sumo_nets.maps.ground_file import GROUND_FILE, with_drawn_ground, with_scan
 from sumo_nets.maps.import_rules import IMPORTER_VERSION, WHEEL_PLACES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
 from sumo_nets.net.net_facts import read_facts
@@ -99,10 +102,7 @@ def import_map(
     is stored.
     """
     name = map_name(source) if name is None else name
-    if not MAP_NAME_PATTERN.fullmatch(name):
-        raise UsageError(
-            f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters"
-        )
+    _check_name(name)
     options = Options() if options is None else options
     if name in _supplied():
         if source != _supplied()[name] or options != Options():
@@ -161,19 +161,21 @@ def _is_outdated(folder: Path) -> bool:
 
 
 def read_map(place: CityMap | str) -> StreetMap:
-    """Return the StreetMap of a map, under the map's name, with its features."""
+    """Return the StreetMap of a map, under the map's name, with its features and drawn ground."""
     name = place if isinstance(place, str) else place.map
     path = map_net(place)
-    street_map = street_map_of(path)
+    street_map = with_drawn_ground(street_map_of(path), path.with_name(GROUND_FILE))
     features = read_features(path.with_name(FEATURES_FILE))
-    known_as = with_features(street_map.net_hash, path.with_name(FEATURES_FILE))
+    known_as = with_scan(
+        with_features(street_map.net_hash, path.with_name(FEATURES_FILE)), path.parent
+    )
     whole = dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
     return whole.with_source_hash(f"{street_map.made_of}-{known_as}")
 
 
 def map_hash(net: Path) -> str:
-    """Return the content hash of a map, of its net and the features next to it."""
-    return with_features(net_content_hash(net), net.with_name(FEATURES_FILE))
+    """Return the content hash of a map, of its net and the features and scan next to it."""
+    return with_scan(with_features(net_content_hash(net), net.with_name(FEATURES_FILE)), net.parent)
 
 
 def file_hash(path: Path) -> str:
@@ -214,6 +216,22 @@ def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
     )
 
 
+def delete_map(name: str) -> Path:
+    """Delete an imported map, and return its former folder.
+
+    Raises UsageError for a map that is not imported, MachineError if it cannot be deleted.
+    """
+    folder = maps_folder() / name
+    imported = sorted(one.name for one in known_maps().values() if one.origin == "imported")
+    if name not in imported:
+        raise unknown("imported map", name, imported)
+    try:
+        shutil.rmtree(folder)
+    except OSError as error:
+        raise unwritable(folder, error) from error
+    return folder
+
+
 def known_maps() -> dict[str, KnownMap]:
     """Return all places by name: imported maps, then nets with sidewalks from SUMO, whole and as
     crops."""
@@ -240,44 +258,78 @@ def _source_of(name: str) -> str:
         return "damaged: import it again"
 
 
-def _store(
-    source: Path, name: str, options: Options, progress: Progress = ignore, *, in_place: bool = True
+def store_map(name: str, fill: Callable[[Path], About]) -> About:
+    """Store a map that `fill` writes into a temporary folder, replace an earlier one of that name,
+    and return its origin.
+
+    fill: writes `net.xml` and what belongs to it, and returns the origin without its hash.
+    Raises what `fill` raises, UsageError for an unusable name, MachineError for a full disk.
+    Then nothing is stored.
+    """
+    _check_name(name)
+    if name in _supplied():
+        raise UsageError(
+            f"'{name}' is the name of a net that comes with SUMO: choose another with --name"
+        )
+    return _stored(name, fill, "replace")
+
+
+def _check_name(name: str) -> None:
+    if not MAP_NAME_PATTERN.fullmatch(name):
+        raise UsageError(
+            f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters"
+        )
+
+
+def _stored(
+    name: str, fill: Callable[[Path], About], existing: Literal["replace", "keep"]
 ) -> About:
-    """Convert a map in a temporary folder, then move it into place."""
+    """Let `fill` write a map into a temporary folder, then move it into place."""
     folder = maps_folder()
-    existing: Literal["replace", "keep"] = "replace" if in_place else "keep"
     try:
         with atomic_folder(folder / name, existing=existing) as ready:
-            with TemporaryDirectory(dir=ready) as scratch:
-                converted = convert(source, Path(scratch), options, progress)
-                converted.net.rename(ready / "net.xml")
-            if converted.features:
-                write_features(converted.features, ready / FEATURES_FILE)
-            about = About(
-                name=name,
-                source=source.name,
-                source_hash=file_hash(source),
-                format=" ".join(
-                    filter(None, (converted.format, converted.facts.version, converted.packing))
-                ),
-                imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
-                bbox=options.bbox,
-                lefthand=options.lefthand,
-                as_is=options.as_is,
-                sidewalk_width_m=options.sidewalk_width_m,
-                versions={
-                    "importer": str(IMPORTER_VERSION),
-                    "eclipse-sumo": version("eclipse-sumo"),
-                },
-                changes=converted.changes,
-                guessed_share=converted.guessed_share,
-                licences=_licences(name, source, converted.licences),
-                net_hash=map_hash(ready / "net.xml"),
-            )
+            about = fill(ready)
+            about = msgspec.structs.replace(about, net_hash=map_hash(ready / "net.xml"))
             (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
         return about
     except OSError as error:
         raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error
+
+
+def _store(
+    source: Path, name: str, options: Options, progress: Progress = ignore, *, in_place: bool = True
+) -> About:
+    """Convert a map and store it."""
+
+    def fill(ready: Path) -> About:
+        with TemporaryDirectory(dir=ready) as scratch:
+            converted = convert(source, Path(scratch), options, progress)
+            converted.net.rename(ready / "net.xml")
+        if converted.features:
+            write_features(converted.features, ready / FEATURES_FILE)
+        return About(
+            name=name,
+            source=source.name,
+            source_hash=file_hash(source),
+            format=" ".join(
+                filter(None, (converted.format, converted.facts.version, converted.packing))
+            ),
+            imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
+            bbox=options.bbox,
+            lefthand=options.lefthand,
+            as_is=options.as_is,
+            sidewalk_width_m=options.sidewalk_width_m,
+            versions={
+                "importer": str(IMPORTER_VERSION),
+                "eclipse-sumo": version("eclipse-sumo"),
+            },
+            changes=converted.changes,
+            guessed_share=converted.guessed_share,
+            licences=_licences(name, source, converted.licences),
+            net_hash="",
+        )
+
+    return _stored(name, fill, "replace" if in_place else "keep")
 
 
 def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
@@ -287,9 +339,15 @@ def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...
         licences.append(GAME_LICENCE)
     if name in WHEEL_PLACES and WHEEL_PLACES[name].osm:
         licences.append(OSM_LICENCE)
+    return (*licences, *licence_texts(source.resolve().parent))
+
+
+def licence_texts(folder: Path) -> tuple[str, ...]:
+    """Return the texts of the licence files in a folder."""
+    licences = []
     for name in ("LICENCE.txt", "LICENSE.txt", "LICENSE", "SOURCE.txt"):
         try:
-            text = (source.resolve().parent / name).read_text(errors="replace")
+            text = (folder / name).read_text(errors="replace")
         except OSError:
             continue
         lines = [line.strip() for line in text.splitlines() if line.strip()]

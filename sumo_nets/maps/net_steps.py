@@ -167,7 +167,15 @@ def widen_sidewalks(
 
 
 def start_sumo(file: MapFile, net: Path) -> None:
-    """Start SUMO on the net for a second: it refuses some nets that netconvert accepts."""
+    """Start SUMO on the net of a map file, as `start_net` does."""
+    start_net(net, str(file.source))
+
+
+def start_net(net: Path, source: str) -> None:
+    """Start SUMO on the net for a second: it refuses some nets that netconvert accepts.
+
+    source: name of the map in errors. Raises MapError, MachineError without SUMO.
+    """
     command = [
         str(sumo_home() / "bin" / "sumo"),
         "-n",
@@ -188,7 +196,7 @@ def start_sumo(file: MapFile, net: Path) -> None:
         )
     except subprocess.TimeoutExpired as error:
         raise MapError(
-            f"{file.source}: SUMO did not start on the net within {START_TIMEOUT_S:g} s"
+            f"{source}: SUMO did not start on the net within {START_TIMEOUT_S:g} s"
         ) from error
     except OSError as error:
         raise MachineError(
@@ -196,4 +204,4 @@ def start_sumo(file: MapFile, net: Path) -> None:
         ) from error
     if done.returncode != 0:
         ended = f"(sumo -n NET -e 1 ends with {done.returncode})"
-        raise MapError(f"{file.source}: SUMO refuses the net {ended}{error_summary(done.stderr)}")
+        raise MapError(f"{source}: SUMO refuses the net {ended}{error_summary(done.stderr)}")

@@ -55,6 +55,8 @@ class Unfinished: pass
 """
 
 
+DRIVES = "schedule:sprint-1.6"
+"""A policy without a camera, whose processes start fast."""
 SEED = "2"
 """Of runs that go through the suites in their order."""
 
@@ -134,14 +136,12 @@ def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
 
 @pytest.fixture(scope="module")
 def whole_run(desk: Path, cosim: Cosim) -> Path:
-    """The tiny suite, run without interruption by one process, the camera on."""
+    """The tiny suite, run without interruption by one process."""
     done = cosim(
         "run",
         "tiny.json",
         "--policy",
-        "straight",
-        "--camera",
-        "bullet",
+        DRIVES,
         "--seed",
         SEED,
         "--out",
@@ -184,7 +184,7 @@ def test_a_run_prints_its_table_and_leaves_its_folder(
         "run",
         "tiny.json",
         "--policy",
-        "straight",
+        DRIVES,
         "--episodes",
         "2",
         "--out",
@@ -215,9 +215,7 @@ def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(
         "run",
         "tiny.json",
         "--policy",
-        "straight",
-        "--camera",
-        "bullet",
+        DRIVES,
         "--jobs",
         "2",
         "--seed",
@@ -227,7 +225,9 @@ def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(
     )
     two = cosim(*words, cwd=desk)
     assert two.returncode == 0
-    assert "\n3 episodes, " in two.stderr and "episodes of 'straight' on this machine" in two.stderr
+    assert (
+        "\n3 episodes, " in two.stderr and f"episodes of '{DRIVES}' on this machine" in two.stderr
+    )
     assert ": done, 3 of 3\n" in two.stderr
     assert hashes(desk / "two") == hashes(whole_run)
     assert all(len(h) == 32 for h in hashes(whole_run).values())
@@ -237,11 +237,11 @@ def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(
 
 def test_shards_that_are_merged_are_the_run(desk: Path, cosim: Cosim, whole_run: Path) -> None:
     """Of three episodes in two shards, one of them from Python; each says what to do with it."""
-    words = ("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--seed", SEED)
+    words = ("run", "tiny.json", "--policy", DRIVES, "--seed", SEED)
     said = cosim(*words, "--shard", "1/2", "--out", "shard-1", cwd=desk)
     assert said.returncode == 0 and "Shard 1/2 of the run: `cosim merge`" in said.stderr
-    options = EpisodeOptions(camera="bullet", seed=int(SEED))
-    run(str(desk / "tiny.json"), "straight", shard="2/2", out=desk / "shard-2", options=options)
+    options = EpisodeOptions(seed=int(SEED))
+    run(str(desk / "tiny.json"), DRIVES, shard="2/2", out=desk / "shard-2", options=options)
     assert [*hashes(desk / "shard-2")] == ["t-1"]
     assert cosim("merge", "shard-1", "shard-2", "--out", "merged", cwd=desk).returncode == 0
     assert (desk / "merged/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
@@ -331,9 +331,7 @@ def test_a_full_disk_ends_the_run_with_the_reason(
         "run",
         "tiny.json",
         "--policy",
-        "straight",
-        "--camera",
-        "bullet",
+        "schedule:stand",
         "--seed",
         SEED,
         "--out",
@@ -480,7 +478,7 @@ def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(
 ) -> None:
     """A drawn seed is printed and is in run.json and every row; --resume takes it and refuses
     another."""
-    words = ("run", "tiny.json", "--policy", "stop", "--episodes", "1", "--out", "one")
+    words = ("run", "tiny.json", "--policy", "schedule:stand", "--episodes", "1", "--out", "one")
     run = cosim(*words, cwd=desk)
     seed = json.loads((desk / "one/run.json").read_text())["seed"]
     assert run.returncode == 0 and f"Seed {seed}: " in run.stderr

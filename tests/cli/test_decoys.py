@@ -8,26 +8,23 @@ import msgspec
 import pandas as pd
 import pytest
 
-from cosim.spec.scenario import write_suite
-from scenarios.suites.catalog import load_suite
+from cosim.spec.scenario import Suite, write_suite
 from tests.conftest import Cosim
+from tests.support.event_ways import event_way
 
 
 @pytest.fixture
 def few(tmp_path: Path) -> Path:
-    """Two scenarios of `reactive` that are over after a second, and their decoys at the end."""
-    whole = load_suite("reactive")
+    """Two scenarios in a small city that are over after a second, and their decoys at the end."""
     events = [
-        msgspec.structs.replace(one, time_limit_s=1.0)
-        for one in whole.scenarios
-        if one.id in ("lateral-001", "overtaking-001")
+        event_way(kind, f"{kind}-001", at_m=10.0, time_s=1.0) for kind in ("lateral", "overtaking")
     ]
     decoys = [
         msgspec.structs.replace(one, id=f"{one.id}-decoy", decoy_of=one.id, go_on_mps=0.6)
         for one in events
     ]
     path = tmp_path / "few.json"
-    write_suite(msgspec.structs.replace(whole, scenarios=(*events, *decoys)), path)
+    write_suite(Suite(name="few", version="1", scenarios=(*events, *decoys)), path)
     return path
 
 
@@ -36,7 +33,7 @@ def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim
     """In each shard pairs alone, which merged have D; one alone by its id, none with --no-decoys; a
     run is resumed with its own choice; `cosim score` and `cosim list` know decoys."""
 
-    always = ("run", few.name, "--policy", "stop", "--seed", "7")
+    always = ("run", few.name, "--policy", "schedule:stand", "--seed", "7")
 
     def run(name: str, *words: str) -> set[str]:
         said = cosim(*always, "--out", name, *words, cwd=tmp_path)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from cosim.spec.episode_id import drives_second
 from cosim.spec.scenario import Suite, write_suite
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
@@ -38,6 +40,111 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "deeper/far.py").write_text(POLICY)
     (folder / "deeper/speeds.py").write_text("AHEAD_MPS = 1.0")
     return folder
+
+
+PEEKS = """
+from pathlib import Path
+import cosim
+
+Path(__file__).parents[1].joinpath("secret.txt").read_text()
+
+class Peeks:
+    manifest = cosim.Manifest("peeks", camera=None, goal="route_point")
+    def reset(self, episode, seed): pass
+    def act(self, observation):
+        return cosim.Command(0.5, 0.1 * float(observation.goal.y_m))
+"""
+OWN = """
+name = "own"
+place = {city = 1, size_m = 500}
+way = {kind = "straight", length_m = 30}
+limits = {time_s = 1}
+"""
+
+
+@pytest.mark.engine
+def test_every_command_that_runs_a_policy_can_isolate_it(tmp_path: Path, cosim: Cosim) -> None:
+    """It cannot read beyond its folder in runs, checks and collections; --policy-data shows it
+    more."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/peeks.py").write_text(PEEKS)
+    (tmp_path / "secret.txt").write_text("secret")
+    (tmp_path / "own.toml").write_text(OWN)
+    write_suite(Suite(name="one", version="1", scenarios=(small_scenario(),)), tmp_path / "s.json")
+    name = "mine/peeks.py:Peeks"
+    commands = {
+        "check": ("policy", "check", name, "--frames", "2"),
+        "own": ("scenario", "run", "own.toml", "--policy", name, "--out", "own"),
+        "collect": ("collect", "s.json", "--policy", name, "--unsolved", "--out", "demos"),
+    }
+    for command in commands.values():
+        said = cosim(*command, "--isolated", cwd=tmp_path)
+        assert said.returncode == 2 and "--policy-data" in said.stderr, (command, said.stderr)
+    shown = ("--isolated", "--policy-data", "secret.txt")
+    said = cosim(*commands["own"], *shown, cwd=tmp_path)
+    assert said.returncode == 0, said.stderr
+    spec = json.loads((tmp_path / "own/run.json").read_text())
+    assert spec["policy_runs"] in ("isolated: namespaces", "isolated: landlock")
+    said = cosim(*commands["check"], *shown, cwd=tmp_path)
+    assert said.returncode in (0, 1) and "peeks" in said.stdout, said.stderr
+
+
+MEMORY = """
+import os
+from pathlib import Path
+import cosim
+
+SEEN = []
+FILE = Path(__file__).with_name("seen.txt")
+
+
+class Memory:
+    manifest = cosim.Manifest("memory", camera=None, goal="final_point", rate_hz=4.0)
+
+    def reset(self, episode, seed):
+        self.begins = True
+
+    def act(self, observation):
+        if self.begins:
+            place = round(observation.goal.x_m, 3)
+            with FILE.open("a") as file:
+                file.write(f"{place} {os.getpid()} {place in SEEN}\\n")
+            SEEN.append(place)
+            self.begins = False
+        return cosim.Command(0.0, 0.0)
+"""
+"""Policy that recognizes the second member of a pair by its first view, if its process has run the
+first one."""
+
+
+@pytest.mark.engine
+def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosim: Cosim) -> None:
+    """A policy that remembers does not recognize a decoy, with one process per half of the run."""
+    (tmp_path / "memory.py").write_text(MEMORY)
+    small = msgspec.structs.replace(small_scenario(), time_limit_s=0.5)
+    x_m, y_m, heading_rad = small.start
+    events = [
+        msgspec.structs.replace(small, id=f"n-{k}", start=(x_m, y_m, heading_rad + 0.1 * k))
+        for k in range(3)
+    ]
+    decoys = [msgspec.structs.replace(one, id=f"{one.id}-decoy", decoy_of=one.id) for one in events]
+    suite = Suite(name="pairs", version="1", scenarios=(*events, *decoys))
+    write_suite(suite, tmp_path / "pairs.json")
+    for seed in (1, 2):
+        halves = [{one.id: drives_second(seed, one) for one in those} for those in (events, decoys)]
+        assert all(halves[0][one.decoy_of] != halves[1][one.id] for one in decoys)
+        said = cosim(
+            *("run", "pairs.json", "--policy", "memory.py:Memory", "--seed", str(seed)),
+            *("--jobs", "1", "--out", f"run-{seed}"),
+            cwd=tmp_path,
+        )
+        assert said.returncode == 0, said.stderr
+        rows = [line.split() for line in (tmp_path / "seen.txt").read_text().splitlines()]
+        (tmp_path / "seen.txt").unlink()
+        places = Counter(place for place, _, _ in rows)
+        assert sorted(places.values()) == [2, 2, 2]
+        assert {seen for _, _, seen in rows} == {"False"}
+        assert len({process for _, process, _ in rows}) == 2
 
 
 @pytest.mark.engine

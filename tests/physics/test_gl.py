@@ -169,6 +169,31 @@ def test_cameras_of_two_lights_at_once_draw_each_its_own(world: BulletWorld) -> 
     )
 
 
+@pytest.mark.parametrize("camera", [GlCamera, BulletCamera])
+def test_people_of_the_same_ids_look_different_in_other_places(
+    world: BulletWorld,
+    monkeypatch: pytest.MonkeyPatch,
+    camera: type[GlCamera] | type[BulletCamera],
+) -> None:
+    """Otherwise the person of every event had the same clothes, and could be recognized by them."""
+    robot, street = moment(world)
+    cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
+    row = np.column_stack([np.full(6, 3.0), np.linspace(-1.5, 1.5, 6)])
+    xy = robot.pose.xy + row @ np.array([[cos, sin], [-sin, cos]])
+    still = np.zeros(6)
+    people = People.of(tuple(f"e{k}" for k in range(6)), xy, still, still, ("stand",) * 6, still)
+    frames = []
+    for seed in (1, 2):
+        monkeypatch.setattr(world.surface, "seed", seed)
+        with camera(world, SPEC) as eye:
+            frames.append(eye.render(robot, dataclasses.replace(street, people=people)))
+    one, other = frames
+    assert one.labels is not None and other.labels is not None
+    both = (one.labels == LABELS["person"]) & (other.labels == LABELS["person"])
+    changed = np.abs(one.rgb[both].astype(int) - other.rgb[both]).max(axis=1) > 40
+    assert both.sum() > 500 and changed.mean() > 0.3
+
+
 def test_a_picture_depends_on_its_moment_alone(world: BulletWorld) -> None:
     """The same state is the same picture, whatever was drawn before, far off or a step away, and in
     whatever camera."""

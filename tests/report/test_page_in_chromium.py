@@ -18,11 +18,12 @@ from cosim.report.page.plots import plots_of
 from cosim.report.page.reasons import CAUSES
 from cosim.report.page.runs import read_runs
 from cosim.report.page.scene import PlacePicture, Spot
-from cosim.spec.scenario import City
+from cosim.spec.scenario import City, Suite, write_suite
 from tests.conftest import Cosim
 from tests.support.blind_policy import BEND
 from tests.support.chromium import CHROMIUM, Page, chromium
 from tests.support.driven_runs import HIT, run_of, short_way
+from tests.support.event_ways import event_way
 
 pytestmark = [
     pytest.mark.engine,
@@ -55,15 +56,10 @@ def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     """The report of a run of two scenarios that a blind policy fails, in place of a file that was
     there."""
     folder = tmp_path_factory.mktemp("report")
-    words = (
-        "--policy",
-        "tests.support.blind_policy:Blind",
-        "--scenario",
-        "lateral-011",
-        "--scenario",
-        "obstructing-009",
-    )
-    done = cosim("run", "reactive", *words, "--out", "run", cwd=folder)
+    ways = (event_way("lateral", "a", at_m=8.0), event_way("obstructing", "b", at_m=11.0))
+    write_suite(Suite(name="ways", version="1", scenarios=ways), folder / "ways.json")
+    words = ("--policy", "tests.support.blind_policy:Blind", "--out", "run")
+    done = cosim("run", "ways.json", *words, cwd=folder)
     assert done.returncode == 0, done.stderr
     (folder / "report.html").write_text("another page")
     with pytest.MonkeyPatch.context() as patch:

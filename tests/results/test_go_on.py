@@ -11,7 +11,7 @@ import pytest
 from cosim.core.geometry import Polyline
 from cosim.core.state import Command
 from cosim.report.page.reasons import mishaps_of, reason_of
-from cosim.results.go_on import STOP_S, Passing, PassingWindow, passing_of
+from cosim.results.go_on import OVERTAKEN_M, STOP_S, Passing, PassingWindow, passing_of, rule_met
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
@@ -52,13 +52,43 @@ def test_the_window_ends_one_metre_past_the_person() -> None:
     assert window_end("lateral", 0.1, lambda s: 10.0) is None
 
 
-def test_the_window_of_one_who_overtakes_ends_when_they_are_ahead() -> None:
-    """From 1 m behind at 2 m/s past a robot at 1 m/s: 3 m ahead after 4 s; the robot is ahead of
-    them at first, which ends nothing. A trigger of the scenario's own decides like the kind's."""
-    overtakes = lambda s: 7.0 + 2.0 * s  # noqa: E731
-    assert window_end("overtaking", 1.0, overtakes) == 81
-    assert window_end("lateral", 1.0, overtakes, trigger_m=-1.0) == 81
-    assert window_end("overtaking", 2.0, overtakes) is None
+def test_the_window_of_one_who_overtakes_ends_by_the_robots_place_alone() -> None:
+    """7.8 m after the trigger, 1 m behind the event: at 18.8 m, wherever the person is or whether
+    there still is one. A trigger of the scenario's own decides like the kind's."""
+    places: list[Callable[[float], float | None]] = [lambda s: 7.0 + 2.0 * s, lambda s: None]
+    for place in places:
+        assert window_end("overtaking", 2.0, place) == 108
+        assert window_end("lateral", 2.0, place, trigger_m=-0.5) == 103
+        assert window_end("overtaking", 0.9, place) is None
+
+
+def test_no_motion_gives_way_and_goes_on() -> None:
+    """Of 500 random motions, with and without stops, at limits that the mean speed exceeds or not:
+    each that passes meets the rule of the event or of the decoy, one that does not pass neither."""
+    rng = np.random.default_rng(29)
+    decoy = msgspec.structs.replace(EVENT, kind="overtaking", decoy=True)
+    event = msgspec.structs.replace(decoy, decoy=False)
+    met = []
+    for _ in range(500):
+        v_mps = np.repeat(rng.uniform(0.0, 2.0, 20) * (rng.random(20) < 0.9), 12)
+        route_s_m = EVENT.route_s_m + 1.0 + np.cumsum(v_mps) * 0.05
+        ends = []
+        for twin, away_m in ((event, 0.9), (decoy, 4.0)):
+            window = PassingWindow(ROUTE, twin, EVENT_KINDS["overtaking"])
+            for tick, s_m in enumerate(route_s_m.tolist()):
+                window.see(tick, s_m, {0: np.array([s_m + away_m, 0.0])})
+            ends.append(window.end)
+        assert ends[0] == ends[1]
+        end = ends[0] or 0
+        assert not end or route_s_m[end - 1] >= EVENT.route_s_m + 1.0 + OVERTAKEN_M
+        passing, limit_mps = (
+            passing_of(route_s_m, v_mps, 0.05, 0, end),
+            float(rng.uniform(0.5, 1.5)),
+        )
+        rules = [rule_met(twin, passing, limit_mps) for twin in (event, decoy)]
+        assert sum(rules) == (passing is not None)
+        met.append((passing is not None, *rules))
+    assert set(met) == {(True, True, False), (True, False, True), (False, False, False)}
 
 
 def test_mean_speed_and_stops_are_those_of_the_window() -> None:

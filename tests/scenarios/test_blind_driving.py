@@ -13,6 +13,7 @@ import pytest
 
 from cosim.core.geometry import Pose, box_disk_gap
 from cosim.results.event_monitor import passed_between
+from cosim.results.go_on import overtaken_at_m
 from cosim.spec.events import Event, EventQuery, EventState
 from cosim.spec.scenario import City
 from scenarios.events import EVENT_KINDS, react
@@ -254,6 +255,21 @@ def test_a_robot_that_drives_on_is_walked_at_again() -> None:
     """Standing for a while far away buys nothing."""
     driven = drive(event("frontal"), lambda t_s: 0.0 if 1.0 < t_s < 5.0 else 1.2, 30.5, 20.0, 0.8)
     assert driven.gap_m < 0.0
+
+
+@pytest.mark.parametrize("v_mps", [0.3, 0.8, 1.4, 2.0])
+def test_who_cuts_in_is_met_before_the_window_of_the_rule_ends(v_mps: float) -> None:
+    """Up to 2 m/s at any offset: a robot that drives straight on without giving way hits the person
+    where the rule of the event asks it to give way."""
+    kind = EVENT_KINDS["overtaking"]
+    for half_m, side, left_m, speed_mps in itertools.product(
+        (1.45, 2.9), (-1, 1), (-0.9, 0.0, 0.9), (1.1, 1.65)
+    ):
+        one = event("overtaking", half_m, 1, side, speed_mps)
+        driven = drive(one, lambda _: v_mps, 48.0, 14.0 / v_mps, left_m)
+        assert driven.gap_m < 0.0
+        end_m = overtaken_at_m(one, kind)
+        assert end_m is not None and driven.seen[-1][0] < end_m
 
 
 @pytest.mark.parametrize("v_mps", [0.3, 0.8, 1.5, 2.5])

@@ -14,11 +14,12 @@ from tests.support.coordinating import serve_made_up
 
 PLAN = [
     PlannedBlow(1, "kill worker"),
-    PlannedBlow(3, "stop worker"),
-    PlannedBlow(4, "kill process"),
-    PlannedBlow(5, "kill coordinator"),
-    PlannedBlow(7, "end worker"),
+    PlannedBlow(2, "stop worker"),
+    PlannedBlow(3, "kill process"),
+    PlannedBlow(4, "kill coordinator"),
+    PlannedBlow(5, "end worker"),
 ]
+"""So early that episodes are left for the last blow where several end between two looks."""
 SEED = 143
 """With this one who is stopped is so for 0.6 s."""
 

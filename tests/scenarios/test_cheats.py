@@ -8,10 +8,12 @@ import pandas as pd
 import pytest
 
 import cosim
+from cosim.spec.scenario import Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.catalog import load_suite
 from tests.conftest import Cosim
 from tests.support import cheats
+from tests.support.event_ways import event_way
 
 KINDS = tuple(EVENT_KINDS)
 NAMES = tuple(name for name in cheats.CHEATS if name != "Quitter")
@@ -54,18 +56,11 @@ def test_a_cheat_solves_no_event(cheat: str, request: pytest.FixtureRequest) -> 
 def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: Cosim) -> None:
     """It has failed, hit nobody, and covered nothing of its route; its run has no rates and ends
     with 1."""
-    scenario = "frontal-005"  # the people are met before any obstacle
-    words = (
-        "run",
-        "reactive",
-        "--scenario",
-        scenario,
-        "--policy",
-        "tests.support.cheats:Quitter",
-        "--out",
-        str(tmp_path / "r"),
-    )
-    ran = cosim(*words, cwd=Path(__file__).parents[2])
+    way = event_way("obstructing", "one", at_m=11.0)
+    suite = Suite(name="one", version="1", scenarios=(way,))
+    write_suite(suite, tmp_path / "one.json")
+    words = ("run", "one.json", "--policy", "tests.support.cheats:Quitter", "--out", "r")
+    ran = cosim(*words, cwd=tmp_path)
     table = pd.read_csv(tmp_path / "r" / "results.csv")
     assert ran.returncode == 1 and table["status"].tolist() == ["crashed"], ran.stderr
     assert not table[["success", "spl", "route_completion"]].iloc[0].any()

@@ -8,6 +8,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
+import shapely
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Pose, box_disk_gap
@@ -193,6 +194,23 @@ def test_decoys_of_gestures_show_one_of_four_others_at_the_same_place() -> None:
         assert [(w.x_m, w.y_m, w.heading_rad) for w in a.states[0].walkers] == [
             (w.x_m, w.y_m, w.heading_rad) for w in b.states[0].walkers
         ]
+
+
+@pytest.mark.parametrize("kind", EVENT_KINDS)
+def test_people_of_decoys_stay_where_the_row_says(kind: str) -> None:
+    """When the robot has passed, they are there; people without a place still walk."""
+    row = EVENT_KINDS[kind]
+    for side, left_m in itertools.product((-1, 1), (-0.3, 0.0, 0.3)):
+        decoy = row.decoy_of(event(kind, side=side, people=row.people[1]))
+        states = [reply.states[0] for _, reply in drive(decoy, 1.0, 25.0, 62.0, left_m)]
+        last = [state for state in states if state.phase == "acting"][-1]
+        for number, walker in enumerate(last.walkers):
+            places = row.stays_of(decoy, number)
+            ground = shapely.MultiPoint(places).convex_hull
+            if places:
+                assert ground.distance(shapely.Point(walker.x_m, walker.y_m)) < 1e-6
+            else:
+                assert math.hypot(walker.vx_mps, walker.vy_mps) > 0.5
 
 
 @pytest.mark.parametrize("patience_s", [2.0, 4.0])

@@ -12,6 +12,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -26,13 +27,14 @@ from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.episode_id import episode_id_of
 from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.scenario import CrowdSpec, Scenario, Suite, write_suite
+from physics.cameras.choice import renderer_of
 from scenarios.ipc.sandbox import KINDS
 from scenarios.runs import run as suite_run
 from scenarios.runs.isolated_policy import isolated_driver
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, ROOT, WIDE, Cosim, Said, without_lines
 from tests.support import hostile
-from tests.support.hostile import ANSWER_S, DEEDS, DONE, FLOOD_BYTES, FORGED, Honest
+from tests.support.hostile import ANSWER_S, DEEDS, DONE, FLOOD_BYTES, FORGED, START_S, Honest
 
 OF = "hostile_policy"
 SEED = 5
@@ -49,16 +51,16 @@ for i in range(3, 1024):
 """
 
 
-_SHORT = f"""
+_WATCHED = """
 import sys
 from scenarios.ipc import child_process
 from scenarios.runs import environment_slot
-environment_slot.TICK_S = {ANSWER_S}
 child_process.ENDING_S = 2.0
+environment_slot.TICK_S = {tick_s}
 from cosim.__main__ import main
 main()
 """
-"""The command line with short timeouts of ticks and of the end of processes."""
+"""The command line with timeouts of ticks and, short, of the end of processes."""
 
 
 class War(NamedTuple):
@@ -79,14 +81,24 @@ class War(NamedTuple):
 
 
 class Wars(NamedTuple):
-    """The runs of a hosting: of behaviours that harm the run folder, and of the others. In a
-    sandbox, where none can, they are one run."""
+    """The runs of a hosting, at the same time.
+
+    hanging: of behaviours that are ended by a timeout, which is short
+    harmful: of those that harm the run folder; in a sandbox, where none can, they are in `others`
+    others: of the others, whose timeouts are so long that a slow machine misses none
+    """
 
     others: War
-    harmful: War
+    hanging: War
+    harmful: War | None
+
+    @property
+    def all(self) -> list[War]:
+        return [war for war in self if war is not None]
 
     def of(self, name: str) -> War:
-        return self.harmful if DEEDS[name].harms_folder else self.others
+        """Return the run of a behaviour."""
+        return next(war for war in self.all if name in war.names)
 
 
 @cache
@@ -115,12 +127,15 @@ def prepare(desk: Path, names: Sequence[str], mark: str) -> dict[str, str]:
 
 
 def war(desk: Path, names: tuple[str, ...], *options: str, jobs: int = 2) -> War:
-    """Run behaviours by some processes at a time."""
+    """Run behaviours by some processes at a time; a run of hanging ones has short timeouts."""
     mark = f"hostile-{uuid.uuid4()}"
-    timeout = ("--answer-timeout", f"{ANSWER_S:g}", "--start-timeout", f"{ANSWER_S:g}")
+    hangs = HANGING[0] in names
+    answer_s, start_s = (ANSWER_S, START_S) if hangs else (PATIENCE_S, PATIENCE_S)
+    timeout = ("--answer-timeout", f"{answer_s:g}", "--start-timeout", f"{start_s:g}")
     words = ("--policy", f"{OF}:Hostile", "--jobs", str(jobs), "--seed", str(SEED), "--out", "run")
+    code = _WATCHED.format(tick_s=answer_s)
     done = subprocess.run(
-        [sys.executable, "-c", _SHORT, "run", "hostile.json", *words, *timeout, *options],
+        [sys.executable, "-c", code, "run", "hostile.json", *words, *timeout, *options],
         cwd=desk,
         env=os.environ | WIDE | prepare(desk, names, mark),
         capture_output=True,
@@ -139,8 +154,9 @@ def war(desk: Path, names: tuple[str, ...], *options: str, jobs: int = 2) -> War
 _ALWAYS = ("--camera", "bullet", "--log-json", "log.jsonl")
 HOSTINGS = {"in-process": (*_ALWAYS, "--frames", "0.25"), "isolated": (*_ALWAYS, "--isolated")}
 BOXED = {f"isolated: {kind}" for kind in KINDS}
+HANGING = tuple(name for name, deed in DEEDS.items() if deed.hangs)
 HARMFUL = tuple(name for name, deed in DEEDS.items() if deed.harms_folder)
-OTHERS = tuple(name for name, deed in DEEDS.items() if not deed.harms_folder)
+OTHERS = tuple(name for name in DEEDS if name not in HANGING + HARMFUL)
 
 
 @pytest.fixture(scope="module", params=HOSTINGS)
@@ -151,12 +167,17 @@ def hosting(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="module")
 def wars(hosting: str, tmp_path_factory: pytest.TempPathFactory) -> Wars:
     options = HOSTINGS[hosting]
-    if hosting == "isolated":
-        run = war(tmp_path_factory.mktemp(hosting), tuple(DEEDS), *options)
-        return Wars(run, run)
-    others = war(tmp_path_factory.mktemp(hosting), OTHERS, *options)
-    folder = tmp_path_factory.mktemp("harmful")
-    return Wars(others, war(folder, ("honest", *HARMFUL), *options, jobs=1))
+    isolated = hosting == "isolated"
+    # Most of the time of those that hang is waiting, in which the others run.
+    runs = [(OTHERS + HARMFUL if isolated else OTHERS, 2), (HANGING, 2)]
+    runs += [] if isolated else [(("honest", *HARMFUL), 1)]
+    with ThreadPoolExecutor(len(runs)) as pool:
+        begun = [
+            pool.submit(war, tmp_path_factory.mktemp("war"), names, *options, jobs=jobs)
+            for names, jobs in runs
+        ]
+    others, hanging, *harmful = [one.result() for one in begun]
+    return Wars(others, hanging, *(harmful or [None]))
 
 
 def with_mark(mark: str) -> list[int]:
@@ -212,7 +233,7 @@ def test_the_table_is_whole() -> None:
 def test_a_run_of_hostile_policies_ends_in_order(hosting: str, wars: Wars) -> None:
     """The run has a row for every episode, exit code 1, no traceback, small logs with the begin and
     the end of floods, and leaves no process."""
-    for run in wars:
+    for run in wars.all:
         crashed = [one for one in run.records.values() if one.status == "crashed"]
         assert run.said.returncode == bool(crashed) and "Traceback" not in run.said.stderr, run.said
         assert f"scheduled {len(run.names)}, scored {len(run.names)}" in run.said.stdout
@@ -224,10 +245,8 @@ def test_a_run_of_hostile_policies_ends_in_order(hosting: str, wars: Wars) -> No
         assert with_mark(run.mark) == []
     logs = [path.read_bytes() for path in (wars.others.folder / "logs").iterdir()]
     assert max(map(len, logs)) < FLOOD_BYTES / 2
-    left_out = b"bytes were printed here and left out"
-    ends = (b"the other flood begins", b"the other flood ends")
-    # Two floods of isolated policies may share a log, whose middle is left out.
-    for words in (left_out, *(ends if hosting == "in-process" else ())):
+    # Two floods may share a log, whose middle is left out.
+    for words in (b"bytes were printed here and left out", b"flood begins", b"flood ends"):
         assert any(words in log for log in logs), words
 
 
@@ -241,9 +260,11 @@ def test_nobody_pays_for_what_another_did_to_the_process(hosting: str, wars: War
 
 @pytest.mark.engine
 def test_pictures_are_kept_as_they_were_drawn(hosting: str, wars: Wars) -> None:
-    """A policy that blackens the picture it is given does not blacken the one that is kept."""
+    """A policy that blackens the picture it is given does not blacken the one that is kept; the
+    record names the renderer."""
     if hosting == "isolated":
         return
+    assert wars.others.records["honest"].setup.renderer == renderer_of("bullet")
     episodes = wars.others.folder / "episodes"
     honest, blackened = (
         [path.read_bytes() for path in sorted((episodes / name / "frames").glob("*.png"))]

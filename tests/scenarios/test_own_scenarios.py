@@ -352,7 +352,7 @@ def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cos
         "run",
         "mine.toml",
         "--policy",
-        "straight",
+        "schedule:stand",
         "--latency",
         "100",
         "--out",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from functools import cache
 from pathlib import Path
@@ -12,24 +13,30 @@ import pytest
 import shapely
 from shapely.geometry import Point
 
-from cosim.core.errors import SpecError
+from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Pose
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.obstacle import footprint
+from cosim.policies.schedule.cheats import CHEATS
+from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.robot import COURIER, SCOUT
-from cosim.spec.scenario import City, Scenario
+from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
-from scenarios.suites.decoys import decoy_of, differing_fields, limited
+from scenarios.suites.catalog import SUITES, load_suite
+from scenarios.suites.decoys import DECOY, decoy_of, differing_fields, limited
 from scenarios.suites.gate_fences import drawn_gate
 from scenarios.suites.lanes import ENDS_M, free_lanes
 from scenarios.suites.obstacles import prove_gap
-from scenarios.suites.proofs import read_proofs
+from scenarios.suites.proofs import Dropped, read_proofs
 from scenarios.suites.reactive import Wanted, build_reactive, event_share
-from scenarios.suites.recipes import RECIPES
+from scenarios.suites.recipes import RECIPES, recipe_of
 from scenarios.tools.build.build_suite import build_suite
 from scenarios.tools.build.claims import CLAIMS, Read
 from scenarios.tools.build.place_claims import common_ways, faults_in_places, straight_lanes
+from scenarios.tools.build.proving import accepted
+from scenarios.tools.exploit import measure
+from scenarios.tools.exploit.evaluate import drive
+from tests.conftest import Cosim
 
 SMALL = City(seed=1, size_m=500.0)
 WANTED = Wanted(19.0, 0.7, -1, 1)
@@ -124,6 +131,21 @@ def test_a_decoy_equals_its_scenario_but_for_the_response(kind: str) -> None:
     assert differing_fields(scenario, replace(decoy, seed=9, obstacles=())) == ["seed", "obstacles"]
 
 
+def test_a_decoy_with_a_person_inside_an_obstacle_is_refused() -> None:
+    """Before the expert drives; the claim finds the person, too, in the decoy alone."""
+    event = drawn("ped_crossing")
+    decoy = decoy_of(event)
+    ((x_m, y_m),) = EVENT_KINDS["ped_crossing"].stays_of(decoy.events[0], 0)
+    thing = Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)
+    event, decoy = (replace(one, obstacles=(*one.obstacles, thing)) for one in (event, decoy))
+    refused = accepted(decoy)
+    assert isinstance(refused, Dropped)
+    words = "person 'e0' stays 0.30 m inside an obstacle"
+    assert (refused.reason, refused.details) == ("person inside an obstacle", words)
+    suite = Suite(name="reactive", version="1", scenarios=(event, decoy))
+    assert list(CLAIMS["people"](Read(suite, None))) == [f"{decoy.id}: {words}"]
+
+
 def test_limits_follow_from_the_experts_time_and_the_robots_speed() -> None:
     """1.5 times and 3 s for events, 1.3 times for decoys, in whole ticks; a faster robot has
     less time, and a long route keeps its limit."""
@@ -141,10 +163,12 @@ def test_limits_follow_from_the_experts_time_and_the_robots_speed() -> None:
     assert long.driven_by("scout").time_limit_s == long.time_limit_s
 
 
-def test_the_slots_spread_lengths_positions_and_sides_evenly() -> None:
+@pytest.mark.parametrize("redraw", [0, 1])
+def test_the_slots_spread_lengths_positions_and_sides_evenly(redraw: int) -> None:
     """In each split every kind has the same lengths and positions, and each side half of the
-    times; lengths, positions and sides are not correlated."""
-    slots = [slot for slot in RECIPES["reactive"].slots if slot.wanted and not slot.decoy_of]
+    times; lengths, positions and sides are not correlated. A redraw is no exception."""
+    slots = recipe_of("reactive", redraw).slots
+    slots = [slot for slot in slots if slot.wanted and not slot.decoy_of]
     for kind in EVENT_KINDS:
         for split, count in (("val", 80), ("test", 20)):
             those = [s.wanted for s in slots if s.structure == kind and s.split == split]
@@ -170,3 +194,62 @@ def test_a_pair_is_built_and_proved_together(tmp_path: Path) -> None:
     assert all(one.time_limit_s < 60.0 for one in suite.scenarios)
     driven = [suite.scenarios[1].id]
     assert list(faults_in_places(suite.scenarios, driven, read_proofs(out))) == []
+
+
+def test_a_redraw_has_the_same_slots_with_other_draws(tmp_path: Path) -> None:
+    """Names, places and splits are equal; seeds, lengths and sides are not. The shipped file is
+    not replaced."""
+    for name, shipped in RECIPES.items():
+        again = [recipe_of(name, number) for number in (1, 2)]
+        for slots in zip(shipped.slots, *(one.slots for one in again), strict=True):
+            same = [(s.name, s.where, s.split, s.like, s.decoy_of, s.length_m) for s in slots]
+            assert len(set(same)) == 1
+            assert len({s.seed(0) for s in slots} | {s.seed(1) for s in slots}) == 6
+        assert [one.version for one in again] == ["2.0-redraw-1", "2.0-redraw-2"]
+    drawn = [[s.wanted for s in recipe_of("reactive", n).slots if s.wanted] for n in (0, 1, 2)]
+    assert all(
+        np.mean([p == q for p, q in zip(a, b, strict=True)]) < 0.05
+        for a, b in itertools.combinations(drawn, 2)
+    )
+    assert recipe_of("reactive", 0) is RECIPES["reactive"]
+    before = SUITES["reactive"].read_bytes()
+    with pytest.raises(UsageError, match="file of its own"):
+        build_suite("reactive", SUITES["reactive"], redraw=1)
+    assert SUITES["reactive"].read_bytes() == before
+
+
+@pytest.mark.engine
+def test_cheats_are_driven_on_a_redraw(
+    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pair of `overtaking` is drawn with other seeds and keeps its claims; who never slows down
+    solves at most its decoy."""
+    out = tmp_path / "redraw.json"
+    said = cosim("suite", "build", "reactive", str(out), "--redraw", "1", "--only", "*taking-7002")
+    assert said.returncode == 0 and "version 2.0-redraw-1" in said.stdout, said.stderr
+    suite = read_suite(out)
+    shipped = {one.id: one for one in load_suite("reactive").scenarios}
+    assert [one.id for one in suite.scenarios] == ["overtaking-7002", "overtaking-7002-decoy"]
+    assert all(one.route != shipped[one.id].route for one in suite.scenarios)
+    for claim in ("decoys", "exclusive", "limits", "proofs", "obstacles"):
+        assert list(CLAIMS[claim](Read(suite, read_proofs(out), out))) == []
+    cheats = {name: CHEATS[name] for name in ("swerve-left", "stop-every-2-m")}
+    monkeypatch.setattr(measure, "CHEATS", cheats)
+    said = cosim("bench", "exploit", "--cheats", "--suite", str(out), "--out", str(tmp_path / "e"))
+    assert said.returncode == 0 and "swerve-left" in said.stdout, said.stderr
+    assert len((tmp_path / "e" / "evaluations.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize(
+    ("number", "cheat"),
+    [("7007", "swerve-fast-left"), ("7010", "swerve-wide-left"), ("7012", "swerve-right")],
+)
+def test_a_swerve_away_from_who_cuts_in_solves_the_decoy_alone(number: str, cheat: str) -> None:
+    """It reaches both goals without a failure, but did not give way in the event."""
+    name = f"overtaking-{number}"
+    ids = (name, name + DECOY)
+    twins = [one for one in load_suite("reactive").scenarios if one.id in ids]
+    results = [drive(twin, CHEATS[cheat]) for twin in twins]
+    assert [(one.done, one.failures) for one in results] == [(1.0, 0.0)] * 2
+    assert [one.solved for one in results] == [False, True]

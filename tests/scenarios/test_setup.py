@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from tests.conftest import PATIENCE_S
-from tests.support.in_turn import COUNT, SAMPLE_COUNT
+from tests.support.in_turn import COUNT, SAMPLE
 
 NOT_DRIVEN_WITH = (
     "pandas",
@@ -45,10 +45,10 @@ def test_an_episode_imports_only_what_it_drives_with() -> None:
 def test_the_kth_episode_of_a_process_is_the_first_one_of_another(
     request: pytest.FixtureRequest,
 ) -> None:
-    """Six episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
+    """Seven episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
     order: same states, same pictures."""
     whole = request.config.getoption("--whole")
-    count, only = (COUNT, []) if whole else (SAMPLE_COUNT, ["--sample"])
+    count, only = (COUNT, []) if whole else (len(SAMPLE), ["--sample"])
     command = [sys.executable, "-m", "tests.support.in_turn", *only]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stderr

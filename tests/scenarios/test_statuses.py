@@ -158,9 +158,9 @@ def test_a_pace_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
         episode, "Pacer", partial(Pacer, clock=lambda: 100.0 + sum(slept_s), sleep=slept_s.append)
     )
     short = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
-    free = run_episode(short, load_policy("straight")).record
+    free = run_episode(short, load_policy("schedule:stand")).record
     assert not slept_s
-    held = run_episode(short, load_policy("straight"), EpisodeOptions(pace=0.5)).record
+    held = run_episode(short, load_policy("schedule:stand"), EpisodeOptions(pace=0.5)).record
     assert sum(slept_s) == pytest.approx(2.0 * Clock().time_s(held.ticks)) and held.ticks >= 20
     assert held.state_hash == free.state_hash != ""
     assert msgspec.structs.replace(held, clock={}) == msgspec.structs.replace(free, clock={})

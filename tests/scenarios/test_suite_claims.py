@@ -32,7 +32,7 @@ from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.catalog import SUITES, load_suite, with_crowd
 from scenarios.suites.daylight import drawn_daylight
-from scenarios.suites.decoys import DECOY, decoy_of, limited
+from scenarios.suites.decoys import DECOY, decoy_of, least_pace_mps, limited, must_give_way
 from scenarios.suites.exploits import ALL, Exploit, Found, Share
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
@@ -66,6 +66,8 @@ def honest(name: str) -> Read:
             made = decoy_of(scenarios[-1])
         else:
             made = of_slot(slot, slots.get(slot.like, slot), number, kinds)
+        if must_give_way(made):
+            made = replace(made, go_on_mps=least_pace_mps(decoy_of(made), EXPERT_MPS))
         scenarios.append(limited(made, EXPERT_S, EXPERT_MPS))
     suite = Suite(name=name, version="1", scenarios=tuple(scenarios))
     return Read(suite, proofs_of(suite))
@@ -262,6 +264,7 @@ def broken() -> dict[str, tuple[str, Read, str]]:
     first = reactive.suite.scenarios[0]
     lateral = next(i for i, s in enumerate(reactive.suite.scenarios) if s.id == "lateral-001-decoy")
     static = next(i for i, s in enumerate(reactive.suite.scenarios) if s.structure == "static")
+    overtaken = next(i for i, s in enumerate(reactive.suite.scenarios) if s.id == "overtaking-001")
     return {
         "one-missing": ("counts", of(unit, list(unit.suite.scenarios[1:])), "is missing"),
         "one-of-another-structure": ("counts", one(unit, 0, structure="curve"), "not ('straight'"),
@@ -408,6 +411,35 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             "is 16.5 s, not 14.7",
         ),
         "no-go-on-rule": ("limits", one(reactive, lateral, go_on_mps=0.0), "is 0, not 0.72"),
+        "no-rule-to-give-way": (
+            "exclusive",
+            one(reactive, overtaken, go_on_mps=0.0),
+            "need not give way",
+        ),
+        "a-person-inside-an-obstacle": (
+            "people",
+            one(reactive, 1, obstacles=(replace(BIN, y_m=-1.0), replace(BIN, y_m=1.0))),
+            "stays 0.30 m inside an obstacle",
+        ),
+        "another-speed-than-the-decoys": (
+            "exclusive",
+            one(reactive, overtaken, go_on_mps=0.9),
+            "its go_on_mps is 0.9, that of its decoy 0.72",
+        ),
+        "a-window-that-people-end": (
+            "exclusive",
+            one(
+                reactive,
+                overtaken,
+                events=(replace(reactive.suite.scenarios[overtaken].events[0], trigger_m=2.0),),
+            ),
+            "comes from the front",
+        ),
+        "a-window-beyond-the-goal": (
+            "exclusive",
+            one(reactive, overtaken, goal_radius_m=5.5),
+            "may be at the goal",
+        ),
         "walkers-in-a-reactive-one": (
             "street life",
             one(reactive, 0, crowd=CrowdSpec(persons=12)),
@@ -477,16 +509,18 @@ def exploit_for(suite_hash: str) -> Exploit:
     schedule = Schedule(name="blind-all")
     shares = {"val_sr": Share(0, 0), "val_d": None, "sr": Share(0, 0), "d": None}
     found = Found(
-        kind=ALL, objective="sr", evaluations=1, schedule=schedule, kinds={}, episodes=(), **shares
-    )
-    return Exploit(
-        suite="unit",
-        suite_hash=suite_hash,
+        kind=ALL,
+        objective="sr",
         goal="final_point",
         seed=0,
+        budget=1,
         evaluations=1,
-        found=(found,),
+        schedule=schedule,
+        kinds={},
+        episodes=(),
+        **shares,
     )
+    return Exploit(suite="unit", suite_hash=suite_hash, found=(found,))
 
 
 def test_a_broken_claim_is_found_out() -> None:

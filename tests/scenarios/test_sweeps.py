@@ -146,7 +146,7 @@ def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -
     done = cosim("scenario", "check", f"{name}.toml", cwd=examples)
     assert done.returncode == 0, done.stderr
     ran = cosim(
-        "scenario", "run", f"{name}.toml", "--policy", "straight", "--out", name, cwd=examples
+        "scenario", "run", f"{name}.toml", "--policy", "schedule:stand", "--out", name, cwd=examples
     )
     assert ran.returncode == 0 and f"Run folder: {name}" in ran.stdout, ran.stderr
     row = pd.read_csv(examples / name / "results.csv").iloc[0]
@@ -159,7 +159,15 @@ def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -
 def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
     """From a file to a table by density, and files beside the run; it is resumed, but not once the
     file is edited."""
-    words = ("scenario", "run", "density-sweep.toml", "--policy", "straight", "--out", "swept")
+    words = (
+        "scenario",
+        "run",
+        "density-sweep.toml",
+        "--policy",
+        "schedule:stand",
+        "--out",
+        "swept",
+    )
     ran = cosim(*words, cwd=examples)
     assert ran.returncode == 0, ran.stderr
     head, *_ = (line for line in ran.stdout.splitlines() if "SR" in line)
@@ -190,7 +198,7 @@ def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, co
         'name = "told"\ngoal_protocol = ["route_point", "final_point"]\n'
         '[place]\ncity = 1\nsize_m = 500\n[way]\nkind = "straight"\n[limits]\ntime_s = 0.5\n'
     )
-    words = ("scenario", "run", "told.toml", "--policy", "stop", "--out", "runs")
+    words = ("scenario", "run", "told.toml", "--policy", "schedule:stand", "--out", "runs")
     done = cosim(*words, "--real-time", cwd=tmp_path)
     assert done.returncode == 0 and "goal_protocol" in done.stdout, done.stderr
     rows = pd.concat(

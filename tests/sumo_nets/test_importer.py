@@ -33,6 +33,7 @@ from sumo_nets.maps.map_store import (
     about_map,
     checked_map,
     credit_of,
+    delete_map,
     import_map,
     known_maps,
     map_name,
@@ -331,6 +332,17 @@ def test_a_shipped_place_of_an_older_importer_is_imported_again(
     path.write_bytes(json.dumps(old).encode())
     assert not outdated(about_map("braunschweig-1"))
     assert json.loads(path.read_bytes())["versions"]["importer"] != "3"
+
+
+@pytest.mark.engine
+def test_an_imported_map_can_be_deleted(tmp_path: Path) -> None:
+    """It is unknown then; maps that are not imported are refused with those that are."""
+    import_map(written(tmp_path / "town.osm", osm()), "to-delete")
+    folder = delete_map("to-delete")
+    assert not folder.exists() and "to-delete" not in known_maps()
+    for name in ("to-delete", "sumo-fkk-in", "../maps"):
+        with pytest.raises(UsageError, match="unknown imported map"):
+            delete_map(name)
 
 
 @pytest.mark.engine

@@ -76,9 +76,9 @@ def test_suites_that_cannot_be_drawn_are_refused() -> None:
     """Another kind of suite, or an event that does not exist, with the valid ones; before any map
     is looked for."""
     with pytest.raises(
-        UsageError, match=r"suite for --map 'unit'\. Valid choices: long-horizon, reactive"
+        UsageError, match=r"suite for --map 'static'\. Valid choices: long-horizon, reactive, unit"
     ):
-        suite_on_map("unit", "nowhere", 0, 1)
+        suite_on_map("static", "nowhere", 0, 1)
     with pytest.raises(UsageError, match=r"event 'ambush'\. Valid choices: .*frontal"):
         suite_on_map("reactive", "nowhere", 0, 1, events=["ambush"])
 
@@ -101,7 +101,7 @@ def test_the_folder_of_a_city_is_that_city(city: Path) -> None:
         400.0,
         0.2,
     )
-    for kind in ("long-horizon", "reactive"):
+    for kind in ("long-horizon", "reactive", "unit"):
         one, again = (suite_on_map(kind, str(city), 3, 2) for _ in range(2))
         assert one == again and len(one.scenarios) == 2
         assert all(
@@ -197,7 +197,7 @@ def test_reactive_scenarios_are_drawn_where_there_is_room() -> None:
 def test_a_run_on_a_city_of_ones_own_is_replayed(cosim: Cosim, city: Path) -> None:
     """`cosim run reactive --map FOLDER` runs, and its replay gives the recorded hash from the run's
     folder alone."""
-    words = ("--map", "seven", "--event", "frontal", "--policy", "straight", "--out", "run")
+    words = ("--map", "seven", "--event", "frontal", "--policy", "schedule:stand", "--out", "run")
     said = cosim("run", "reactive", *words, cwd=city.parent)
     assert said.returncode == 0, said.stderr
     (episode,) = (p.name for p in (city.parent / "run" / "episodes").iterdir())

@@ -36,7 +36,9 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest, WaypointRule
 
 ANSWER_S = 4.0
-"""Timeout of answers and of ticks in the runs of the table."""
+"""Timeout of answers and of ticks in the runs of those that hang."""
+START_S = 12.0
+"""Timeout of loading and of reset in the runs of those that hang: a slow machine loads a policy in it."""
 FLOOD_BYTES = 16 << 20
 ENGINES = ("libsumo", "pybullet", "moderngl", "zenoh", "sumo_nets", "physics")
 _FORKS = 40
@@ -465,6 +467,7 @@ class Deed(NamedTuple):
     call: the call of the policy in which it happens
     attempts: how often the episode is run in the simulator's process
     harms_folder: whether it harms the run folder, so that it has a run of its own
+    hangs: whether a timeout ends it, so that its run has short ones
     """
 
     does: Callable[[Hostile, Any], Any]
@@ -473,10 +476,11 @@ class Deed(NamedTuple):
     call: str = "act"
     attempts: int = 1
     harms_folder: bool = False
+    hangs: bool = False
 
 
-def _no_answer(call: str, name: str) -> str:
-    return f"policy 'honest' gave no answer for {ANSWER_S:g} s in {call} of {name}"
+def _no_answer(call: str, name: str, within_s: float = ANSWER_S) -> str:
+    return f"policy 'honest' gave no answer for {within_s:g} s in {call} of {name}"
 
 
 def _both(words: str) -> tuple[str, str]:
@@ -600,20 +604,31 @@ DEEDS = {
     "forks-many": Deed(_forks_many, DONE, DONE),
     # It is slow, or gives no answer.
     "hangs-in-reset": Deed(
-        _does(lambda: time.sleep(3600)), *_both(_no_answer("reset", "hangs-in-reset")), "reset"
+        _does(lambda: time.sleep(3600)),
+        *_both(_no_answer("reset", "hangs-in-reset", START_S)),
+        "reset",
+        hangs=True,
     ),
-    "hangs-in-act": Deed(_does(lambda: time.sleep(3600)), *_both(_no_answer(_ACT, "hangs-in-act"))),
+    "hangs-in-act": Deed(
+        _does(lambda: time.sleep(3600)), *_both(_no_answer(_ACT, "hangs-in-act")), hangs=True
+    ),
     "holds-the-lock": Deed(
-        _does(lambda: ctypes.PyDLL(None).sleep(3600)), *_both(_no_answer(_ACT, "holds-the-lock"))
+        _does(lambda: ctypes.PyDLL(None).sleep(3600)),
+        *_both(_no_answer(_ACT, "holds-the-lock")),
+        hangs=True,
     ),
     "freezes-later": Deed(
         _freezes_later,
         f"{_ITSELF} showed no sign of life, 2 times: {BLAMED}",
         _no_answer("act at 0.50 s", "freezes-later"),
         attempts=2,
+        hangs=True,
     ),
     "hangs-afterwards": Deed(
-        _does(lambda: time.sleep(3600)), *_both(_no_answer("ended", "hangs-afterwards")), "ended"
+        _does(lambda: time.sleep(3600)),
+        *_both(_no_answer("ended", "hangs-afterwards")),
+        "ended",
+        hangs=True,
     ),
     "dies-afterwards": Deed(
         _does(lambda: os._exit(0)),

@@ -2,8 +2,7 @@
 order.
 
 `python -m tests.support.in_turn` prints the ids of those that came out differently, how many were
-compared, and how many of these were unlike each other. With --sample it takes ten of them, of all
-cities, crowds, robots and lights.
+compared, and how many of these were unlike each other. With --sample it takes SAMPLE alone.
 """
 
 from __future__ import annotations
@@ -27,7 +26,8 @@ from scenarios.episodes.episode import Episode
 from scenarios.places.nets import place
 
 COUNT = 30
-SAMPLE_COUNT = 10
+SAMPLE = (0, 1, 7, 13, 18, 19, 24)
+"""Episodes of all cities, crowds, robots and lights, two pairs of one seed among them."""
 _SECONDS = 0.5
 _CITIES = tuple(City(seed=seed, size_m=500.0) for seed in (1, 2))
 _CROWDS = (
@@ -110,7 +110,7 @@ if __name__ == "__main__":
     import sumo_nets.crowd.crowd  # noqa: F401
 
     sample = "--sample" in sys.argv
-    episodes = [one for k, one in enumerate(drawn()) if k % 6 < 2 or not sample]
+    episodes = [one for k, one in enumerate(drawn()) if k in SAMPLE or not sample]
     first = [_as_the_first(lambda one=one: hash_of(*one)) for one in episodes]  # type: ignore[misc]
     order = np.random.default_rng(12).permutation(len(episodes)).tolist()
     differ = [episodes[k][0].id for k in order if hash_of(*episodes[k]) != first[k]]

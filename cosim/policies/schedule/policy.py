@@ -27,6 +27,12 @@ _LEAST_LOOK_M: Final = 0.7
 _TURN_FIRST_RAD: Final = 1.2
 """Bearing beyond which the robot turns in place."""
 
+_ROLL_M: Final = 1.5
+_ROLL_S: Final = 1.0
+"""Largest distance in metres and time in seconds that a robot rolls after a stop has begun."""
+_BEFORE_GOAL_M: Final = 2.5
+"""Distance in metres before the goal at which a stop surely begins before the goal is reached."""
+
 P = TypeVar("P", bound=Part)
 
 
@@ -96,6 +102,38 @@ class SchedulePolicy:
             return Command(stop.v_mps, stop.w_radps)
         return self._pursue(observation.robot.w_max_radps)
 
+    def least_s(self, way_m: float, time_s: float, *, stops: bool = True) -> float:
+        """Return the least time in seconds to drive `way_m` straight to the goal from now on.
+
+        It is the time at the largest speed that may still come, with the stops that must begin
+        before.
+        way_m: at least this is to be driven.
+        time_s: seconds since the start.
+        stops: whether stops count.
+        """
+        to_come = [timing.part for timing in self._stops if not timing.has_begun]
+        speeds = [timing.part.to_mps for timing in self._speeds if not timing.has_begun]
+        fastest = max(self._v_mps, *speeds, *(stop.v_mps for stop in (*self._due, *to_come)), 0.0)
+        if way_m <= 0.0:
+            return 0.0
+        least_s = way_m / fastest if fastest > 0.0 else math.inf
+        if not stops or way_m <= _ROLL_M or any(stop.v_mps for stop in self._due):
+            return least_s
+        if self._due:
+            least_s += self._until_s - time_s + sum(stop.for_s for stop in self._due[1:])
+        before_m = self._way.length_m - _BEFORE_GOAL_M
+        if math.isfinite(before_m):
+            begins_m = [(stop, _begins_m(stop, self._way.length_m)) for stop in to_come]
+            least_s += sum(
+                stop.for_s
+                for stop, at_m in begins_m
+                if at_m is not None and at_m < before_m and not stop.v_mps
+            )
+        for stop in sorted(to_come, key=lambda one: one.at):
+            if stop.by == "clock" and stop.at < time_s + least_s - _ROLL_S and not stop.v_mps:
+                least_s += stop.for_s
+        return least_s
+
     def _stop_at(self, now: _Progress) -> Stop | None:
         """Return the current stop, if any. Stops that begin during another one follow it."""
         begun = _begun(self._stops, now)
@@ -142,6 +180,10 @@ class _Timing(Generic[P]):
         self.part = part
         self._times = 0
 
+    @property
+    def has_begun(self) -> bool:
+        return self._times > 0
+
     def begins(self, now: _Progress) -> bool:
         """Return whether the part begins now; then its next repetition is awaited."""
         part = self.part
@@ -152,6 +194,15 @@ class _Timing(Generic[P]):
             return False
         self._times += 1
         return True
+
+
+def _begins_m(part: Part, length_m: float) -> float | None:
+    """Return the position in metres along the way where a part begins; None by the clock."""
+    if part.by == "clock":
+        return None
+    if part.by == "goal":
+        return length_m - part.at
+    return part.at * length_m if part.by == "share" else part.at
 
 
 def _begun(timings: Sequence[_Timing[P]], now: _Progress) -> list[P]:

@@ -240,7 +240,7 @@ def _missed_goal(scenario: Scenario, record: Record) -> str:
     """Describe an episode that failed without a failure of the referee."""
     done = 100.0 * (record.measures.get("route_completion") or 0.0)
     if record.ended == "goal" and scenario.go_on_mps > 0.0:
-        return _did_not_go_on(scenario, record)
+        return _broke_speed_rule(scenario, record)
     if record.ended == "goal":
         return "came to the goal, but went between people that it should have passed round"
     if record.ended == "failure":
@@ -252,9 +252,16 @@ def _missed_goal(scenario: Scenario, record: Record) -> str:
     )
 
 
-def _did_not_go_on(scenario: Scenario, record: Record) -> str:
-    """Describe how the robot broke the go-on rule of a decoy, at its slowest event."""
+def _broke_speed_rule(scenario: Scenario, record: Record) -> str:
+    """Describe how the robot broke the go-on rule of a decoy, at its slowest event, or did not give
+    way in an event."""
     passed = [event for event in record.events if event.passing_mps is not None]
+    if not any(event.decoy for event in scenario.events):
+        fastest_mps = max((event.passing_mps or 0.0 for event in passed), default=0.0)
+        return (
+            f"did not give way: it drove {fastest_mps:.2f} m/s on average without a stop, where "
+            f"a stop or less than {scenario.go_on_mps:.2f} m/s was needed"
+        )
     if not passed:
         return "came to the goal, but did not go on past the person of its decoy"
     slowest = min(passed, key=lambda event: event.passing_mps or 0.0)

@@ -21,6 +21,7 @@ import moderngl
 from cosim.core.errors import EngineError, UsageError
 from cosim.core.state import Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
+from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Light
 from physics.cameras.gl.batch import batch_drawing
 from physics.cameras.gl.camera import NOON, GlCamera
@@ -37,10 +38,14 @@ _Seen = Sequence[tuple[SeatKey, RobotState, Street]]
 
 
 class Atlas:
-    """Camera for several worlds. Use it in a `with` block."""
+    """Camera for several worlds. Use it in a `with` block.
 
-    def __init__(self, spec: CameraSpec) -> None:
+    appearance: of scanned places
+    """
+
+    def __init__(self, spec: CameraSpec, appearance: Appearance = "splats") -> None:
         self._spec = spec
+        self._appearance = appearance
         self._size = drawn(spec).width, drawn(spec).height
         self._most = 4 * SIDE_MAX // self._size[1]
         self._cameras: dict[SeatKey, GlCamera] = {}
@@ -72,7 +77,7 @@ class Atlas:
     def join(self, world: BulletWorld, light: Light = NOON) -> SeatKey:
         """Add an environment; the world need not be running."""
         self._running_context  # noqa: B018  raises if the atlas is not running
-        camera = GlCamera(world, self._spec, light=light)
+        camera = GlCamera(world, self._spec, light=light, appearance=self._appearance)
         key = SeatKey(next(self._keys))
         self._cameras[key] = camera.__enter__()
         return key

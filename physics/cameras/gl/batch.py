@@ -24,6 +24,8 @@ from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shading import Pass, SceneBlocks, camera_matrix
 from physics.cameras.gl.shadows import TO_TEXTURE, ShadowMaps, casting
 from physics.cameras.gl.shots import Shots
+from physics.cameras.gl.splat_layers import splat_pictures
+from physics.cameras.gl.splats import SplatCloud
 from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.targets import Target
 from physics.cameras.gl.traffic import Driven, TrafficDrawing
@@ -36,7 +38,10 @@ _PEOPLE_MAX: Final = 4096
 
 
 class Stage(NamedTuple):
-    """Resources of a camera: street scene, optional shadow maps, backdrop, light."""
+    """Resources of a camera: street scene, optional shadow maps, backdrop, light.
+
+    cloud: splats of the place, None without
+    """
 
     surface: Surface
     model: Robot
@@ -44,6 +49,7 @@ class Stage(NamedTuple):
     shadows: ShadowMaps | None
     backdrop: Backdrop
     light: Lighting
+    cloud: SplatCloud | None = None
 
 
 class PictureOrder(NamedTuple):
@@ -71,6 +77,7 @@ class BatchDrawing:
         self.forms = Forms(context, self._surfaces)
         self._crowd, self._traffic = CrowdDrawing(context), TrafficDrawing(context, self.forms)
         self._blocks = SceneBlocks(context)
+        self._pictures = splat_pictures(context)
 
     def draw(
         self, pictures: Sequence[PictureOrder], target: Target, drawn: Callable[[int], None]
@@ -89,7 +96,7 @@ class BatchDrawing:
             self._context.front_face = "cw"  # draw upside down, to read the top row first
             for i, picture in enumerate(few):
                 target.clear()
-                self._draw(i, picture.stage, target)
+                self._draw(i, picture, target)
                 drawn(first + i)
             first += len(few)
 
@@ -103,7 +110,13 @@ class BatchDrawing:
             surface = stage.surface
             shadows = stage.shadows is not None
             watched.append(
-                PeopleSeen(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows)
+                PeopleSeen(
+                    street.people,
+                    _CLOCK.time_s(street.tick),
+                    surface.heights,
+                    shadows,
+                    surface.seed,
+                )
             )
             driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
         self._crowd.set(watched, shots)
@@ -133,12 +146,16 @@ class BatchDrawing:
                     draw = partial(self._draw_pass, i, one.stage)
                     one.stage.shadows.draw(middle, anchor, one.stage.light, draw)
 
-    def _draw(self, i: int, stage: Stage, target: Target) -> None:
+    def _draw(self, i: int, picture: PictureOrder, target: Target) -> None:
         gl = self._context
+        stage = picture.stage
         if stage.shadows is not None:
             stage.shadows.bind()
         self._blocks.bind(2 * i)
         gl.depth_func = "<"
+        if stage.cloud is not None:
+            self._draw_splats(i, picture, stage.cloud, target)
+            return
         self._draw_pass(i, stage, "colour")
         # Paint changes colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
@@ -148,6 +165,25 @@ class BatchDrawing:
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
         stage.backdrop.draw()
+
+    def _draw_splats(
+        self, i: int, picture: PictureOrder, cloud: SplatCloud, target: Target
+    ) -> None:
+        """Draw objects before the sky and the scan's mesh apart, and compose them with splats."""
+        gl = self._context
+        layers = self._pictures.layers(target.size)
+        layers.objects.use()
+        layers.objects.clear(depth=1.0)
+        self._draw_pass(i, picture.stage, "colour")
+        gl.depth_func = "<="
+        picture.stage.backdrop.draw()
+        layers.mesh.use()
+        layers.mesh.clear(depth=1.0)
+        gl.depth_func = "<"
+        gl.enable_only(moderngl.DEPTH_TEST)
+        picture.stage.scene.draw_mesh()
+        self._pictures.compose(cloud, picture.taken, picture.light, layers, target)
+        gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
     def _draw_pass(self, i: int, stage: Stage, which: Pass) -> None:
         shaded = stage.shadows is not None

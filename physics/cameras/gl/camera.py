@@ -14,6 +14,7 @@ import moderngl
 from cosim.core.errors import EngineError
 from cosim.core.state import Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
+from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Light
 from physics.cameras.camera_base import WorldCamera
 from physics.cameras.gl.backdrop import Backdrop
@@ -22,6 +23,7 @@ from physics.cameras.gl.context import context
 from physics.cameras.gl.lighting import Lighting, lighting_of
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shadows import ShadowMaps
+from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, View
@@ -32,14 +34,25 @@ _TARGETS_MAX: Final = 4
 
 
 class GlCamera(WorldCamera):
-    """Robot camera with OpenGL. Use it in a `with` block; the world need not be running."""
+    """Robot camera with OpenGL. Use it in a `with` block; the world need not be running.
+
+    appearance: of a scanned place; splats are drawn where the scan has them
+    """
 
     def __init__(
-        self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON
+        self,
+        world: BulletWorld,
+        spec: CameraSpec,
+        depth: bool = False,
+        light: Light = NOON,
+        appearance: Appearance = "splats",
     ) -> None:
         super().__init__(world, spec, depth)
-        self._sky = sky_of(light, world.surface.seed)
-        self._light = lighting_of(self._sky)
+        scan = world.surface.scan
+        self._splats = scan.splats if scan is not None and appearance == "splats" else None
+        seed = world.surface.seed
+        self._sky = sky_of(light, seed) if scan is None else scan_sky(light, scan.facts, seed)
+        self._light = lighting_of(self._sky, haze=self._splats is None)
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
@@ -48,11 +61,12 @@ class GlCamera(WorldCamera):
         if self._context is None:
             world, light = self._world, self._light
             with context() as gl:
-                scene = GlScene(gl, batch_drawing(gl).forms, world, light)
+                splats = self._splats
+                scene = GlScene(gl, batch_drawing(gl).forms, world, light, splats is not None)
                 shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
-                self._stage = Stage(
-                    world.surface, world.robot, scene, shadows, Backdrop(gl, self._sky), light
-                )
+                cloud = None if splats is None else splat_pictures(gl).cloud(splats)
+                sky = Backdrop(gl, self._sky)
+                self._stage = Stage(world.surface, world.robot, scene, shadows, sky, light, cloud)
             self._context = gl
         return self
 
@@ -64,6 +78,8 @@ class GlCamera(WorldCamera):
                 if self._stage.shadows is not None:
                     self._stage.shadows.release()
                 self._stage.backdrop.release()
+                if self._stage.cloud is not None:
+                    splat_pictures(self._context).release(self._stage.cloud)
                 while self._targets:
                     self._targets.popitem()[1].release()
             self._context = None

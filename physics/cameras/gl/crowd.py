@@ -78,12 +78,14 @@ class PeopleSeen(NamedTuple):
 
     heights: function of (N, 2) points that returns the ground height
     shadows: people cast shadows
+    seed: of their clothes and colours
     """
 
     people: People
     time_s: float
     heights: Callable[[Floats], Floats]
     shadows: bool
+    seed: int = 0
 
 
 class _Worn(NamedTuple):
@@ -117,7 +119,7 @@ class CrowdDrawing:
         self._known = np.zeros(len(self._starts), dtype=bool)
         self._split: list[list[int]] = []
         self._room = 0
-        self._dressed: list[tuple[tuple[str, ...], bytes]] = []
+        self._dressed: list[tuple[tuple[str, ...], bytes, int]] = []
         self._grow(_CROWD_MIN)
 
     def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
@@ -142,7 +144,9 @@ class CrowdDrawing:
         seen = seen[rows]
         casts = casts[rows]
         z_m = _heights(watched, whose, xy)
-        worn = self._dress([(one.people.ids, one.people.age.tobytes()) for one in watched])
+        worn = self._dress(
+            [(one.people.ids, one.people.age.tobytes(), one.seed) for one in watched]
+        )
         outfit, girth, bodies = worn.outfit[rows], worn.girth[rows], worn.bodies[rows]
         heading, strides, pace = (
             np.concatenate([getattr(one.people, name) for one in watched])[rows]
@@ -166,10 +170,10 @@ class CrowdDrawing:
         self._matrices.use(0)
         self._dyed.use(1)
 
-    def _dress(self, who: list[tuple[tuple[str, ...], bytes]]) -> _Worn:
+    def _dress(self, who: list[tuple[tuple[str, ...], bytes, int]]) -> _Worn:
         """Return the appearance of all people, and upload their colours if they changed.
 
-        who: names and ages
+        who: names, ages and seeds
         """
         if who != self._dressed:
             each = [_worn(*one) for one in who]
@@ -291,8 +295,8 @@ def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats)
 
 
 @lru_cache(maxsize=256)
-def _worn(ids: tuple[str, ...], ages: bytes) -> _Worn:
-    looks = list(map(look_of, ids, ages))
+def _worn(ids: tuple[str, ...], ages: bytes, seed: int) -> _Worn:
+    looks = [look_of(name, age, seed) for name, age in zip(ids, ages, strict=True)]
     return _Worn(
         np.array([who.outfit for who in looks], dtype=np.intp),
         np.array([who.girth_m for who in looks], dtype=np.float32),

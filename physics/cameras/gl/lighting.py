@@ -31,6 +31,7 @@ class Lighting:
     horizon: (N, 3) the sky just over the horizon, columns as in physics.cameras.sky
     lamps: 0 by day to 1 at night
     shadows: the sun casts shadows
+    haze: distant objects fade into the fog
     """
 
     to_sun: Floats
@@ -44,6 +45,7 @@ class Lighting:
     exposure: float
     lamps: float
     shadows: bool
+    haze: bool = True
 
     def seen(self, heading_rad: float, half_angle_rad: float) -> Lighting:
         """Return the light of a picture whose fog has the colour of the sky behind it."""
@@ -62,12 +64,12 @@ class Lighting:
             (*(0.5 * (self.up - self.down)), 0.0),
             (*(0.5 * (self.up + self.down) - self.side), 0.0),
             (*self.fog, self.fog_per_m),
-            (HAZE_FROM_M, HAZE_PER_M, HAZE_MOST, 0.0),
+            (HAZE_FROM_M, HAZE_PER_M, HAZE_MOST if self.haze else 0.0, 0.0),
         ]
 
 
-def lighting_of(sky: Sky) -> Lighting:
-    """Convert a sky to shader values."""
+def lighting_of(sky: Sky, haze: bool = True) -> Lighting:
+    """Convert a sky to shader values. haze: of distant objects."""
     up, side, down = sky.ambient
     return Lighting(
         sky.sun,
@@ -81,6 +83,7 @@ def lighting_of(sky: Sky) -> Lighting:
         sky.exposure,
         sky.lamps,
         sky.shadows,
+        haze,
     )
 
 

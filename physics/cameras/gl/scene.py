@@ -26,6 +26,7 @@ from cosim.spec.scenario import Barrier
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.instances import INSTANCE, Forms, Things, instances
 from physics.cameras.gl.lighting import Lighting
+from physics.cameras.gl.scans import scan_layer, scan_rows, scan_shaders
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import STEP_M
 from physics.cameras.gl.surfaces import TileRows, surfaces
@@ -72,6 +73,7 @@ class _Tile:
     ground: TileRows | None
     paint: TileRows | None
     walls: TileRows | None
+    scan: TileRows | None
     things: _Placed
     thing_xy: Floats
     seen_m: Floats
@@ -87,11 +89,20 @@ class _Words(msgspec.Struct, array_like=True):
 
 
 class GlScene:
-    """Static street around a view, as a function of view and signals alone."""
+    """Static street around a view, as a function of view and signals alone.
+
+    splats: the scan's mesh is not in the picture, but drawn apart by `draw_mesh`
+    """
 
     def __init__(
-        self, context: moderngl.Context, forms: Forms, world: BulletWorld, light: Lighting
+        self,
+        context: moderngl.Context,
+        forms: Forms,
+        world: BulletWorld,
+        light: Lighting,
+        splats: bool = False,
     ) -> None:
+        self._splats = splats
         self._surface = world.surface
         self._forms = forms
         self._shadows = light.shadows
@@ -101,6 +112,9 @@ class GlScene:
         self._ground = ground_layer(context, ground)
         self._paint = ground_layer(context, ground)
         self._walls = wall_layer(context, walls)
+        self._scan = scan_layer(
+            context, scan_shaders(context, self._surfaces, light.shadows and not splats, splats)
+        )
         self._seen = Things(context, forms)
         self._standing = Things(context, forms)
         self._fence_forms = forms.apart()  # the number of sizes is unlimited
@@ -146,6 +160,12 @@ class GlScene:
         self._fenced.draw(stage, self._shadows)
         self._walls.draw(stage)
         self._ground.draw(stage)
+        if not self._splats:
+            self._scan.draw(stage)
+
+    def draw_mesh(self) -> None:
+        """Draw normals and labels of the scan's mesh."""
+        self._scan.draw("colour")
 
     def draw_paint(self) -> None:
         """Draw road paint after the ground, without labels and depth."""
@@ -156,6 +176,7 @@ class GlScene:
             self._ground,
             self._paint,
             self._walls,
+            self._scan,
             self._seen,
             self._standing,
             self._fenced,
@@ -182,6 +203,7 @@ class GlScene:
             (self._ground, [tile.ground for tile in tiles]),
             (self._paint, [tile.paint for tile in tiles]),
             (self._walls, [tile.walls for tile in tiles]),
+            (self._scan, [tile.scan for tile in tiles]),
         ):
             layer.hold(rows, self._middles)
         self._stands_xy = np.concatenate([*(tile.thing_xy for tile in tiles), self._obstacle_xy])
@@ -201,7 +223,7 @@ class GlScene:
         self._seen_for = None
         self._still_for = None
         self._lit_for = []
-        for layer in (self._ground, self._paint, self._walls):
+        for layer in (self._ground, self._paint, self._walls, self._scan):
             layer.place(anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
         self._stands = _joined([*placed, _at(self._obstacles, self._obstacle_xy, anchor)])
@@ -218,7 +240,7 @@ class GlScene:
         rows = chosen.nonzero()[0]
         form, things = self._stands
         self._seen.set(*_joined([(form[rows], things[rows]), self._lit]))
-        for layer in (self._ground, self._paint, self._walls):
+        for layer in (self._ground, self._paint, self._walls, self._scan):
             layer.show("colour", tiles.nonzero()[0])
 
     def _stand(self, middle: Floats, anchor: Floats) -> None:
@@ -241,15 +263,16 @@ class GlScene:
         pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
         form = [self._forms.id(("prop", *form), partial(parts_of, *form)) for form in words.forms]
         things = np.array([*form, *[pole] * len(words.posts)], dtype=np.intp), held["things"]
-        ground, paint, walls = (
+        ground, paint, walls, scan = (
             (held[name], held[f"{name}_triangles"]) if name in held else None
-            for name in ("ground", "paint", "walls")
+            for name in ("ground", "paint", "walls", "scan")
         )
         return _Tile(
             _middle(key),
             ground,
             paint,
             walls,
+            scan,
             things,
             held["thing_xy"],
             held["seen_m"],
@@ -265,8 +288,11 @@ class GlScene:
             self._surface.finish(key),
             self._surface.posts(key),
         )
+        scanned = self._surface.scanned(key)
+        ground = (*finish.laid, *chunk.ground) if self._surface.scan is None else ()
         layers = {
-            "ground": ground_rows(self._surfaces, (*finish.laid, *chunk.ground), middle),
+            "scan": scan_rows(scanned, middle),
+            "ground": ground_rows(self._surfaces, ground, middle),
             "paint": ground_rows(self._surfaces, finish.painted, middle),
             "walls": wall_rows(self._surfaces, chunk.buildings, finish.styles, middle),
         }

@@ -22,6 +22,7 @@ from cosim.core.state import Doing, People, RobotState, Street, Vehicles
 from cosim.place.street_map import StreetMap
 from cosim.spec.camera import CameraSpec
 from cosim.spec.options import CameraName
+from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import City
 from scenarios.tools.bench.figures import alone
 
@@ -47,13 +48,17 @@ class Busy(NamedTuple):
 
 
 def busy_street(street_map: StreetMap, persons: int, frames: int) -> Busy:
-    """Fill the view of a robot that looks along the longest sidewalk with people; four of five
-    walk."""
-    rng = np.random.default_rng(persons)
+    """Fill the view of a robot that looks along the longest sidewalk with people."""
     longest = max(
         (s for s in street_map.strips.values() if s.kind == "sidewalk"), key=lambda s: s.length_m
     )
-    x, y, heading = Polyline(longest.line[:, :2]).at(0.3 * longest.length_m)
+    return busy_at(Pose(*Polyline(longest.line[:, :2]).at(0.3 * longest.length_m)), persons, frames)
+
+
+def busy_at(pose: Pose, persons: int, frames: int) -> Busy:
+    """Fill the view of a robot at a pose with people, four of five of whom walk, and cars."""
+    rng = np.random.default_rng(persons)
+    x, y, heading = pose.x_m, pose.y_m, pose.heading_rad
     bearing = heading + rng.uniform(-0.6, 0.6, persons)
     away = np.sqrt(rng.uniform(_NEAREST_M**2, _FARTHEST_M**2, persons))
     start = np.array([x, y]) + away[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
@@ -114,7 +119,7 @@ def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) ->
     world = BulletWorld(StreetSurface(street_map, 5))
     busy = busy_street(street_map, persons, frames)
     with camera_of(camera, world, CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
-        return _median(lambda street: eyes.render(busy.robot, street), busy.streets)
+        return median_s(lambda street: eyes.render(busy.robot, street), busy.streets)
 
 
 def people_alone(persons: int, frames: int, size_m: float) -> float:
@@ -130,7 +135,7 @@ def people_alone(persons: int, frames: int, size_m: float) -> float:
             if street.tick:
                 eyes.end()
 
-        return _median(draw, busy.streets)
+        return median_s(draw, busy.streets)
 
 
 def together(environments: int, frames: int, size_m: float) -> float:
@@ -152,10 +157,10 @@ def together(environments: int, frames: int, size_m: float) -> float:
             if street.tick:
                 eyes.end()
 
-        return _median(draw, busy.streets) / environments
+        return median_s(draw, busy.streets) / environments
 
 
-def _median(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> float:
+def median_s(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> float:
     """Return the median seconds of a picture without the first tenth, in which tiles and bodies
     are built."""
     stamps = [time.perf_counter()]
@@ -163,6 +168,18 @@ def _median(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> fl
         draw(street)
         stamps.append(time.perf_counter())
     return float(statistics.median(np.diff(stamps)[len(streets) // 10 :].tolist()))
+
+
+def _scanned(appearance: Appearance, count: int, frames: int, size_m: float) -> float:
+    from scenarios.tools.bench.splats import scanned_frame
+
+    return scanned_frame(appearance, count, PERSONS, frames, size_m)
+
+
+def _scanned_together(size_m: float) -> float:
+    from scenarios.tools.bench.splats import scanned_together
+
+    return scanned_together(TOGETHER, 1_000_000, PERSONS, 12, size_m)
 
 
 class Drawing(NamedTuple):
@@ -179,6 +196,9 @@ WHOLE: Final = "whole frame, gl"
 PEOPLE: Final = "people alone, gl"
 TINY: Final = "whole frame, bullet (TinyRenderer)"
 EGL: Final = "whole frame, bullet (EGL plugin)"
+SCANNED: Final = "scan, 0.27 M splats, gl"
+_SCANNED_MESH: Final = "scan, mesh, gl"
+_SCAN_CITY_M: Final = 200.0
 _SMALL: Final = "whole frame, gl, 0.2 km city"
 
 FIGURES: Final = (
@@ -197,12 +217,43 @@ FIGURES: Final = (
         partial(together, TOGETHER, 40),
         least_fps=(None, 5000.0),
     ),
+    Drawing(
+        SCANNED,
+        partial(_scanned, "splats", 270_000, 50),
+        _SCAN_CITY_M,
+        least_fps=(8.0, 300.0),
+    ),
+    Drawing(
+        _SCANNED_MESH,
+        partial(_scanned, "mesh", 1000, 100),
+        _SCAN_CITY_M,
+        least_fps=(80.0, None),
+    ),
+    Drawing(
+        "scan, 1 M splats, gl",
+        partial(_scanned, "splats", 1_000_000, 30),
+        _SCAN_CITY_M,
+        least_fps=(None, 150.0),
+    ),
+    Drawing(
+        "scan, 3 M splats, gl",
+        partial(_scanned, "splats", 3_000_000, 20),
+        _SCAN_CITY_M,
+        least_fps=(None, 60.0),
+    ),
+    Drawing(
+        f"{TOGETHER} environments in a scan of 1 M splats, gl",
+        _scanned_together,
+        _SCAN_CITY_M,
+        least_fps=(None, 400.0),
+    ),
 )
 
 
 RATIOS: Final = (
     ("gl / TinyRenderer", WHOLE, TINY, ">= 5"),
     ("gl / EGL plugin", WHOLE, EGL, ">= 5"),
+    ("scan: splats / mesh", SCANNED, _SCANNED_MESH, ""),
     ("time in a 2 km city / 0.2 km city", _SMALL, WHOLE, "<= 1.1"),
 )
 """Ratios: name, figures above and below the line, target."""

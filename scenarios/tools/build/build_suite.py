@@ -23,13 +23,14 @@ import physics
 import scenarios
 import sumo_nets
 from cosim.core.cache import sources_hash
-from cosim.core.errors import CosimError, RunError, SpecError
+from cosim.core.errors import CosimError, RunError, SpecError, UsageError
 from cosim.core.files import write_atomic
 from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Place, Scenario, Suite, write_suite
-from scenarios.suites.decoys import decoy_of, has_decoy
+from scenarios.suites.catalog import SUITES
+from scenarios.suites.decoys import decoy_of, has_decoy, must_give_way
 from scenarios.suites.proofs import Dropped, Proof, Proofs, write_proofs
-from scenarios.suites.recipes import RECIPES, Slot, SuiteRecipe, candidate, repeated
+from scenarios.suites.recipes import Slot, SuiteRecipe, candidate, recipe_of, repeated
 from scenarios.tools.build.proving import accepted
 
 CANDIDATES: Final = 6
@@ -78,22 +79,26 @@ def build_suite(
     tries: int = CANDIDATES,
     progress: Progress = ignore,
     only: Sequence[str] = (),
+    redraw: int = 0,
 ) -> tuple[Suite, Proofs]:
     """Build a suite at a path, with its proofs; the result does not depend on the number of
     processes.
 
     tries: candidates of each scenario.
     only: names of scenarios, to build a part of the suite for inspection.
+    redraw: number of a redraw with other seeds; 0 for the shipped suite.
 
     Proofs are stored in the folder OUT.parts until the suite is complete. Call it again to resume.
 
     Raises SpecError with the scenarios whose candidates all failed. Raises RunError if OUT.parts is
-    of another version.
+    of another version, UsageError if a redraw would replace a shipped suite.
     """
-    recipe = RECIPES[name]
+    if redraw and out.resolve() in {path.resolve() for path in SUITES.values()}:
+        raise UsageError(f"{out} is the shipped suite: write a redraw to a file of its own")
+    recipe = recipe_of(name, redraw)
     folder = out.with_suffix(".parts")
     slots = _with_needed(recipe, only) if only else list(recipe.slots)
-    _open(folder, name)
+    _open(folder, f"{name} {redraw}" if redraw else name)
     for line, done in _run(_pieces(slots), folder, jobs, tries):
         progress(f"{done}/{len(slots)} {line}", done / len(slots))
     kept = [_kept(folder, slot) for slot in slots]
@@ -213,7 +218,7 @@ def _look_after(worker: _Worker, folder: Path) -> None:
         worker.process.join()
         for slot in worker.piece.slots:
             if (tried := _tried(folder, slot.name)).begun:
-                hung = Dropped(_seed(slot, len(tried.dropped)), "hung")
+                hung = Dropped(slot.seed(len(tried.dropped)), "hung")
                 _note(folder, slot, _Tried((*tried.dropped, hung)))
 
 
@@ -238,13 +243,13 @@ def _fill(slot: Slot, folder: Path, tries: int) -> None:
     dropped = list(tried.dropped)
     begun = tried.begun
     if begun >= _BEGUN:
-        dropped.append(Dropped(_seed(slot, len(dropped)), "its process died"))
+        dropped.append(Dropped(slot.seed(len(dropped)), "its process died"))
         begun = 0
     for attempt in itertools.count(len(dropped)):
         if attempt >= tries:
             _note(folder, slot, _Tried(tuple(dropped)))
             return
-        seed = _seed(slot, attempt)
+        seed = slot.seed(attempt)
         _note(folder, slot, _Tried(tuple(dropped), begun + 1))
         begun = 0
         try:
@@ -276,6 +281,10 @@ def _accepted(scenario: Scenario) -> list[tuple[Scenario, Proof]] | Dropped:
     )
     if isinstance(decoy, Dropped):
         return msgspec.structs.replace(decoy, reason=f"decoy: {decoy.reason}")
+    if must_give_way(scenario):
+        first = accepted(msgspec.structs.replace(scenario, go_on_mps=decoy[0].go_on_mps))
+        if isinstance(first, Dropped):
+            return first
     return [first, decoy]
 
 
@@ -288,10 +297,6 @@ def _drawn(slot: Slot, folder: Path, seed: int) -> Scenario:
     if not path.exists():
         raise SpecError(f"'{slot.like}', which it repeats, was not solved")
     return repeated(slot, msgspec.json.decode(path.read_bytes(), type=Kept).scenario)
-
-
-def _seed(slot: Slot, attempt: int) -> int:
-    return 1000 * attempt + slot.number
 
 
 def _trying(folder: Path, name: str) -> Path:

@@ -16,11 +16,19 @@ from typing import Final
 
 import numpy as np
 
+from cosim.results.go_on import overtaken_at_m
 from cosim.spec.scenario import City, CityMap, Scenario, Suite, content_hash
 from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.daylight import FOG_M, LOWEST_SUN_RAD, sun_rises_rad
-from scenarios.suites.decoys import differing_fields, has_decoy, least_pace_mps, time_limit_s
+from scenarios.suites.decoys import (
+    differing_fields,
+    has_decoy,
+    least_pace_mps,
+    must_give_way,
+    people_in_obstacles,
+    time_limit_s,
+)
 from scenarios.suites.exploits import ALL, Exploit, Share, kind_of
 from scenarios.suites.lanes import THINGS
 from scenarios.suites.proofs import Proofs, proofs_path
@@ -261,6 +269,39 @@ def _decoys(read: Read) -> Iterator[str]:
     yield from (f"{those[0].id}: is the decoy of no scenario" for those in decoys.values())
 
 
+def _people(read: Read) -> Iterator[str]:
+    """Check that people of reactive scenarios and decoys stay at places without obstacles."""
+    for one in read.suite.scenarios:
+        yield from (f"{one.id}: {words}" for words in people_in_obstacles(one))
+
+
+def _exclusive(read: Read) -> Iterator[str]:
+    """Check that no motion solves both an event in which the robot must give way and its decoy.
+
+    The rules of both are opposite at one speed. The robot alone ends their window, on the route:
+    the same motion has the same window in both.
+    """
+    decoys = {one.decoy_of: one for one in read.suite.scenarios if one.decoy_of}
+    for one in filter(must_give_way, read.suite.scenarios):
+        if not one.go_on_mps:
+            yield f"{one.id}: the robot need not give way: its go_on_mps is 0"
+        elif one.id in decoys and (other := decoys[one.id].go_on_mps) != one.go_on_mps:
+            yield (
+                f"{one.id}: its go_on_mps is {one.go_on_mps:g}, that of its decoy {other:g}: "
+                f"motions of a speed between them solve both or none"
+            )
+        last_m = one.route_line.length_m - one.goal_radius_m
+        for event in one.events:
+            end_m = overtaken_at_m(event, EVENT_KINDS[event.kind])
+            if end_m is None:
+                yield f"{one.id}: its person comes from the front and decides when it is passed"
+            elif end_m > last_m:
+                yield (
+                    f"{one.id}: the robot is overtaken until {end_m:.1f} m, but may be at the "
+                    f"goal at {last_m:.1f} m"
+                )
+
+
 def _limits(read: Read) -> Iterator[str]:
     """Check that the limits of short scenarios follow from their proofs."""
     proofs = {proof.scenario: proof for proof in read.proofs.proofs} if read.proofs else {}
@@ -483,6 +524,8 @@ CLAIMS: Final[Mapping[str, Callable[[Read], Iterator[str]]]] = MappingProxyType(
         "sides": _sides,
         "obstacles": _obstacles,
         "decoys": _decoys,
+        "people": _people,
+        "exclusive": _exclusive,
         "limits": _limits,
         "spread": _spread,
         "duplicates": _duplicates,

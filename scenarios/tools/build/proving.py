@@ -20,7 +20,7 @@ from cosim.spec.obstacle import footprint
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, content_hash
 from scenarios.episodes.run_episode import run_episode
-from scenarios.suites.decoys import limited
+from scenarios.suites.decoys import limited, people_in_obstacles
 from scenarios.suites.proofs import Dropped, Proof
 
 EXPERT: Final = "orca"
@@ -74,8 +74,11 @@ class _Witness:
 def accepted(scenario: Scenario) -> tuple[Scenario, Proof] | Dropped:
     """Return a scenario that the expert solves, with its limits and proof, or why it fails.
 
-    The expert must also meet the go-on rule of a decoy, at any speed but without a stop.
+    The expert must also meet the go-on rule of a decoy, at any speed but without a stop. A person
+    who may stay inside an obstacle is a failure before it drives.
     """
+    if (inside := next(people_in_obstacles(scenario), None)) is not None:
+        return Dropped(scenario.seed, "person inside an obstacle", inside)
     rule = {"go_on_mps": _ANY_MPS} if any(event.decoy for event in scenario.events) else {}
     found = proved(msgspec.structs.replace(scenario, **rule))
     if isinstance(found, Dropped):

@@ -31,13 +31,14 @@ from cosim.results.record import Record
 from cosim.results.run_folder import DEMONSTRATION, RunFolder
 from cosim.results.run_spec import brief
 from cosim.spec.demo_options import DemoOptions
-from cosim.spec.options import EpisodeOptions
+from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.episodes.demonstration import Demonstration, check_parquet
 from scenarios.episodes.demonstrator import Demonstrator, load_learner
 from scenarios.ipc.messages import Hello, MessageHandler
 from scenarios.runs.local import LocalProcesses
 from scenarios.runs.planning import run_spec
+from scenarios.runs.policy_host import settled_host
 from scenarios.runs.pool import run_all
 from scenarios.suites.catalog import with_robot
 from scenarios.suites.fits import check_places
@@ -132,6 +133,7 @@ def collect(
     options: EpisodeOptions,
     episodes: int | None = None,
     jobs: int = 1,
+    host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
     resume: bool = False,
     showing: _Showing = _unshown,
     progress: Progress = ignore,
@@ -145,6 +147,7 @@ def collect(
     policy: name of the expert.
     options: seed, robot, goal, own_camera and camera are used.
     episodes: number of episodes in the data set; by default all that are solved.
+    host: where the expert is queried.
     showing, progress: display of the run.
 
     Raises RunError for a folder of another data set. Raises UsageError and SpecError for invalid
@@ -167,7 +170,13 @@ def collect(
         if learner is None
         else Hello(collecting.learner, learner.manifest, learner.source_hash)
     )
-    hello = Hello(policy, expert.manifest, expert.source_hash, learner=beside)
+    hello = Hello(
+        policy,
+        expert.manifest,
+        expert.source_hash,
+        host=settled_host(host, expert),
+        learner=beside,
+    )
     with ExitStack() as stack:
         found: list[Collected] = []
         dropped = Counter[str]()

@@ -51,6 +51,8 @@ SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
     }
 )
 _SHOWN: Final = "straight-003"
+_PERSON: Final = "person-30"
+"""Name of the person ahead, whose clothes are yellow there and so easy to see."""
 """Scenario of the suite `unit` whose place is shown.
 
 The way is 18 m long and has lawns on both sides. No large object is close to the camera: a policy
@@ -167,7 +169,7 @@ def _somebody(route: Polyline, s_m: float) -> People:
     """Return one adult in the middle of the way, facing the robot."""
     pose = route.at(s_m)
     return People.of(
-        ("somebody",),
+        (_PERSON,),
         [pose.xy],
         [wrap_angle(pose.heading_rad + math.pi)],
         [0.0],

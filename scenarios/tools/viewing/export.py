@@ -12,8 +12,7 @@ from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Scenario
 from physics.ground.tiles import tiles_touching
 from physics.street.gltf import as_gltf
-from physics.street.street_surface import StreetSurface
-from scenarios.places.nets import place
+from scenarios.places.nets import surface_of_place
 
 _AROUND_M: Final = 30.0
 """Largest distance of the written tiles from the route, in metres."""
@@ -24,8 +23,7 @@ def export_street(scenario: Scenario, path: Path, progress: Progress = ignore) -
     many tiles. y is up, x and -z are the map's x and y, in metres. Raises MachineError when it
     cannot be written."""
     progress(f"reading the street map of {scenario.place.name}")
-    _, street_map = place(scenario.place)
-    surface = StreetSurface(street_map, scenario.place.seed, scenario.place.roughness)
+    surface = surface_of_place(scenario.place)
     keys = tiles_touching(shapely.buffer(shapely.LineString(scenario.route), _AROUND_M))
     written = as_gltf(surface, keys, scenario.barriers, progress, scenario.obstacles)
     try:

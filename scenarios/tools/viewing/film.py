@@ -34,7 +34,7 @@ from cosim.results.run_folder import read_records, read_spec
 from cosim.results.waypoint_replay import WaypointReplay
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import robot_called
-from cosim.spec.run_config import CameraChoice
+from cosim.spec.run_config import Appearance, CameraChoice
 from physics.cameras.view import robot_shot
 from scenarios.episodes.replay import (
     RecordedEpisode,
@@ -76,6 +76,7 @@ class Cut(NamedTuple):
     speed: factor of real time.
     camera: renderer.
     view: viewpoint.
+    appearance: of scanned places, by default that of the run.
     """
 
     from_s: float = 0.0
@@ -84,6 +85,7 @@ class Cut(NamedTuple):
     speed: int = 1
     camera: CameraChoice = "auto"
     view: Viewpoint = "follow"
+    appearance: Appearance | None = None
 
 
 class FilmedFailure(NamedTuple):
@@ -172,7 +174,7 @@ def make_film(
     fps = round(1.0 / Clock().tick_s)
     with ExitStack() as stack:
         video = stack.enter_context(Video(output, cut.size, fps))
-        episode, policy = replay_episode(told, cut.camera)
+        episode, policy = replay_episode(told, cut.camera, appearance=cut.appearance)
         stack.enter_context(episode)
         camera = stack.enter_context(episode.eyes(robot_eye(cut)))
         minimap = Minimap(street_map, scenario, episode.footprint_m)
@@ -317,7 +319,8 @@ class _Reel:
         for event, state in zip(self._scenario.events, step.events.states, strict=True):
             if state.phase == "acting" and event.id not in self._triggered:
                 self._triggered.add(event.id)
-                self._say(step.tick, event.kind.replace("_", " "), hud.INK)
+                decoy = " (decoy)" if self._scenario.decoy_of else ""
+                self._say(step.tick, event.kind.replace("_", " ") + decoy, hud.INK)
         for failure in verdict.failures:
             self._counts[failure.kind] += 1
             other = f" with {failure.other_kind}" if failure.other_kind else ""

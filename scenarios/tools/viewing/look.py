@@ -16,7 +16,7 @@ from cosim.policies.load import load_policy
 from cosim.report.legend import Image
 from cosim.spec.camera import CameraSpec
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.run_config import CameraChoice
+from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.episode import Episode
 from scenarios.places.nets import place
@@ -41,12 +41,14 @@ def look_at(
     size: tuple[int, int],
     camera_name: CameraChoice = "auto",
     progress: Progress = ignore,
+    appearance: Appearance = "splats",
 ) -> tuple[Image, float]:
     """Return the picture `at_s` seconds into an episode, or at its end if that comes first.
 
     policy: name of the policy that drives until then.
     size: width and height in pixels.
     progress: receives the running step.
+    appearance: of scanned places.
 
     Returns ((H, W, 3) uint8 RGB, seconds).
     """
@@ -60,8 +62,9 @@ def look_at(
     progress(f"reading the street map of {scenario.place.name}")
     place(scenario.place)
     progress("starting SUMO, PyBullet and the camera")
+    options = EpisodeOptions(camera=camera_name, appearance=appearance)
     with (
-        Episode(scenario, driver.manifest, EpisodeOptions(camera=camera_name)) as episode,
+        Episode(scenario, driver.manifest, options) as episode,
         episode.eyes(spec) as camera,
     ):
         driver.reset(episode.id, episode.seed)

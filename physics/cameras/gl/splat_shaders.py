@@ -1,0 +1,512 @@
+"""Compute shaders of splats: keys, stable sort, projection, lists of tiles, and the picture.
+
+All shaders read the uniform block `Splatting` (binding VIEW_BINDING), see `view_rows` in
+`physics.cameras.gl.splats`. Buffers are storage blocks with the bindings of the shader.
+
+Pictures are upside down in textures: row 0 is the top one.
+No shader uses atomic operations, so that the order of blending depends on no schedule.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from cosim.core.state import LABELS
+from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
+
+VIEW_BINDING: Final = 1
+TILE_PX: Final = 8
+"""Side of a tile in pixels."""
+NEAR_M: Final = 0.2
+"""Minimum depth of the centre of a drawn splat, metres."""
+BLUR_PX2: Final = 0.3
+"""Variance added to each projected splat, in square pixels, as in the training of splats."""
+FULL: Final = 1.0 / 1024.0
+"""Transmittance below which a pixel is full."""
+STRAY: Final = 0.3
+"""Maximum difference of a pixel's depth from its splat's, as a share."""
+BEHIND_M: Final = 0.12
+"""Distance behind the mesh from which objects are covered, metres."""
+STEEP: Final = 0.02
+"""Minimum slope of a ray to the ground."""
+NOTHING_M: Final = 1.0e9
+"""Limit of pixels without an object."""
+GROUND_LABELS: Final = (LABELS["road"], LABELS["ground"])
+"""First and last label of the ground."""
+
+OBJECTS_UNIT: Final = 9
+OBJECTS_DEPTH_UNIT: Final = 10
+MESH_UNIT: Final = 11
+MESH_DEPTH_UNIT: Final = 12
+COLOUR_UNIT: Final = 13
+MEDIAN_UNIT: Final = 14
+LIMITS_UNIT: Final = 15
+"""Texture units of a picture's layers."""
+
+METRES: Final = f"""
+float metres(float depth) {{
+    return {FAR_PLANE_M * NEAR_PLANE_M} / ({FAR_PLANE_M} - {FAR_PLANE_M - NEAR_PLANE_M} * depth);
+}}
+"""
+"""Conversion of the depth buffer to metres along the view."""
+
+_BLOCK: Final = f"""#version 430
+layout(std140, binding = {VIEW_BINDING}) uniform Splatting {{
+    vec4 eye;     // xyz in the frame of the splats; w focal length in pixels
+    vec4 right;   // w tangent of half the width
+    vec4 up;      // w tangent of half the height
+    vec4 ahead;
+    uvec4 sizes;  // width and height in pixels, columns and rows of tiles
+    uvec4 counts; // splats
+    vec4 lattice; // xyz of the point from which distances are sorted
+}};
+"""
+
+KEYS: Final = (
+    _BLOCK
+    + """
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) readonly buffer Splats { uvec4 splats[]; };
+layout(std430, binding = 1) writeonly buffer Keys { uint keys[]; };
+layout(std430, binding = 2) writeonly buffer Values { uint values[]; };
+void main() {
+    uint i = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * 4194240u;
+    if (i >= counts.x) return;
+    precise vec3 d = uintBitsToFloat(splats[3u * i].xyz) - lattice.xyz;
+    precise float xx = d.x * d.x;
+    precise float yy = d.y * d.y;
+    precise float zz = d.z * d.z;
+    precise float xy = xx + yy;
+    precise float all = xy + zz;
+    uint bits = floatBitsToUint(all) >> 12;
+    keys[i] = min(max(bits, 251904u) - 251904u, 65535u);
+    values[i] = i;
+}
+"""
+)
+"""Keys of the order: the bits of the squared distance, in steps of 2048 to a factor of two.
+
+251904 is the key of 2^-4, a distance of 0.25 m. Steps are below 0.03 % of the distance.
+"""
+
+CLEAR: Final = """#version 430
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) writeonly buffer Counts { uint counts[]; };
+uniform uint total;
+void main() {
+    uint i = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * 4194240u;
+    if (i < total) counts[i] = 0u;
+}
+"""
+
+_SORTED: Final = """
+uniform uint total;
+uniform uint chunk;   // items of an invocation
+uniform uint chunks;
+uniform uint digits;
+uniform uint shift;
+"""
+
+COUNT: Final = (
+    """#version 430
+layout(local_size_x = LANES) in;
+layout(std430, binding = 0) buffer Counts { uint counts[]; };
+layout(std430, binding = 1) readonly buffer Keys { uint keys[]; };
+"""
+    + _SORTED
+    + """
+void main() {
+    uint c = gl_GlobalInvocationID.x;
+    if (c >= chunks) return;
+    uint end = min((c + 1u) * chunk, total);
+    for (uint i = c * chunk; i < end; ++i)
+        counts[c * digits + ((keys[i] >> shift) % digits)] += 1u;
+}
+"""
+)
+"""Count the keys of each chunk by digit."""
+
+COLUMNS: Final = (
+    """#version 430
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) buffer Counts { uint counts[]; };
+layout(std430, binding = 1) writeonly buffer Groups { uint groups[]; };
+uniform uint group;   // chunks of a group
+"""
+    + _SORTED
+    + """
+void main() {
+    uint digit = gl_GlobalInvocationID.x, g = gl_GlobalInvocationID.y;
+    if (digit >= digits) return;
+    uint sum = 0u;
+    uint end = min((g + 1u) * group, chunks);
+    for (uint c = g * group; c < end; ++c) {
+        uint one = counts[c * digits + digit];
+        counts[c * digits + digit] = sum;
+        sum += one;
+    }
+    groups[g * digits + digit] = sum;
+}
+"""
+)
+"""Replace the counts of a digit by their sums over the chunks before, within a group."""
+
+GROUPS: Final = (
+    """#version 430
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) buffer Groups { uint groups[]; };
+layout(std430, binding = 1) writeonly buffer Totals { uint totals[]; };
+uniform uint groups_of;
+"""
+    + _SORTED
+    + """
+void main() {
+    uint digit = gl_GlobalInvocationID.x;
+    if (digit >= digits) return;
+    uint sum = 0u;
+    for (uint g = 0u; g < groups_of; ++g) {
+        uint one = groups[g * digits + digit];
+        groups[g * digits + digit] = sum;
+        sum += one;
+    }
+    totals[digit] = sum;
+}
+"""
+)
+"""Replace the sums of the groups by those of the groups before."""
+
+SCAN: Final = """#version 430
+layout(local_size_x = 256) in;
+layout(std430, binding = 0) buffer Totals { uint totals[]; };
+uniform uint digits;
+shared uint sums[256];
+void main() {
+    uint t = gl_LocalInvocationID.x;
+    uint each = (digits + 255u) / 256u;
+    uint first = min(t * each, digits), end = min(first + each, digits);
+    uint sum = 0u;
+    for (uint i = first; i < end; ++i) sum += totals[i];
+    sums[t] = sum;
+    barrier();
+    for (uint step = 1u; step < 256u; step *= 2u) {
+        uint before = t >= step ? sums[t - step] : 0u;
+        barrier();
+        sums[t] += before;
+        barrier();
+    }
+    sum = sums[t] - sum;
+    for (uint i = first; i < end; ++i) {
+        uint one = totals[i];
+        totals[i] = sum;
+        sum += one;
+    }
+    if (t == 255u) totals[digits] = sums[255];
+}
+"""
+"""Replace values by the sums of those before, and append the sum of all. One group of 256."""
+
+SCATTER: Final = (
+    """#version 430
+layout(local_size_x = LANES) in;
+layout(std430, binding = 0) buffer Counts { uint counts[]; };
+layout(std430, binding = 1) readonly buffer Keys { uint keys[]; };
+layout(std430, binding = 2) readonly buffer Groups { uint groups[]; };
+layout(std430, binding = 3) readonly buffer Totals { uint totals[]; };
+layout(std430, binding = 4) readonly buffer Values { uint values[]; };
+layout(std430, binding = 5) writeonly buffer KeysOut { uint keys_out[]; };
+layout(std430, binding = 6) writeonly buffer ValuesOut { uint values_out[]; };
+uniform uint group;
+uniform uint keep_keys;
+"""
+    + _SORTED
+    + """
+void main() {
+    uint c = gl_GlobalInvocationID.x;
+    if (c >= chunks) return;
+    uint end = min((c + 1u) * chunk, total);
+    uint before = (c / group) * digits;
+    for (uint i = c * chunk; i < end; ++i) {
+        uint key = keys[i];
+        uint digit = (key >> shift) % digits;
+        uint at = counts[c * digits + digit];
+        counts[c * digits + digit] = at + 1u;
+        at += groups[before + digit] + totals[digit];
+        values_out[at] = values[i];
+        if (keep_keys != 0u) keys_out[at] = key;
+    }
+}
+"""
+)
+"""Move values to their places, in the order of the input within a digit."""
+
+PROJECT: Final = (
+    _BLOCK
+    + f"""
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) readonly buffer Splats {{ uvec4 splats[]; }};
+layout(std430, binding = 1) readonly buffer Order {{ uint order[]; }};
+layout(std430, binding = 2) writeonly buffer Records {{ uvec4 records[]; }};
+layout(std430, binding = 3) writeonly buffer Rects {{ uvec2 rects[]; }};
+layout(std430, binding = 4) writeonly buffer Slopes {{ vec2 slopes[]; }};
+const float SCALE = 0.84932180;  // sqrt(log2(e) / 2)
+const float FAINTEST = -7.99435344;  // log2(1 / 255)
+void main() {{
+    uint i = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * 4194240u;
+    if (i >= counts.x) return;
+    uint s = 3u * order[i];
+    uvec4 centre = splats[s];
+    vec3 d = uintBitsToFloat(centre.xyz) - eye.xyz;
+    float z = dot(ahead.xyz, d);
+    uint rgba = centre.w;
+    float opacity = float(rgba >> 24) / 255.0;
+    rects[i] = uvec2(0u);
+    if (!(z > {NEAR_M}) || opacity < 1.0 / 255.0) return;
+    float x = dot(right.xyz, d) / z, y = dot(up.xyz, d) / z;
+    vec4 first = uintBitsToFloat(splats[s + 1u]);
+    vec4 second = uintBitsToFloat(splats[s + 2u]);
+    float cx = clamp(x, -1.3 * right.w, 1.3 * right.w);
+    float cy = clamp(y, -1.3 * up.w, 1.3 * up.w);
+    vec3 ju = (right.xyz - cx * ahead.xyz) * (eye.w / z);
+    vec3 jv = (cy * ahead.xyz - up.xyz) * (eye.w / z);
+    vec3 col = vec3(first.x, first.y, first.w);
+    vec3 u = vec3(dot(ju, col), ju.y * first.z + ju.z * second.x, ju.z * second.y);
+    vec3 v = vec3(dot(jv, col), jv.y * first.z + jv.z * second.x, jv.z * second.y);
+    float uu = dot(u, u), vv = dot(v, v), b = dot(u, v);
+    vec3 n = cross(u, v);
+    float a = uu + {BLUR_PX2}, c = vv + {BLUR_PX2};
+    float det = dot(n, n) + {BLUR_PX2} * (uu + vv) + {BLUR_PX2 * BLUR_PX2};
+    float lo = log2(opacity);
+    float reach = sqrt(max(lo - FAINTEST, 0.0)) / SCALE;
+    vec2 at = 0.5 * vec2(sizes.xy) + eye.w * vec2(x, -y);
+    vec2 half_px = reach * sqrt(vec2(a, c)) + 0.01;
+    vec2 low = max(floor((at - half_px) / {TILE_PX}.0), vec2(0.0));
+    vec2 high = min(floor((at + half_px) / {TILE_PX}.0) + 1.0, vec2(sizes.zw));
+    if (!all(lessThan(low, high))) return;
+    rects[i] = uvec2(uint(low.x) | (uint(low.y) << 16), uint(high.x) | (uint(high.y) << 16));
+    float root = sqrt(c * det);
+    uint marks = (rgba & 0xffffffu) | (second.z > 0.5 ? 0x1000000u : 0u);
+    mat3 lower = mat3(col, vec3(0.0, first.z, second.x), vec3(0.0, 0.0, second.y));
+    vec3 w = lower * (ahead.xyz * lower), flat_u = lower * u, flat_v = lower * v;
+    float zu = dot(w, flat_u), zv = dot(w, flat_v), ff = dot(flat_u, flat_v);
+    uu = dot(flat_u, flat_u);
+    vv = dot(flat_v, flat_v);
+    n = cross(flat_u, flat_v);
+    slopes[i] = vec2(vv * zu - ff * zv, uu * zv - ff * zu) / max(dot(n, n) + 1e-4 * uu * vv, 1e-37);
+    records[2u * i] = floatBitsToUint(vec4(at, SCALE * c / root, -SCALE * b / root));
+    records[2u * i + 1u] = uvec4(floatBitsToUint(vec3(SCALE / sqrt(c), lo, z)), marks);
+}}
+"""
+)
+"""Project splats in their order to records of 8 words, and to rectangles of tiles.
+
+A record is the pixel, three factors of the inverse covariance, log2 of the opacity, the depth, and
+the colour with the mark of the ground. Slopes are those of the depth in metres per pixel, of the
+splat with its standard deviations squared, and so nearly flat.
+The factors have no cancellation in long, thin splats.
+"""
+
+SUMS: Final = (
+    _BLOCK
+    + """
+layout(local_size_x = LANES) in;
+layout(std430, binding = 0) readonly buffer Rects { uvec2 rects[]; };
+layout(std430, binding = 1) writeonly buffer Sums { uint sums[]; };
+layout(std430, binding = 2) writeonly buffer Before { uint before[]; };
+uniform uint chunk;
+void main() {
+    uint c = gl_GlobalInvocationID.x;
+    uint end = min((c + 1u) * chunk, counts.x);
+    if (c * chunk >= end) return;
+    uint sum = 0u;
+    for (uint i = c * chunk; i < end; ++i) {
+        uvec2 rect = rects[i];
+        before[i] = sum;
+        sum += ((rect.y & 0xffffu) - (rect.x & 0xffffu)) * ((rect.y >> 16) - (rect.x >> 16));
+    }
+    sums[c] = sum;
+}
+"""
+)
+"""Count the pairs of tile and splat of each chunk, and those before each splat in its chunk."""
+
+EMIT: Final = (
+    _BLOCK
+    + """
+layout(local_size_x = LANES) in;
+layout(std430, binding = 0) readonly buffer Rects { uvec2 rects[]; };
+layout(std430, binding = 1) readonly buffer Sums { uint sums[]; };
+layout(std430, binding = 2) readonly buffer Before { uint before[]; };
+layout(std430, binding = 3) writeonly buffer Keys { uint keys[]; };
+layout(std430, binding = 4) writeonly buffer Values { uint values[]; };
+uniform uint chunk;
+uniform uint chunks;
+uniform uint span;   // pairs of an invocation
+uniform uint total;
+uint splat_of(uint pair) {
+    uint low = 0u, high = chunks;
+    while (low + 1u < high) {
+        uint middle = (low + high) / 2u;
+        if (sums[middle] <= pair) low = middle; else high = middle;
+    }
+    uint inside = pair - sums[low];
+    high = min((low + 1u) * chunk, counts.x);
+    low *= chunk;
+    while (low + 1u < high) {
+        uint middle = (low + high) / 2u;
+        if (before[middle] <= inside) low = middle; else high = middle;
+    }
+    return low;
+}
+void main() {
+    uint pair = gl_GlobalInvocationID.x * span;
+    uint end = min(pair + span, total);
+    if (pair >= end) return;
+    uint i = splat_of(pair), x, y, x0, x1, y1, nth = pair - sums[i / chunk] - before[i];
+    uvec2 rect = rects[i];
+    for (bool begins = true; pair < end; ++pair) {
+        if (begins) {
+            x0 = rect.x & 0xffffu;
+            x1 = rect.y & 0xffffu;
+            y1 = rect.y >> 16;
+            x = x0 + nth % (x1 - x0);
+            y = (rect.x >> 16) + nth / (x1 - x0);
+        }
+        keys[pair] = y * sizes.z + x;
+        values[pair] = i;
+        x += 1u;
+        if (x == x1) { x = x0; y += 1u; }
+        begins = y == y1 && pair + 1u < end;
+        nth = 0u;
+        rect.y = begins ? 0u : 1u;
+        for (uint step = 0u; step < 8u && rect.y == 0u; ++step) rect = rects[++i];
+        if (begins && rect.y == 0u) {
+            i = splat_of(pair + 1u);
+            rect = rects[i];
+        }
+    }
+}
+"""
+)
+"""List the pairs of tile and splat in the order of the splats, the same number by each invocation.
+
+llvmpipe ends the loops of an invocation after 65535 iterations, so no loop goes over all tiles.
+"""
+
+PAINT: Final = (
+    _BLOCK
+    + f"""
+layout(local_size_x = {TILE_PX}, local_size_y = DOWN) in;
+layout(std430, binding = 0) readonly buffer Records {{ uvec4 records[]; }};
+layout(std430, binding = 1) readonly buffer Starts {{ uint starts[]; }};
+layout(std430, binding = 2) readonly buffer Lists {{ uint lists[]; }};
+layout(std430, binding = 3) readonly buffer Slopes {{ vec2 slopes[]; }};
+layout(rgba16f, binding = 0) writeonly uniform image2D painted;
+layout(r32f, binding = 1) writeonly uniform image2D median;
+#ifdef LIMITED
+layout(binding = {LIMITS_UNIT}) uniform sampler2D limits;
+#endif
+const uint NONE = 0xffffffffu;
+float depth_at(uint record, vec2 pixel) {{
+    float z = uintBitsToFloat(records[record + 1u].z);
+    float slope = dot(slopes[record / 2u], pixel - uintBitsToFloat(records[record].xy));
+    return z * z / (z - clamp(slope, -{STRAY} * z, {STRAY} * z));
+}}
+void main() {{
+    ivec2 here = ivec2(gl_GlobalInvocationID.xy) * ivec2(1, ROWS);
+    vec2 at = vec2(here) + 0.5;
+    uint tile = gl_WorkGroupID.y * sizes.z + gl_WorkGroupID.x;
+    float left[ROWS], limit[ROWS];
+    uint middle[ROWS];
+    vec3 sum[ROWS];
+    for (int j = 0; j < ROWS; ++j) {{
+        left[j] = 1.0;
+        middle[j] = NONE;
+        sum[j] = vec3(0.0);
+#ifdef LIMITED
+        limit[j] = texelFetch(limits, min(here + ivec2(0, j), ivec2(sizes.xy) - 1), 0).r;
+#endif
+    }}
+    uint end = starts[tile + 1u];
+    for (uint k = starts[tile]; k < end; ++k) {{
+        uint r = 2u * lists[k];
+        uvec4 second = records[r + 1u];
+        vec4 one = uintBitsToFloat(records[r]);
+        vec3 two = uintBitsToFloat(second.xyz);
+        uint rgb = second.w;
+        vec3 colour = vec3(rgb & 0xffu, (rgb >> 8) & 0xffu, (rgb >> 16) & 0xffu);
+        vec2 off = at - one.xy;
+        float most = 0.0;
+        for (int j = 0; j < ROWS; ++j) {{
+            float y = off.y + float(j);
+            precise float px = one.z * off.x;
+            precise float py = one.w * y;
+            precise float p = px + py;
+            precise float q = two.x * y;
+            precise float power = two.y - (p * p + q * q);
+            float share = power > -7.99435344 ? left[j] * exp2(power) : 0.0;
+#ifdef LIMITED
+            bool ground = rgb >= 0x1000000u;
+            share = two.z < (ground ? limit[j] : abs(limit[j])) ? share : 0.0;
+#endif
+            share = left[j] < {FULL} ? 0.0 : share;
+            sum[j] += share * colour;
+            left[j] -= share;
+            middle[j] = middle[j] == NONE && left[j] < 0.5 ? r : middle[j];
+#ifdef LIMITED
+            most = max(most, limit[j] == 0.0 ? 0.0 : left[j]);
+#else
+            most = max(most, left[j]);
+#endif
+        }}
+        if (most < {FULL}) break;
+    }}
+    for (int j = 0; j < ROWS; ++j) {{
+        ivec2 pixel = here + ivec2(0, j);
+        if (all(lessThan(pixel, ivec2(sizes.xy)))) {{
+            imageStore(painted, pixel, vec4(sum[j] / 255.0, left[j]));
+            imageStore(median, pixel, vec4(middle[j] == NONE ? 0.0 : depth_at(middle[j], vec2(pixel) + 0.5)));
+        }}
+    }}
+}}
+"""
+)
+"""Blend the splats of a tile from front to back until each pixel is full.
+
+limits: depth up to which splats are drawn; negative where ground splats are not, 0 for none.
+Each invocation draws ROWS pixels of a column. The median depth is that of the splat's plane: its
+inverse is linear in the picture.
+"""
+
+LIMITS: Final = (
+    _BLOCK
+    + f"""
+layout(local_size_x = {TILE_PX}, local_size_y = {TILE_PX}) in;
+layout(r32f, binding = 0) writeonly uniform image2D limits;
+layout(binding = {OBJECTS_DEPTH_UNIT}) uniform sampler2D objects_depth;
+layout(binding = {MESH_UNIT}) uniform sampler2D mesh;
+layout(binding = {MESH_DEPTH_UNIT}) uniform sampler2D mesh_depth;
+{METRES}
+void main() {{
+    ivec2 here = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(here, ivec2(sizes.xy)))) return;
+    float object = texelFetch(objects_depth, here, 0).r;
+    float limit = {NOTHING_M:.1f};
+    if (object < 1.0) {{
+        float label = texelFetch(mesh, here, 0).a * 255.0;
+        float gap = metres(object) - metres(texelFetch(mesh_depth, here, 0).r);
+        float y = (0.5 * float(sizes.y) - float(here.y) - 0.5) / eye.w;
+        float x = (float(here.x) + 0.5 - 0.5 * float(sizes.x)) / eye.w;
+        float steep = abs(ahead.z + x * right.z + y * up.z);
+        bool ground = label < {GROUND_LABELS[1]}.5 && label > {GROUND_LABELS[0]}.0 - 0.5;
+        float behind = ground ? gap * max(steep, {STEEP}) : gap;
+        limit = behind < {BEHIND_M} ? 0.0 : ground ? metres(object) : -metres(object);
+    }}
+    imageStore(limits, here, vec4(limit));
+}}
+"""
+)
+"""Decide by the mesh which splats may cover an object.
+
+An object is covered where it is BEHIND_M behind the mesh: below ground measured vertically, because
+the noise of a scan's ground is long in a flat view.
+"""

@@ -1,0 +1,1 @@
+"""Scanned places: their ground, files and checks."""
