@@ -69,7 +69,8 @@ class ScanChoices:
     georeference: Annotated[
         str,
         Option(
-            "Origin of the files: LATITUDE,LONGITUDE, or CRS[,EAST,NORTH] such as EPSG:25833.",
+            "Origin of the files: LATITUDE,LONGITUDE[,HEADING of +y, 0 is north], or "
+            "CRS[,EAST,NORTH] such as EPSG:25833.",
             metavar="PLACE",
             panel=_FRAME,
         ),

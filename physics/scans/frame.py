@@ -43,11 +43,13 @@ _PROBE_M: Final = 100.0
 class Placing(msgspec.Struct, frozen=True, kw_only=True):
     """Place of a scan on earth: of its origin in degrees, or of its coordinates in a system.
 
+    heading_deg: compass heading of +y of the scan, clockwise from north; 0 is assumed if None.
     crs: name for pyproj, such as "EPSG:25833". Coordinates plus `offset` are metres in it.
     """
 
     latitude_deg: float | None = None
     longitude_deg: float | None = None
+    heading_deg: float | None = None
     crs: str = ""
     offset: tuple[float, float] = (0.0, 0.0)
 
@@ -158,11 +160,29 @@ def place(low: Floats, high: Floats, placing: Placing | None) -> tuple[Matrix, G
                 "georeference: give latitude_deg and longitude_deg of the origin, or crs"
             )
         there = Georeference(latitude_deg=placing.latitude_deg, longitude_deg=placing.longitude_deg)
+        turned = _to_north(placing.heading_deg or 0.0)
         if np.any(origin[:2]):
-            lon, lat = _local(there)(origin[0], origin[1], inverse=True)
+            ((east, north, _),) = move(origin[None], turned).tolist()
+            lon, lat = _local(there)(east, north, inverse=True)
             there = Georeference(latitude_deg=lat, longitude_deg=lon)
-        return shift(-origin), there
+        return combine(turned, shift(-origin)), there
+    if placing.heading_deg is not None:
+        raise MapError(
+            f"georeference: heading_deg is {placing.heading_deg:g}, but {placing.crs} has its own "
+            "north: leave it out, or give latitude and longitude in place of crs"
+        )
     return _place_in_system(low, high, placing)
+
+
+def _to_north(heading_deg: float) -> Matrix:
+    """Return the matrix that turns +y from a compass heading to north. Raises MapError."""
+    if not -360.0 <= heading_deg <= 360.0:
+        raise MapError(
+            f"georeference: heading_deg is {heading_deg:g}, but must be -360 to 360: the compass "
+            "heading of +y of the scan, in degrees clockwise from north"
+        )
+    a, b = math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))
+    return (a, b, 0.0, 0.0), (-b, a, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def local_origin(low: Floats, high: Floats) -> Floats:

@@ -21,6 +21,7 @@ from physics.scans.frame import (
     Matrix,
     combine,
     file_matrix,
+    local_origin,
     move,
     move_splats,
     place,
@@ -35,6 +36,11 @@ from scenarios.places.scan_options import ScanOptions, Up, read_transform
 
 BUDGET: Final = 4_000_000
 """Number of splats above which a scan is refused: 3 million are drawn at 60 frames/s on a GPU."""
+NORTH_ASSUMED: Final = (
+    "georeference: +y of the scan (-z of a .glb) is taken as north, heading 0: if it points "
+    "elsewhere, give its compass heading in degrees as third number of --georeference, or as "
+    "heading_deg in scan.json"
+)
 _ENDINGS: Final = (".glb", ".ply", ".obj", ".spz", ".splat")
 
 
@@ -160,9 +166,13 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
     findings = [finding for _, _, raw in meshes for finding in raw.findings]
     words = f"mesh: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices"
     findings.append(note(words))
-    if any(row[3] for row in placing[:3]):
-        shifted = ", ".join(f"{-row[3]:.0f}" for row in placing[:3])
+    origin = local_origin(low, high)
+    if origin.any():
+        shifted = ", ".join(f"{one:.0f}" for one in origin)
         findings.append(note(f"local origin at ({shifted}) m of the source frame"))
+    given = options.georeference
+    if given is not None and not given.crs and given.heading_deg is None:
+        findings.append(note(NORTH_ASSUMED))
     return LoadedScan(
         mesh,
         combine(placing, matrix),

@@ -610,6 +610,30 @@ def test_areas_come_from_openstreetmap_through_the_georeference(tmp_path: Path) 
     assert "OpenStreetMap" in " ".join(str(one) for one in checked.findings)
 
 
+def test_a_heading_turns_the_scan_to_north(tmp_path: Path) -> None:
+    """Latitude and longitude alone state the assumed heading and the remedy; with a heading, +y of the
+    scan points there, and a system of coordinates has none."""
+    (tmp_path / "mesh.glb").write_bytes(glb(street()))
+
+    def loaded(words: str) -> scan_sources.LoadedScan:
+        given = {"georeference": parse_georeference(words)}
+        return scan_sources.load_mesh(tmp_path, read_options(tmp_path, given))[0]
+
+    plain, stated, east = (loaded(f"55.698,13.195{rest}") for rest in ("", ",0", ",90"))
+    said = [one.words for one in plain.findings if "is taken as north, heading 0" in one.words]
+    assert len(said) == 1 and "third number of --georeference" in said[0]
+    assert not any("taken as north" in one.words for one in (*stated.findings, *east.findings))
+    assert np.array_equal(plain.mesh.vertices, stated.mesh.vertices)
+    turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    there = np.array(sorted((plain.mesh.vertices @ turn.T).round(4).tolist()))
+    assert np.array(sorted(east.mesh.vertices.round(4).tolist())) == pytest.approx(there, abs=1e-3)
+    with pytest.raises(CosimError, match=r"heading_deg is 720, but must be -360 to 360"):
+        loaded("55.698,13.195,720")
+    (tmp_path / "scan.json").write_text('{"georeference": {"crs": "EPSG:25833", "heading_deg": 3}}')
+    with pytest.raises(CosimError, match="EPSG:25833 has its own north: leave it out"):
+        scan_sources.load_mesh(tmp_path, read_options(tmp_path, {}))
+
+
 def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
     """An .obj with its texture in another file is read from a folder, with the texture's colour."""
     from PIL import Image
