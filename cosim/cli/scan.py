@@ -252,7 +252,7 @@ def areas(
 ) -> None:
     """Write the areas of a scan as GeoJSON in metres, or replace them and build its net again."""
     from cosim.place.scan import read_scan
-    from cosim.place.scan_areas import draft_areas, write_areas
+    from cosim.place.scan_areas import write_areas
 
     folder = _map_folder(name)
     sources = {"areas": set_, "osm": osm, "way": way}
@@ -268,9 +268,9 @@ def areas(
     scan = read_scan(folder, splats=False)
     found = scan.areas
     if draft is not None:
-        from physics.scans.ground import slope
+        from scenarios.places.chosen_areas import drafted_areas
 
-        found = draft_areas(scan.heights, slope(scan.heights))
+        found = drafted_areas(scan.mesh, scan.heights)
     instead = replacement_note(target)
     write_areas(found, target)
     out.print(f"Areas: {target} ({len(found)} areas){instead}", soft_wrap=True, highlight=False)

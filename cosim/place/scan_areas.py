@@ -41,8 +41,6 @@ _SIMPLE_M: Final = 0.25
 _DRAFT_WIDTH_M: Final = 1.2
 """Least width of drafted ground, in metres."""
 _DRAFT_M2: Final = 10.0
-_DRAFTS: Final = 8
-"""Largest number of drafted pieces."""
 _SPECK_M2: Final = 1.0
 """Area in m2 below which walkable pieces and holes are dropped."""
 _SHIFTS_M: Final = ((4.0, 0.5), (0.5, 0.1))
@@ -186,15 +184,20 @@ def corridor(way: Floats, width_m: float, grid: HeightGrid) -> tuple[ScanArea, .
 
 
 def draft_areas(
-    grid: HeightGrid, grade: NDArray[np.float32], most_grade: float = MOST_GRADE
+    grid: HeightGrid, grade: NDArray[np.float32], hidden: NDArray[np.bool_] | None = None
 ) -> tuple[ScanArea, ...]:
-    """Return the largest pieces of level, free, measured ground as sidewalks, largest first.
+    """Return the largest connected piece of level, free, measured ground as a sidewalk.
 
-    grade: (H, W) slope of the ground. It is a draft: roads and lawns are not told from sidewalks.
+    It is a draft: roads and lawns are not told from sidewalks.
+
+    grade: (H, W) slope of the ground.
+    hidden: (H, W) whether ground is behind walls, as seen from the walked side.
 
     Raises MapError if no piece is large enough.
     """
-    free = grid.measured & ~grid.blocked & (grade < most_grade)
+    free = grid.measured & ~grid.blocked & (grade < MOST_GRADE)
+    if hidden is not None:
+        free &= ~hidden
     ground = opened(_cells(grid, free), 0.5 * _DRAFT_WIDTH_M)
     simple = shapely.simplify(shapely.buffer(ground, -0.5 * _SIMPLE_M), _SIMPLE_M)
     parts = [Polygon(part.exterior, _large_rings(part)) for part in _large(simple, _DRAFT_M2)]
@@ -203,7 +206,7 @@ def draft_areas(
             f"no level ground of {_DRAFT_M2:g} m2 without obstacles: check the scan's up axis and "
             "scale, or draw areas"
         )
-    return tuple(ScanArea("sidewalk", part) for part in parts[:_DRAFTS])
+    return (ScanArea("sidewalk", parts[0]),)
 
 
 def walkable_ground(areas: Iterable[ScanArea], grid: HeightGrid) -> Polygon | MultiPolygon:

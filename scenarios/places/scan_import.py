@@ -103,7 +103,7 @@ def check_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) 
     heights = height_grid(loaded.mesh, None, _step_m(loaded))
     findings += _holes(heights)
     progress("finding the walkable area")
-    areas, found = find_areas(options, heights, loaded.georeference, progress)
+    areas, found = find_areas(options, loaded.mesh, heights, loaded.georeference, progress)
     findings += found
     findings += check_areas(areas, heights)
     if any(one.level == "refused" for one in findings):
