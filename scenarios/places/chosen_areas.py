@@ -63,8 +63,8 @@ def find_areas(
     return areas, [
         warning(
             f"areas: a draft of {size_m2:.0f} m2 of level ground, in which roads, lawns and "
-            "sidewalks are not distinguished, without ground behind walls: edit it (`cosim scan areas`), or give --areas, "
-            "--osm or --way"
+            "sidewalks are not distinguished, without ground behind walls: edit it "
+            "(`cosim scan areas`), or give --areas, --osm or --way"
         )
     ]
 

@@ -169,7 +169,7 @@ def test_walkable_ground_is_drawn_ground_less_what_stands() -> None:
 def test_a_draft_is_the_largest_level_free_piece() -> None:
     """Steep, blocked and unmeasured ground is left out, and so is what is behind it."""
     grade = np.zeros(GRID.heights.shape, dtype=np.float32)
-    grade[:, 82:86] = 1.0  # a step at x = 20.5 to 21.5
+    grade[:, 80:84] = 1.0  # a step at x = 20 to 21
     blocked = GRID.blocked.copy()
     blocked[36:44, 40:48] = True  # x 10 to 12, y 9 to 11
     (area,) = draft_areas(dataclasses.replace(GRID, blocked=blocked), grade)
