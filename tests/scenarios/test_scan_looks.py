@@ -3,37 +3,93 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import shapely
 
 from cosim.core.geometry import Pose
-from cosim.core.state import Street
+from cosim.core.state import Command, Street
+from cosim.place.scan import read_facts
+from cosim.results.record import RECORD_FILE, ScanLook
+from cosim.results.table import table_row
 from cosim.spec.camera import CameraSpec
-from cosim.spec.scenario import City, CityMap
+from cosim.spec.manifest import Manifest
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import City, CityMap, CrowdSpec, Scenario
 from physics.cameras.gl.camera import GlCamera
 from physics.dynamics.world import BulletWorld
+from scenarios.episodes.episode import Episode
 from scenarios.places.nets import surface_of_place
 from scenarios.places.scan_import import import_scan
 from scenarios.places.scan_make import crossing_box, make_scan
 from scenarios.places.scan_options import read_options
+from sumo_nets.maps.map_store import maps_folder, read_map
 
 POSES = 12
 NEAR_M = 20.0
 
 
-@pytest.mark.engine
-def test_the_splats_of_a_scan_match_its_mesh(tmp_path: Path) -> None:
-    """Over drawn poses on a generated scan, pictures agree to 24 dB, depths to 5 cm for 90 % of the
-    pixels within 20 m, and labels for 97 %."""
+@pytest.fixture(scope="module")
+def looks(tmp_path_factory: pytest.TempPathFactory) -> CityMap:
+    """A generated scan of 30 x 30 m."""
+    folder = tmp_path_factory.mktemp("scans") / "looks"
     city = City(seed=7, size_m=300.0)
     x0, y0, x1, y1 = crossing_box(surface_of_place(city).street_map)
     box = (x0 + 25.0, y0 + 15.0, x1 - 25.0, y1 - 15.0)
-    make_scan(city, box, tmp_path / "looks", spacing_m=0.05)
-    import_scan(tmp_path / "looks", read_options(tmp_path / "looks", {}))
-    surface = surface_of_place(CityMap(map="looks"))
+    make_scan(city, box, folder, spacing_m=0.05)
+    import_scan(folder, read_options(folder, {}))
+    return CityMap(map="looks")
+
+
+@pytest.mark.engine
+def test_a_record_has_the_look_that_the_cameras_saw(looks: CityMap) -> None:
+    """The splats' hash and the sun with a camera, no splats with the mesh's look, nothing without a
+    camera; the state is the same."""
+    line = max(read_map("looks").strips.values(), key=lambda strip: strip.length_m).line[:, :2]
+    scenario = Scenario(
+        id="look",
+        suite="looks",
+        place=looks,
+        seed=0,
+        start=(*line[0].tolist(), math.atan2(*(line[1] - line[0])[::-1])),
+        goal=tuple(line[-1].tolist()),
+        route=tuple(map(tuple, line.tolist())),
+        crowd=CrowdSpec(persons=0, vehicles=0),
+        time_limit_s=1.0,
+    )
+    manifests = {
+        True: Manifest("seeing", camera=CameraSpec(64, 36)),
+        False: Manifest("blind", camera=None),
+    }
+    records = {}
+    for sees, appearance in ((True, "splats"), (True, "mesh"), (False, "splats")):
+        with Episode(scenario, manifests[sees], EpisodeOptions(appearance=appearance)) as episode:
+            episode.reset()
+            while not episode.over:
+                episode.advance(Command(0.3, 0.0))
+            records[sees, appearance] = episode.result()[0]
+    facts = read_facts(maps_folder() / "looks")
+    assert facts.sun is not None
+    splats, mesh, blind = records.values()
+    assert splats.scan == ScanLook(
+        appearance="splats",
+        splats=facts.splats_hash,
+        sun_azimuth_deg=facts.sun.azimuth_deg,
+        sun_elevation_deg=facts.sun.elevation_deg,
+    )
+    assert mesh.scan == msgspec.structs.replace(splats.scan, appearance="mesh", splats="")
+    assert blind.scan is None and "scan" not in table_row(splats)
+    assert len({record.state_hash for record in records.values()}) == 1
+    assert RECORD_FILE.decode(splats.encoded()).scan == splats.scan
+
+
+@pytest.mark.engine
+def test_the_splats_of_a_scan_match_its_mesh(looks: CityMap) -> None:
+    """Over drawn poses on a generated scan, pictures agree to 24 dB, depths to 5 cm for 90 % of the
+    pixels within 20 m, and labels for 97 %."""
+    surface = surface_of_place(looks)
     assert surface.scan is not None
     walkable = [a.polygon for a in surface.scan.areas if a.kind in ("sidewalk", "crossing")]
     ground = shapely.buffer(shapely.union_all(walkable), -0.6)
