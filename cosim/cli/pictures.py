@@ -198,9 +198,7 @@ def look(
     ] = None,
     drawn_on: Annotated[
         str | None,
-        typer.Option(
-            "--map", help="Map on which `cosim run --map` drew the scenario with this id."
-        ),
+        typer.Option("--map", help="Map on which `cosim run --map` drew the scenario."),
     ] = None,
     policy: Annotated[str, typer.Option(help="The policy that drives until then.")] = "route",
     robot: Annotated[str, typer.Option(help=help_of("robot"))] = "",

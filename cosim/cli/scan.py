@@ -251,8 +251,7 @@ def areas(
     ] = 3.0,
 ) -> None:
     """Write the areas of a scan as GeoJSON in metres, or replace them and build its net again."""
-    from cosim.place.scan import read_scan
-    from cosim.place.scan_areas import write_areas
+    from cosim.place.scan import encode_areas, read_scan
 
     folder = _map_folder(name)
     sources = {"areas": set_, "osm": osm, "way": way}
@@ -272,7 +271,7 @@ def areas(
 
         found = drafted_areas(scan.mesh, scan.heights)
     instead = replacement_note(target)
-    write_areas(found, target)
+    target.write_bytes(msgspec.json.format(encode_areas(found, step_m=0.01), indent=1))
     out.print(f"Areas: {target} ({len(found)} areas){instead}", soft_wrap=True, highlight=False)
 
 

@@ -90,9 +90,10 @@ def one_scenario(
     """Find one scenario by its id, or by the path of its file: the suite with it alone, and of how
     many it is one.
 
-    suite: where to look for the id; by default in the shipped suites. which: of a file or a run
-    folder, the id or the number, counted from 1; by default the first. Raises UsageError with the valid choices,
-    SpecError for a file with faults.
+    suite: where to look for the id; by default in the shipped suites.
+    which: of a file or a run folder, the id or the number, counted from 1; by default the first.
+
+    Raises UsageError with the valid choices, SpecError for a file with faults.
     """
     if not name.endswith((".json", ".toml")) and not _is_run(name):
         if which is not None:

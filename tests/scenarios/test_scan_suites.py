@@ -113,7 +113,8 @@ def test_areas_of_a_stored_scan_are_replaced(cosim: Cosim, scan: str, tmp_path: 
     features = json.loads(draft.read_text())["features"]
     assert features and features[0]["properties"]["kind"] == "sidewalk"
     x, y = before.walkable.centroid.x, before.walkable.centroid.y
-    way = {"type": "LineString", "coordinates": [[x - 6.0, y], [x + 6.0, y]]}
+    points = [[x - 6.0, y], [x + 6.0, y]]
+    way = {"type": "LineString", "frame": "local", "coordinates": points}
     (tmp_path / "way.geojson").write_text(json.dumps(way))
     done = cosim(
         "scan", "areas", "replaced", "--way", str(tmp_path / "way.geojson"), "--width", "2"
@@ -160,7 +161,9 @@ def test_a_drawn_scenario_is_found_by_its_id(cosim: Cosim, tmp_path: Path) -> No
     for whole in suites.values():
         for scenario in whole.scenarios:
             assert drawn_on_map(scenario.id, "flat-street").scenarios == (scenario,)
-    with pytest.raises(UsageError, match="is none of map 'flat-street': .* straight-flat-street-0"):
+    with pytest.raises(
+        UsageError, match=r"is none of map 'flat-street': .* straight-flat-street-0"
+    ):
         drawn_on_map("frontal-corridor-003", "flat-street")
     wanted = suites["unit"].scenarios[1]
     write_suite(suites["unit"], tmp_path / "scenarios.json")
