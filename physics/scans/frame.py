@@ -36,6 +36,7 @@ FAR_M: Final = 2000.0
 """Distance of a scan from its origin beyond which it gets a local origin: float32 keeps 0.1 mm."""
 _SHEAR: Final = 0.01
 """Largest difference of a transform from a similarity, as a share of its scale."""
+_LAST: Final = (0.0, 0.0, 0.0, 1.0)
 _PROBE_M: Final = 100.0
 """Distance over which the direction of north is measured in a coordinate system."""
 
@@ -101,6 +102,22 @@ def check_similarity(transform: Sequence[Sequence[float]]) -> None:
 def scale_of(matrix: Sequence[Sequence[float]]) -> float:
     """Return the metres per unit of a matrix."""
     return float(abs(_determinant(matrix)) ** (1.0 / 3.0))
+
+
+def levelling(normal: Floats) -> Matrix:
+    """Return the shortest rotation that turns a unit normal up."""
+    x, y, z = (float(one) for one in normal)
+    if z < -1.0 + 1e-9:
+        return (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), _LAST
+    k = 1.0 / (1.0 + z)
+    first = 1.0 - k * x * x, -k * x * y, -x, 0.0
+    second = -k * x * y, 1.0 - k * y * y, -y, 0.0
+    return first, second, (x, y, z, 0.0), _LAST
+
+
+def unplaced(direction: Floats, placing: Matrix) -> Floats:
+    """Return a direction of the net's frame before a placing, which turns and shifts."""
+    return np.array([sum(placing[i][k] * direction[i] for i in range(3)) for k in range(3)])
 
 
 def combine(second: Matrix, first: Matrix) -> Matrix:

@@ -634,6 +634,31 @@ def test_a_heading_turns_the_scan_to_north(tmp_path: Path) -> None:
         scan_sources.load_mesh(tmp_path, read_options(tmp_path, {}))
 
 
+@pytest.mark.parametrize("heading", ["", ",33"])
+def test_the_remedy_of_a_tilted_scan_levels_it(scan: Path, heading: str) -> None:
+    """The refusal has the transforms for scan.json; with them the ground is level, and the splats are
+    on the mesh."""
+    turn = _turned(12.0)
+    (scan / "mesh.glb").write_bytes(glb(turn(street())))
+    cloud = splats_of(street())
+    cloud.centres = turn(Street(cloud.centres, street().triangles, street().colours)).vertices
+    (scan / "splats.ply").write_bytes(gaussian_ply(cloud))
+    there = {"georeference": parse_georeference(f"55.698,13.195{heading}")}
+    (words,) = _refused(_words(scan, **there))
+    found = re.search(r'this in scan\.json, in place of scale and up: ("transform".*\]\])$', words)
+    assert found is not None, words
+    (scan / "scan.json").write_text("{" + found[1] + "}")
+    again = _words(scan, splat_scale=None, splat_up=None, areas=None, **there)
+    assert _refused(again) == []
+    (level,) = (one for one in again if "degrees off the up axis" in one)
+    assert float(level.split()[4]) < 0.3
+    assert any(re.search(r"splats to mesh: 0\.0", one) for one in again)
+
+
+def _refused(said: list[str]) -> list[str]:
+    return [words for words in said if words.startswith("refused")]
+
+
 def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
     """An .obj with its texture in another file is read from a folder, with the texture's colour."""
     from PIL import Image
