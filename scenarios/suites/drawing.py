@@ -139,7 +139,7 @@ def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) 
 
     People spread evenly over the length of sidewalks, so narrow sidewalks have less room for each.
     The crowd is as dense as leaves each person FREE_M2 on all but CROWDED_SHARE of the route's
-    sidewalks. Nobody walks where they are narrower than `passing_width_m`.
+    sidewalks. On sidewalks narrower than `passing_width_m`, no ground counts as free.
     There are no groups where three abreast fill a sidewalk of the route.
     A crowd without a density is unchanged.
     """

@@ -1,4 +1,4 @@
-"""Both looks of a scan: its splats and its mesh show the same street."""
+"""An imported generated scan: its looks show the same street, and robots stand on its mesh."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import shapely
 
 from cosim.core.geometry import Pose
 from cosim.core.state import Command, Street
-from cosim.place.scan import read_facts
+from cosim.place.scan import ScanMesh, read_facts
 from cosim.results.record import RECORD_FILE, ScanLook
 from cosim.results.table import table_row
 from cosim.spec.camera import CameraSpec
@@ -116,3 +116,51 @@ def test_the_splats_of_a_scan_match_its_mesh(looks: CityMap) -> None:
             assert np.percentile(gap_m, 90) < 0.05
             assert (one.labels == other.labels).mean() > 0.97
     assert np.median(psnr_db) > 24.0, psnr_db
+
+
+STARTS = 1000
+
+
+@pytest.mark.engine
+def test_robots_stand_on_the_mesh_wherever_they_start(looks: CityMap) -> None:
+    """At 1,000 random places of the walkable area, after 0.1 s, the robot has not moved, and its base
+    is within 2 cm of the mean height of the mesh under its wheels."""
+    surface = surface_of_place(looks)
+    assert surface.scan is not None
+    inside = shapely.buffer(read_map("looks").walkable, -0.5)
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(inside.bounds[:2], inside.bounds[2:], (20 * STARTS, 2))
+    xy = xy[shapely.contains_xy(inside, xy)][:STARTS]
+    headings = rng.uniform(-math.pi, math.pi, len(xy))
+    stands = np.empty((STARTS, 3))
+    with BulletWorld(surface) as world:
+        ahead, aside = (0.5 * side for side in world.robot.drive.span_m)
+        for i, (x, y) in enumerate(xy.tolist()):
+            world.place(Pose(x, y, float(headings[i])))
+            for _ in range(2):
+                robot = world.step(Command(0.0, 0.0), Street(0), Street(0), 10).robot
+            stands[i] = robot.pose.x_m, robot.pose.y_m, robot.z_m
+    wheels = np.array([(a * ahead, b * aside) for a in (1, -1) for b in (1, -1)])
+    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+    turned = np.stack(
+        [cos * wheels[:, 0] - sin * wheels[:, 1], sin * wheels[:, 0] + cos * wheels[:, 1]], 2
+    )
+    ground = _mesh_heights(surface.scan.mesh, (xy[:, None] + turned).reshape(-1, 2)).reshape(-1, 4)
+    assert np.abs(stands[:, 2] - ground.mean(axis=1)).max() < 0.02
+    assert np.hypot(*(stands[:, :2] - xy).T).max() < 0.02
+
+
+def _mesh_heights(mesh: ScanMesh, xy: np.ndarray) -> np.ndarray:
+    """Return the height of the lowest triangle over each (N, 2) point that faces up, (N,)."""
+    corners = mesh.vertices.astype(float)[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    up = normals[:, 2] > 0.5 * np.linalg.norm(normals, axis=1)
+    corners, normals = corners[up], normals[up]
+    tree = shapely.STRtree(shapely.polygons(corners[:, :, :2]))
+    point, triangle = tree.query(shapely.points(xy), predicate="intersects")
+    offset = xy[point] - corners[triangle, 0, :2]
+    n = normals[triangle]
+    z = corners[triangle, 0, 2] - (n[:, 0] * offset[:, 0] + n[:, 1] * offset[:, 1]) / n[:, 2]
+    lowest = np.full(len(xy), np.inf)
+    np.minimum.at(lowest, point, z)
+    return lowest
