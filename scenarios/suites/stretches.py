@@ -30,6 +30,8 @@ BEND_M: Final = 0.15
 """Largest distance of a straight way from the middle of a sidewalk of a street, in metres."""
 _TURN_RAD: Final = math.radians(60.0)
 """Largest turn from one piece of a stretch to the next."""
+_NARROW_M: Final = 1.2
+"""Width below which a piece is narrow, in metres."""
 _LENGTH_M: Final = 42.0
 """Length of a stretch of a scan, in metres: the longest route, and ENDS_CLEAR_M at both ends."""
 _SPACING_M: Final = 15.0
@@ -144,16 +146,24 @@ def _chains(street_map: StreetMap, pieces: Mapping[str, Strip]) -> Iterator[list
 
 
 def _joints(street_map: StreetMap, pieces: Mapping[str, Strip]) -> dict[Port, Port]:
-    """Return the port at which each port leads on: at every corner, the straightest pairs."""
+    """Return the port at which each port leads on: at every corner, the straightest pairs.
+
+    Narrow pieces, such as those behind a post, are joined last.
+    """
     onward: dict[Port, Port] = {}
     for corner in street_map.corners.values():
         ports = sorted({port for port in corner.ports if port.strip in pieces})
         turns = [
-            (abs(wrap_angle(_outward(pieces, a) + math.pi - _outward(pieces, b))), a, b)
+            (
+                min(pieces[a.strip].width_m, pieces[b.strip].width_m) < _NARROW_M,
+                abs(wrap_angle(_outward(pieces, a) + math.pi - _outward(pieces, b))),
+                a,
+                b,
+            )
             for a, b in combinations(ports, 2)
             if a.strip != b.strip
         ]
-        for turn_rad, a, b in sorted(turns):
+        for _, turn_rad, a, b in sorted(turns):
             if turn_rad < _TURN_RAD and a not in onward and b not in onward:
                 onward |= {a: b, b: a}
     return onward
