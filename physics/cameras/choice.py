@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from cosim.place.scan import Scan
-from cosim.results.run_setup import MESH_LOOK
+from cosim.results.run_setup import MESH_LOOK, appearance_of
 from cosim.spec.camera import CameraSpec
 from cosim.spec.options import CameraName
 from cosim.spec.run_config import Appearance, CameraChoice
@@ -46,9 +46,11 @@ def renderer_of(name: CameraName, appearance: Appearance = "splats") -> str:
     return {"bullet": "bullet-tiny", "bullet-egl": "bullet-egl"}[name]
 
 
-def appearance_in(name: CameraName, scan: Scan, appearance: Appearance) -> Appearance:
-    """Return the appearance with which a camera draws a scan: the chosen one where it can."""
-    return appearance if name == "gl" and scan.splats is not None else "mesh"
+def drawn_appearance(renderer: str, scan: Scan) -> Appearance:
+    """Return the appearance with which a renderer, by its name, draws a scan."""
+    if scan.splats is None or renderer.startswith("bullet"):
+        return "mesh"
+    return appearance_of(renderer)
 
 
 def camera_of(

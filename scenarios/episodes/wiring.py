@@ -37,7 +37,7 @@ from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import join_faults
-from physics.cameras.choice import appearance_in, camera_of, camera_of_choice, renderer_of
+from physics.cameras.choice import camera_of, camera_of_choice, drawn_appearance, renderer_of
 from physics.dynamics.world import BulletWorld
 from physics.street.furniture import Prop, footprints
 from physics.street.surface import Surface
@@ -177,7 +177,7 @@ def staged(
             parts=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
             renderer=renderer,
-            scan=_look_of(street, options) if manifest.camera or manifest.cameras else None,
+            scan=_look_of(street, renderer, options) if camera is not None or cameras else None,
             scorer=Scorer(
                 scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock
             ),
@@ -195,13 +195,17 @@ def staged(
         )
 
 
-def _look_of(surface: Surface, options: EpisodeOptions) -> ScanLook | None:
-    """Return how a scanned place looks in pictures; None for other places."""
+def _look_of(surface: Surface, renderer: str, options: EpisodeOptions) -> ScanLook | None:
+    """Return how a scanned place looks in pictures; None for other places.
+
+    renderer: of the policy's first camera; further cameras draw in this process.
+    """
     if surface.scan is None:
         return None
     facts = surface.scan.facts
-    camera = camera_of_choice(options.camera)
-    appearance = appearance_in(camera, surface.scan, options.appearance)
+    if renderer == NO_RENDERER:
+        renderer = renderer_of(camera_of_choice(options.camera), options.appearance)
+    appearance = drawn_appearance(renderer, surface.scan)
     return ScanLook(
         appearance=appearance,
         splats=facts.splats_hash if appearance == "splats" else "",
