@@ -170,7 +170,7 @@ look_app = typer.Typer()
     rich_help_panel=LOOK,
     epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 "
     "--residents 8`  \n`cosim look mine.toml --scenario 2 --view above`  \n`cosim look "
-    "frontal-my-street-000 --map my-street`",
+    "frontal-sumo-fkk-in-000 --map sumo-fkk-in`",
 )
 def look(
     scenario: Annotated[
