@@ -24,6 +24,7 @@ from cosim.core.errors import MachineError, UsageError, listed, unknown
 from cosim.spec.run_config import Appearance, help_of
 
 if TYPE_CHECKING:
+    from cosim.spec.scenario import Suite
     from scenarios.tools.viewing.look import Viewpoint
 
 
@@ -168,21 +169,22 @@ look_app = typer.Typer()
 @look_app.command(
     rich_help_panel=LOOK,
     epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 "
-    "--residents 8`  \n`cosim look mine.toml --scenario 2 --view above`",
+    "--residents 8`  \n`cosim look mine.toml --scenario 2 --view above`  \n`cosim look "
+    "frontal-sumo-fkk-in-000 --map sumo-fkk-in`",
 )
 def look(
     scenario: Annotated[
         str,
         typer.Argument(
             help="A scenario's id (`cosim list long-horizon`), or a file: your .toml, a suite's "
-            ".json."
+            ".json, or a run folder."
         ),
     ],
     which: Annotated[
         str | None,
         typer.Option(
             "--scenario",
-            help="Of a file, which scenario: its id or its number; by default the first.",
+            help="Of a file or run, which scenario: its id or its number; by default the first.",
         ),
     ] = None,
     at: Annotated[float, typer.Option(min=0.0, help="Seconds into the episode.")] = 0.0,
@@ -193,6 +195,10 @@ def look(
         typer.Option(
             help="Where the scenario is: a suite or a suite's .json file; by default looked up."
         ),
+    ] = None,
+    drawn_on: Annotated[
+        str | None,
+        typer.Option("--map", help="Map on which `cosim run --map` drew the scenario."),
     ] = None,
     policy: Annotated[str, typer.Option(help="The policy that drives until then.")] = "route",
     robot: Annotated[str, typer.Option(help=help_of("robot"))] = "",
@@ -213,7 +219,10 @@ def look(
     picked = view_of(view)
     pixels = parse_size("--size", size, (16, 4096))
     check_output(output)
-    found, of = one_scenario(scenario, suite, which)
+    if drawn_on is None:
+        found, of = one_scenario(scenario, suite, which)
+    else:
+        found, of = _drawn(scenario, drawn_on, robot, suite or which), 1
     changed = with_crowd(
         with_robot(found, robot),
         residents=residents,
@@ -233,6 +242,17 @@ def look(
         soft_wrap=True,
         highlight=False,
     )
+
+
+def _drawn(scenario: str, map_name: str, robot: str, chosen: str | None) -> Suite:
+    """Return the suite with a scenario that `cosim run --map` draws. Raises UsageError."""
+    from cosim.spec.robot import COURIER, robot_called
+    from scenarios.suites.sample import drawn_on_map
+
+    if chosen is not None:
+        raise UsageError("--map draws the scenario again: leave --suite and --scenario out")
+    with doing(f"drawing {scenario}"):
+        return drawn_on_map(scenario, map_name, robot_called(robot or COURIER.name))
 
 
 def _save(image: object, path: Path) -> None:

@@ -28,6 +28,7 @@ from cosim.results.metrics import (
     RATED_PER_PROGRESS,
     SUCCESS_IN_WORDS,
 )
+from cosim.results.run_setup import appearance_of
 from cosim.results.table import (
     INJECTED,
     crashed_in,
@@ -213,19 +214,13 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
         out.print("; ".join(terms), highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
-    if "renderer" in table and any(map(draws_mesh, table["renderer"].dropna().astype(str))):
+    renderers = table["renderer"].dropna().astype(str) if "renderer" in table else ()
+    if any(appearance_of(renderer) == "mesh" for renderer in renderers):
         out.print("scanned places are drawn by their mesh", highlight=False, markup=False)
     if words := injections_in_words(table):
         out.print(f"+ {words}", soft_wrap=True, highlight=False, markup=False)
     if words := _latency_in_words(table):
         out.print(words, highlight=False, markup=False)
-
-
-def draws_mesh(renderer: str) -> bool:
-    """Return whether pictures of scanned places show their mesh, by the renderer's name."""
-    from physics.cameras.choice import appearance_of  # loads OpenGL
-
-    return appearance_of(renderer) == "mesh"
 
 
 def _latency_in_words(table: pd.DataFrame) -> str:

@@ -77,7 +77,8 @@ class ScanChoices:
     georeference: Annotated[
         str,
         Option(
-            "Origin of the files: LATITUDE,LONGITUDE, or CRS[,EAST,NORTH] such as EPSG:25833.",
+            "Origin of the files: LATITUDE,LONGITUDE[,HEADING of +y, 0 is north], or "
+            "CRS[,EAST,NORTH] such as EPSG:25833.",
             metavar="PLACE",
             panel=_FRAME,
         ),
@@ -260,8 +261,7 @@ def areas(
     ] = 3.0,
 ) -> None:
     """Write the areas of a scan as GeoJSON in metres, or replace them and build its net again."""
-    from cosim.place.scan import read_scan
-    from cosim.place.scan_areas import draft_areas, write_areas
+    from cosim.place.scan import encode_areas, read_scan
 
     folder = _map_folder(name)
     sources = {"areas": set_, "osm": osm, "way": way}
@@ -277,11 +277,11 @@ def areas(
     scan = read_scan(folder, splats=False)
     found = scan.areas
     if draft is not None:
-        from physics.scans.ground import slope
+        from scenarios.places.chosen_areas import drafted_areas
 
-        found = draft_areas(scan.heights, slope(scan.heights))
+        found = drafted_areas(scan.mesh, scan.heights)
     instead = replacement_note(target)
-    write_areas(found, target)
+    target.write_bytes(msgspec.json.format(encode_areas(found, step_m=0.01), indent=1))
     out.print(f"Areas: {target} ({len(found)} areas){instead}", soft_wrap=True, highlight=False)
 
 

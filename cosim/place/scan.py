@@ -212,7 +212,7 @@ def write_scan(scan: Scan, map_folder: Path) -> ScanFacts:
         _save(folder, "splats", scan.splats, Splats.__slots__)
         floaters = np.empty((0, 3), np.float32) if scan.floaters is None else scan.floaters
         np.save(folder / f"{_FLOATERS}.npy", floaters, allow_pickle=False)
-    areas = encode_areas(scan.areas)
+    areas = encode_areas(scan.areas, framed=False)  # the hashes of maps cover these bytes
     (folder / _AREAS).write_bytes(areas)
     facts = msgspec.structs.replace(
         scan.facts,
@@ -244,17 +244,24 @@ def parse_areas(data: bytes) -> tuple[ScanArea, ...]:
     return tuple(areas)
 
 
-def encode_areas(areas: Iterable[ScanArea]) -> bytes:
-    """Return areas as GeoJSON in the net's frame."""
+def encode_areas(areas: Iterable[ScanArea], *, framed: bool = True, step_m: float = 0.0) -> bytes:
+    """Return areas as GeoJSON in the net's frame.
+
+    framed: whether the member "frame" says so, as files that are read for an import need.
+    step_m: grid to which coordinates are rounded, in metres; 0 for none.
+    """
     features = [
         {
             "type": "Feature",
             "properties": {"kind": area.kind},
-            "geometry": shapely.geometry.mapping(area.polygon),
+            "geometry": shapely.geometry.mapping(
+                shapely.set_precision(area.polygon, step_m) if step_m else area.polygon
+            ),
         }
         for area in areas
     ]
-    return msgspec.json.encode({"type": "FeatureCollection", "features": features})
+    frame = {"frame": "local"} if framed else {}
+    return msgspec.json.encode({"type": "FeatureCollection", **frame, "features": features})
 
 
 def _array(folder: Path, name: str) -> NDArray[Any]:

@@ -41,8 +41,6 @@ _SIMPLE_M: Final = 0.25
 _DRAFT_WIDTH_M: Final = 1.2
 """Least width of drafted ground, in metres."""
 _DRAFT_M2: Final = 10.0
-_DRAFTS: Final = 8
-"""Largest number of drafted pieces."""
 _SPECK_M2: Final = 1.0
 """Area in m2 below which walkable pieces and holes are dropped."""
 _SHIFTS_M: Final = ((4.0, 0.5), (0.5, 0.1))
@@ -102,8 +100,8 @@ def read_areas(
 ) -> tuple[ScanArea, ...]:
     """Read drawn areas from a GeoJSON file in WGS84 or in metres of the net's frame.
 
-    A member "frame", "local" or "wgs84", names the frame. Without it, coordinates near the
-    georeference are degrees.
+    A member "frame", "local" or "wgs84", names the frame. Only degrees near the georeference need
+    none.
 
     Raises MapError naming file, feature and remedy.
     """
@@ -125,20 +123,6 @@ def read_areas(
             areas.append((number, ScanArea(kind, part)))
     _check(path, areas, grid)
     return tuple(area for _, area in areas)
-
-
-def write_areas(areas: Iterable[ScanArea], path: Path) -> None:
-    """Write areas as GeoJSON in metres of the net's frame, for editing. Raises OSError."""
-    features = [
-        {
-            "type": "Feature",
-            "properties": {"kind": area.kind},
-            "geometry": shapely.geometry.mapping(shapely.set_precision(area.polygon, 0.01)),
-        }
-        for area in areas
-    ]
-    whole = {"type": "FeatureCollection", "frame": "local", "features": features}
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(whole), indent=1))
 
 
 def read_way(path: Path, georeference: Georeference | None) -> Floats:
@@ -164,6 +148,11 @@ def read_way(path: Path, georeference: Georeference | None) -> Floats:
         ) from error
     if len(way) < 2 or not np.isfinite(way).all():
         raise MapError(f"{path}: route must have at least two points, all of them numbers")
+    if np.ptp(way, axis=0).max() < _FAR_DEG:
+        raise MapError(
+            f"{path}: the route's points, {way[0, 0]:.6g}, {way[0, 1]:.6g} and so on, are degrees, "
+            "but must be metres: write them as a GeoJSON LineString, and give --georeference"
+        )
     return way if origin is None or georeference is None else way + to_local(origin, georeference)
 
 
@@ -186,15 +175,20 @@ def corridor(way: Floats, width_m: float, grid: HeightGrid) -> tuple[ScanArea, .
 
 
 def draft_areas(
-    grid: HeightGrid, grade: NDArray[np.float32], most_grade: float = MOST_GRADE
+    grid: HeightGrid, grade: NDArray[np.float32], hidden: NDArray[np.bool_] | None = None
 ) -> tuple[ScanArea, ...]:
-    """Return the largest pieces of level, free, measured ground as sidewalks, largest first.
+    """Return the largest connected piece of level, free, measured ground as a sidewalk.
 
-    grade: (H, W) slope of the ground. It is a draft: roads and lawns are not told from sidewalks.
+    It is a draft: roads and lawns are not told from sidewalks.
+
+    grade: (H, W) slope of the ground.
+    hidden: (H, W) whether ground is behind walls, as seen from the walked side.
 
     Raises MapError if no piece is large enough.
     """
-    free = grid.measured & ~grid.blocked & (grade < most_grade)
+    free = grid.measured & ~grid.blocked & (grade < MOST_GRADE)
+    if hidden is not None:
+        free &= ~hidden
     ground = opened(_cells(grid, free), 0.5 * _DRAFT_WIDTH_M)
     simple = shapely.simplify(shapely.buffer(ground, -0.5 * _SIMPLE_M), _SIMPLE_M)
     parts = [Polygon(part.exterior, _large_rings(part)) for part in _large(simple, _DRAFT_M2)]
@@ -203,7 +197,7 @@ def draft_areas(
             f"no level ground of {_DRAFT_M2:g} m2 without obstacles: check the scan's up axis and "
             "scale, or draw areas"
         )
-    return tuple(ScanArea("sidewalk", part) for part in parts[:_DRAFTS])
+    return (ScanArea("sidewalk", parts[0]),)
 
 
 def walkable_ground(areas: Iterable[ScanArea], grid: HeightGrid) -> Polygon | MultiPolygon:
@@ -390,17 +384,50 @@ def _placer(
     )
     if not len(xy) or not np.isfinite(xy).all():
         raise MapError(f"{path}: coordinates must be finite numbers")
-    if frame is None and georeference is not None:
-        origin = np.array([georeference.longitude_deg, georeference.latitude_deg])
-        frame = "wgs84" if (np.abs(xy - origin) < _FAR_DEG).all() else "local"
-    if frame != "wgs84":
+    if not _in_degrees(path, xy, frame, georeference):
         return lambda shape: shape
+    assert georeference is not None
+    return lambda shape: shapely.transform(shape, lambda lonlat: to_local(lonlat, georeference))
+
+
+def _in_degrees(
+    path: Path, xy: Floats, frame: str | None, georeference: Georeference | None
+) -> bool:
+    """Return whether coordinates (N, 2) are degrees near the georeference, and not metres.
+
+    Raises MapError with their range and the remedy if they do not fit the frame, or need one.
+    """
+    (x0, y0), (x1, y1) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
+    words = f"{path}: its coordinates, {x0:.6g} to {x1:.6g} and {y0:.6g} to {y1:.6g}, are"
+    # Metres of drawn ground extend farther.
+    small = bool(np.ptp(xy, axis=0).max() < _FAR_DEG)
+    degrees = small and max(abs(x0), abs(x1)) <= 180.0 and max(abs(y0), abs(y1)) <= 90.0
+    if not degrees and frame == "local":
+        return False
+    if not degrees:
+        here = "" if frame is None else ", but its frame is 'wgs84'"
+        raise MapError(
+            f"{words} no degrees in a small area{here}: for metres of the map, write "
+            '"frame": "local" beside "type"'
+        )
     if georeference is None:
         raise MapError(
-            f"{path}: is in WGS84, but the scan has no georeference: import it with "
-            "--georeference, or draw in metres with frame 'local'"
+            f"{words} degrees, but the scan has no georeference: import it with --georeference "
+            "LATITUDE,LONGITUDE of its origin, or draw in metres of the map with "
+            '"frame": "local"'
         )
-    return lambda shape: shapely.transform(shape, lambda lonlat: to_local(lonlat, georeference))
+    if frame == "local":
+        raise MapError(
+            f"{words} degrees, but its frame is 'local', metres of the map: write "
+            '"frame": "wgs84"'
+        )
+    lat, lon = georeference.latitude_deg, georeference.longitude_deg
+    if not (np.abs(xy - np.array([lon, lat])) < _FAR_DEG).all():
+        raise MapError(
+            f"{words} degrees far from the scan, at longitude {lon:.6g} and latitude {lat:.6g}: "
+            "coordinates are longitude, latitude; check them, and --georeference"
+        )
+    return True
 
 
 def _check(path: Path, areas: Sequence[tuple[int, ScanArea]], grid: HeightGrid) -> None:

@@ -440,6 +440,11 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
                 f"{first_label} sees by {first_camera}; {other.label} by {camera}: "
                 "a difference may be the camera's"
             )
+        if words := _looks_apart(runs[0], run):
+            yield (
+                f"{first_label} and {other.label} saw scanned places differently, a difference may "
+                f"be the look's (--appearance, or another import): {words}"
+            )
         if changed := [n for n, v in first.versions.items() if run.spec.setup.versions.get(n) != v]:
             differing = ", ".join(
                 f"{n} {first.versions[n]} and {run.spec.setup.versions.get(n)}" for n in changed
@@ -448,6 +453,15 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
                 f"{first_label} and {other.label} ran with other versions, a difference may be "
                 f"theirs: {differing}"
             )
+
+
+def _looks_apart(one: WholeRun, other: WholeRun) -> str:
+    """Return in words how the first scanned place that looked different did; "" if none did."""
+    for name, record in one.records.items():
+        looks = record.scan, other.records[name].scan if name in other.records else None
+        if looks[0] is not None and looks[1] is not None and looks[0] != looks[1]:
+            return f"in {name}, {looks[0].in_words} and {looks[1].in_words}"
+    return ""
 
 
 def _differing_terms(before: ComparedRun, after: ComparedRun) -> str:

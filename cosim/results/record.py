@@ -30,6 +30,7 @@ from cosim.spec.episode_id import episode_id_of
 from cosim.spec.injection import Injected
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
@@ -102,6 +103,28 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
+class ScanLook(msgspec.Struct, frozen=True, kw_only=True):
+    """Look of a scanned place in the pictures of a policy.
+
+    splats: content hash of the splats that were drawn, "" for the mesh's look
+    sun_azimuth_deg, sun_elevation_deg: direction to its sun, clockwise from north and above the
+        horizon; None if it is unknown
+    """
+
+    appearance: Appearance
+    splats: str = ""
+    sun_azimuth_deg: float | None = None
+    sun_elevation_deg: float | None = None
+
+    @property
+    def in_words(self) -> str:
+        """Description for notes."""
+        look = f"splats {self.splats}" if self.splats else "the mesh"
+        if self.sun_azimuth_deg is None:
+            return f"{look} without sun"
+        return f"{look} with the sun at {self.sun_azimuth_deg:g}, {self.sun_elevation_deg:g}"
+
+
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """Result of one episode: scenario, run set-up, manifest and outcome.
 
@@ -110,6 +133,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     manifest: includes the goals of the run, except `goals`, which are not recorded
     episode: id of the episode sent to the policy, drawn from the run's seed
     nonstandard: what no camera mount of the robot allows, in words
+    scan: how a scanned place looked to the policy's cameras; None without cameras or scan
     status: "crashed": the policy crashed, which counts as a failure. "invalid": the simulator is at
         fault: no failure, but the event did not happen or could not be seen; or an engine failed
         twice
@@ -133,6 +157,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     manifest: Manifest
     episode: str = ""
     nonstandard: str = ""
+    scan: ScanLook | None = None
     status: Status
     reason: str = ""
     ended: Ended | None = None

@@ -6,11 +6,19 @@ import msgspec
 
 from cosim.core.versions import versions
 from cosim.spec.options import EpisodeOptions, PolicyProcess
+from cosim.spec.run_config import Appearance
 
 METRIC_SCHEMA = 4
 """Version of the metric definitions; results of other schemas are not compared."""
 NO_RENDERER = "none"
 """Renderer name of an episode whose policy has no camera."""
+MESH_LOOK = ", mesh"
+"""End of a renderer's name with the mesh's look of scanned places."""
+
+
+def appearance_of(renderer: str) -> Appearance:
+    """Return the appearance of scanned places in pictures, by the renderer's name in a record."""
+    return "mesh" if renderer.endswith(MESH_LOOK) else "splats"
 
 
 class RunSetup(msgspec.Struct, frozen=True, kw_only=True):

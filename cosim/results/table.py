@@ -79,6 +79,7 @@ _RECORD_ONLY = {
     "red_light_entries",
     "events",
     "injections",
+    "scan",
     "schema",
     "clock",
 }

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from cosim.place.scan import Scan
+from cosim.results.run_setup import MESH_LOOK, appearance_of
 from cosim.spec.camera import CameraSpec
 from cosim.spec.options import CameraName
 from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Light
 from physics.cameras.gl import context
-
-_MESH = ", mesh"
-"""End of a renderer's name with the mesh's look of scanned places."""
 
 if TYPE_CHECKING:
     from physics.cameras.bullet_camera import BulletCamera
@@ -43,13 +42,15 @@ def renderer_of(name: CameraName, appearance: Appearance = "splats") -> str:
     Pictures have the same bits on the same renderer only.
     """
     if name == "gl":
-        return context.renderer() + (_MESH if appearance == "mesh" else "")
+        return context.renderer() + (MESH_LOOK if appearance == "mesh" else "")
     return {"bullet": "bullet-tiny", "bullet-egl": "bullet-egl"}[name]
 
 
-def appearance_of(renderer: str) -> Appearance:
-    """Return the appearance of scanned places in pictures, by the renderer's name in a record."""
-    return "mesh" if renderer.endswith(_MESH) else "splats"
+def drawn_appearance(renderer: str, scan: Scan) -> Appearance:
+    """Return the appearance with which a renderer, by its name, draws a scan."""
+    if scan.splats is None or renderer.startswith("bullet"):
+        return "mesh"
+    return appearance_of(renderer)
 
 
 def camera_of(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -133,10 +133,13 @@ def guess_up(normal: Floats, up: str) -> tuple[str, float]:
     return f"{'+' if raw[axis] > 0 else '-'}{'xyz'[axis]}", angle
 
 
-def check_up(mesh: ScanMesh, up: str) -> list[Finding]:
+def check_up(
+    mesh: ScanMesh, up: str, level: Callable[[Floats], str] = lambda _: ""
+) -> list[Finding]:
     """Check that the ground's normal is within 5 degrees of the stated up axis.
 
     up: axis of the file; "" if a transform is given in place of it.
+    level: returns the option that levels the scan for a normal, "" if there is none.
     """
     overall, ground = ground_planes(mesh)
     if ground.support < 0.4 * overall.support:
@@ -150,6 +153,8 @@ def check_up(mesh: ScanMesh, up: str) -> list[Finding]:
     words = f"up: the ground's normal is {tilt:.0f} degrees off {said}; at most 5 are allowed"
     if up and axis != up and angle < 15.0:
         return [refusal(f"{words}: the ground fits {axis} ({angle:.1f} degrees): try --up {axis}")]
+    if option := level(ground.normal):
+        return [refusal(f"{words}: level the scan before its export, or by {option}")]
     return [
         refusal(
             f"{words}: level the scan before its export, or turn it by --transform "

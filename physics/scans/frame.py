@@ -36,6 +36,7 @@ FAR_M: Final = 2000.0
 """Distance of a scan from its origin beyond which it gets a local origin: float32 keeps 0.1 mm."""
 _SHEAR: Final = 0.01
 """Largest difference of a transform from a similarity, as a share of its scale."""
+_LAST: Final = (0.0, 0.0, 0.0, 1.0)
 _PROBE_M: Final = 100.0
 """Distance over which the direction of north is measured in a coordinate system."""
 
@@ -43,11 +44,13 @@ _PROBE_M: Final = 100.0
 class Placing(msgspec.Struct, frozen=True, kw_only=True):
     """Place of a scan on earth: of its origin in degrees, or of its coordinates in a system.
 
+    heading_deg: compass heading of +y of the scan, clockwise from north; 0 is assumed if None.
     crs: name for pyproj, such as "EPSG:25833". Coordinates plus `offset` are metres in it.
     """
 
     latitude_deg: float | None = None
     longitude_deg: float | None = None
+    heading_deg: float | None = None
     crs: str = ""
     offset: tuple[float, float] = (0.0, 0.0)
 
@@ -99,6 +102,22 @@ def check_similarity(transform: Sequence[Sequence[float]]) -> None:
 def scale_of(matrix: Sequence[Sequence[float]]) -> float:
     """Return the metres per unit of a matrix."""
     return float(abs(_determinant(matrix)) ** (1.0 / 3.0))
+
+
+def levelling(normal: Floats) -> Matrix:
+    """Return the shortest rotation that turns a unit normal up."""
+    x, y, z = (float(one) for one in normal)
+    if z < -1.0 + 1e-9:
+        return (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), _LAST
+    k = 1.0 / (1.0 + z)
+    first = 1.0 - k * x * x, -k * x * y, -x, 0.0
+    second = -k * x * y, 1.0 - k * y * y, -y, 0.0
+    return first, second, (x, y, z, 0.0), _LAST
+
+
+def unplaced(direction: Floats, placing: Matrix) -> Floats:
+    """Return a direction of the net's frame before a placing, which turns and shifts."""
+    return np.array([sum(placing[i][k] * direction[i] for i in range(3)) for k in range(3)])
 
 
 def combine(second: Matrix, first: Matrix) -> Matrix:
@@ -158,11 +177,29 @@ def place(low: Floats, high: Floats, placing: Placing | None) -> tuple[Matrix, G
                 "georeference: give latitude_deg and longitude_deg of the origin, or crs"
             )
         there = Georeference(latitude_deg=placing.latitude_deg, longitude_deg=placing.longitude_deg)
+        turned = _to_north(placing.heading_deg or 0.0)
         if np.any(origin[:2]):
-            lon, lat = _local(there)(origin[0], origin[1], inverse=True)
+            ((east, north, _),) = move(origin[None], turned).tolist()
+            lon, lat = _local(there)(east, north, inverse=True)
             there = Georeference(latitude_deg=lat, longitude_deg=lon)
-        return shift(-origin), there
+        return combine(turned, shift(-origin)), there
+    if placing.heading_deg is not None:
+        raise MapError(
+            f"georeference: heading_deg is {placing.heading_deg:g}, but {placing.crs} has its own "
+            "north: leave it out, or give latitude and longitude in place of crs"
+        )
     return _place_in_system(low, high, placing)
+
+
+def _to_north(heading_deg: float) -> Matrix:
+    """Return the matrix that turns +y from a compass heading to north. Raises MapError."""
+    if not -360.0 <= heading_deg <= 360.0:
+        raise MapError(
+            f"georeference: heading_deg is {heading_deg:g}, but must be -360 to 360: the compass "
+            "heading of +y of the scan, in degrees clockwise from north"
+        )
+    a, b = math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))
+    return (a, b, 0.0, 0.0), (-b, a, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def local_origin(low: Floats, high: Floats) -> Floats:

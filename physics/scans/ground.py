@@ -340,7 +340,7 @@ def _standing(
     # Large triangles may pass over changing ground, so the test for them has a margin.
     near = (high > middle + STANDING_M[0] - 1.0) & (low < middle + STANDING_M[1] + 1.0)
     for part in _chunks(corners[near]):
-        for samples in _samples(part, 0.5 * lattice.step_m):
+        for samples, _ in samples_of(part, 0.5 * lattice.step_m):
             point = lattice.index(samples[:, :2])
             above = samples[:, 2] - ground[point]
             standing = (above > STANDING_M[0]) & (above < STANDING_M[1])
@@ -348,17 +348,20 @@ def _standing(
     return np.asarray((counts >= _SAMPLES).reshape(lattice.shape))
 
 
-def _samples(corners: Floats, step_m: float) -> Iterator[Floats]:
-    """Yield points on triangles, at most `step_m` apart along their edges, (N, 3)."""
+def samples_of(corners: Floats, step_m: float) -> Iterator[tuple[Floats, NDArray[np.int64]]]:
+    """Yield points on triangles, at most `step_m` apart along their edges, (N, 3), and the index of
+    the triangle of each, (N,)."""
     sides = corners - np.roll(corners, 1, axis=1)
     longest = np.sqrt((sides * sides).sum(axis=2)).max(axis=1)
     parts = np.clip(np.ceil(longest / step_m), 1, 4096).astype(np.int64)
     for count in np.unique(parts).tolist():
-        some = corners[parts == count]
+        owners = np.flatnonzero(parts == count)
+        some = corners[owners]
         j, k = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
         inside = j + k <= count
         v, w = (j[inside] / count)[None, :, None], (k[inside] / count)[None, :, None]
         rows = max(1, 2_000_000 // v.size)
         for i in range(0, len(some), rows):
             a, b, c = (some[i : i + rows, None, n] for n in range(3))
-            yield (a + v * (b - a) + w * (c - a)).reshape(-1, 3)
+            points = (a + v * (b - a) + w * (c - a)).reshape(-1, 3)
+            yield points, np.repeat(owners[i : i + rows], v.size)

@@ -169,7 +169,7 @@ class Episode:
         self._scorer = stage.scorer
         self._injected = stage.injected
         drawn = msgspec.structs.replace(self.setup, renderer=stage.renderer)
-        self.record = msgspec.structs.replace(self.record, setup=drawn)
+        self.record = msgspec.structs.replace(self.record, setup=drawn, scan=stage.scan)
         self._setup_s = time.perf_counter() - self._began_s
         return self
 

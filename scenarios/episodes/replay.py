@@ -16,12 +16,12 @@ from cosim.results.log import Log, Tick
 from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records
+from cosim.results.run_setup import appearance_of
 from cosim.results.traffic import RoadState
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
-from physics.cameras.choice import appearance_of
 from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.run_episode import drive

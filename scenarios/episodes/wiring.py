@@ -27,6 +27,7 @@ from cosim.place import overlay
 from cosim.place.barriers import without_barriers
 from cosim.place.car_paths import waits_before
 from cosim.place.street_map import Port, StreetMap, WalkableArea
+from cosim.results.record import ScanLook
 from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import EventKinds
@@ -36,7 +37,7 @@ from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import join_faults
-from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
+from physics.cameras.choice import camera_of, camera_of_choice, drawn_appearance, renderer_of
 from physics.dynamics.world import BulletWorld
 from physics.street.furniture import Prop, footprints
 from physics.street.surface import Surface
@@ -65,6 +66,7 @@ class StagedScenario:
     """A scenario whose engines run.
 
     renderer: name of the policy's renderer in records.
+    scan: look of a scanned place to the policy's cameras; None without either.
     observer: builds observations.
     eyes: creates further cameras.
     entrances: arrivals and departures of the crowd.
@@ -73,6 +75,7 @@ class StagedScenario:
     parts: EpisodeEngines
     robot: Robot
     renderer: str
+    scan: ScanLook | None
     scorer: Scorer
     observer: Observer
     eyes: Callable[[CameraSpec], AbstractContextManager[ViewCamera]]
@@ -174,6 +177,7 @@ def staged(
             parts=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
             renderer=renderer,
+            scan=_look_of(street, renderer, options) if camera is not None or cameras else None,
             scorer=Scorer(
                 scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock
             ),
@@ -189,6 +193,25 @@ def staged(
             injected=injected,
             entrances=crowd.entrances,
         )
+
+
+def _look_of(surface: Surface, renderer: str, options: EpisodeOptions) -> ScanLook | None:
+    """Return how a scanned place looks in pictures; None for other places.
+
+    renderer: of the policy's first camera; further cameras draw in this process.
+    """
+    if surface.scan is None:
+        return None
+    facts = surface.scan.facts
+    if renderer == NO_RENDERER:
+        renderer = renderer_of(camera_of_choice(options.camera), options.appearance)
+    appearance = drawn_appearance(renderer, surface.scan)
+    return ScanLook(
+        appearance=appearance,
+        splats=facts.splats_hash if appearance == "splats" else "",
+        sun_azimuth_deg=None if facts.sun is None else facts.sun.azimuth_deg,
+        sun_elevation_deg=None if facts.sun is None else facts.sun.elevation_deg,
+    )
 
 
 def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd | EmptyStreet:

@@ -12,7 +12,14 @@ import numpy as np
 from cosim.core.errors import MapError, UsageError
 from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
-from cosim.place.scan import Georeference, HeightGrid, ScanArea, read_scan, write_scan
+from cosim.place.scan import (
+    Georeference,
+    HeightGrid,
+    ScanArea,
+    ScanMesh,
+    read_scan,
+    write_scan,
+)
 from cosim.place.scan_areas import (
     corridor,
     cut_to_scan,
@@ -25,6 +32,7 @@ from cosim.place.scan_areas import (
 from physics.scans.check import check_areas, check_way
 from physics.scans.findings import Finding, note, raise_refusals, warning
 from physics.scans.ground import slope
+from physics.scans.hidden import behind_walls
 from physics.scans.labels import label_mesh
 from scenarios.places.scan_options import ScanOptions
 from sumo_nets.maps.map_store import About, about_map, map_net, store_map
@@ -35,6 +43,7 @@ _ABOUT_AREAS: Final = ("areas:", "holes:", "net:", "way:")
 
 def find_areas(
     options: ScanOptions,
+    mesh: ScanMesh,
     heights: HeightGrid,
     georeference: Georeference | None,
     progress: Progress = ignore,
@@ -49,15 +58,23 @@ def find_areas(
         areas = corridor(way, options.width_m, heights)
         words = f"areas: a corridor of {options.width_m:g} m along {Path(options.way).name}"
         return areas, [note(words), *_way_heights(Path(options.way), way, heights)]
-    areas = draft_areas(heights, slope(heights))
+    areas = drafted_areas(mesh, heights)
     size_m2 = sum(area.polygon.area for area in areas)
     return areas, [
         warning(
             f"areas: a draft of {size_m2:.0f} m2 of level ground, in which roads, lawns and "
-            "sidewalks are not distinguished: edit it (`cosim scan areas`), or give --areas, "
-            "--osm or --way"
+            "sidewalks are not distinguished, without ground behind walls: edit it "
+            "(`cosim scan areas`), or give --areas, --osm or --way"
         )
     ]
+
+
+def drafted_areas(mesh: ScanMesh, heights: HeightGrid) -> tuple[ScanArea, ...]:
+    """Return a draft of the walkable area from the ground.
+
+    Raises MapError if there is too little ground.
+    """
+    return draft_areas(heights, slope(heights), behind_walls(mesh, heights))
 
 
 def replace_areas(
@@ -76,7 +93,9 @@ def replace_areas(
     about = about_map(name)
     scan = read_scan(map_net(name).parent)
     progress("finding the walkable area")
-    areas, findings = find_areas(options, scan.heights, scan.facts.georeference, progress)
+    areas, findings = find_areas(
+        options, scan.mesh, scan.heights, scan.facts.georeference, progress
+    )
     findings += check_areas(areas, scan.heights)
     raise_refusals(findings)
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final
@@ -34,7 +35,7 @@ from physics.scans.labels import label_mesh
 from physics.scans.mesh_distance import MeshDistance
 from scenarios.places.chosen_areas import find_areas
 from scenarios.places.scan_options import ScanOptions
-from scenarios.places.scan_sources import LoadedScan, load_mesh, load_splats, splat_hint
+from scenarios.places.scan_sources import LoadedScan, level_hint, load_mesh, load_splats, splat_hint
 from sumo_nets.maps.import_rules import IMPORTER_VERSION
 from sumo_nets.maps.map_store import About, licence_texts, map_name, store_map
 
@@ -94,7 +95,7 @@ def check_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) 
     findings = loaded.findings
     progress("checking axes and scale")
     findings += check_scale(loaded.mesh)
-    findings += check_up(loaded.mesh, loaded.up)
+    findings += check_up(loaded.mesh, loaded.up, partial(level_hint, loaded, options))
     if any(one.level == "refused" for one in findings):
         return CheckedScan(None, tuple(findings))
     if splat_files:
@@ -103,7 +104,7 @@ def check_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) 
     heights = height_grid(loaded.mesh, None, _step_m(loaded))
     findings += _holes(heights)
     progress("finding the walkable area")
-    areas, found = find_areas(options, heights, loaded.georeference, progress)
+    areas, found = find_areas(options, loaded.mesh, heights, loaded.georeference, progress)
     findings += found
     findings += check_areas(areas, heights)
     if any(one.level == "refused" for one in findings):

@@ -160,16 +160,20 @@ def _matrix_in(path: Path, held: Mapping[str, Any]) -> Any:
 
 
 def parse_georeference(words: str) -> Placing:
-    """Return the place of "LATITUDE,LONGITUDE", "CRS" or "CRS,EAST,NORTH".
+    """Return the place of "LATITUDE,LONGITUDE[,HEADING]", "CRS" or "CRS,EAST,NORTH".
 
     Raises UsageError.
     """
     parts = [part.strip() for part in words.split(",")]
     try:
-        if len(parts) == 2:
-            latitude, longitude = map(float, parts)
+        if len(parts) == 2 or (len(parts) == 3 and _is_number(parts[0])):
+            latitude, longitude, *heading = map(float, parts)
             if -90.0 <= latitude <= 90.0 and -180.0 <= longitude <= 180.0:
-                return Placing(latitude_deg=latitude, longitude_deg=longitude)
+                return Placing(
+                    latitude_deg=latitude,
+                    longitude_deg=longitude,
+                    heading_deg=heading[0] if heading else None,
+                )
         elif len(parts) == 3:
             return Placing(crs=parts[0], offset=(float(parts[1]), float(parts[2])))
         elif parts[0]:
@@ -178,9 +182,18 @@ def parse_georeference(words: str) -> Placing:
         pass
     raise UsageError(
         f"--georeference {words}: give LATITUDE,LONGITUDE of the origin in degrees, such as "
-        "55.698,13.195, or a coordinate system, such as EPSG:25833, with an offset or without: "
+        "55.698,13.195, with the compass heading of +y if that is not north: 55.698,13.195,33; "
+        "or a coordinate system, such as EPSG:25833, with an offset or without: "
         "EPSG:25833,391000,5820000"
     )
+
+
+def _is_number(words: str) -> bool:
+    try:
+        float(words)
+    except ValueError:
+        return False
+    return True
 
 
 def parse_sun(words: str) -> ScanSun:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import MapError
+from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
 from cosim.place.scan import Georeference, ScanMesh, Splats
 from physics.scans.check import fitting_frame, ground_planes, guess_up
@@ -21,20 +22,28 @@ from physics.scans.frame import (
     Matrix,
     combine,
     file_matrix,
+    levelling,
+    local_origin,
     move,
     move_splats,
     place,
     scale_of,
+    unplaced,
 )
 from physics.scans.mesh_distance import MeshDistance
 from physics.scans.ordering import order_mesh, order_splats, take_splats
 from physics.scans.read_mesh import MOST_TRIANGLES, RawMesh, read_mesh
 from physics.scans.read_splats import RawSplats, read_splats
 from physics.scans.sources import kind_of_source, read_source, stem_and_ending
-from scenarios.places.scan_options import ScanOptions, Up, read_transform
+from scenarios.places.scan_options import OPTIONS_FILE, ScanOptions, Up, read_transform
 
 BUDGET: Final = 4_000_000
 """Number of splats above which a scan is refused: 3 million are drawn at 60 frames/s on a GPU."""
+NORTH_ASSUMED: Final = (
+    "georeference: +y of the scan (-z of a .glb) is taken as north, heading 0: if it points "
+    "elsewhere, give its compass heading in degrees as third number of --georeference, or as "
+    "heading_deg in scan.json"
+)
 _ENDINGS: Final = (".glb", ".ply", ".obj", ".spz", ".splat")
 
 
@@ -44,6 +53,8 @@ class LoadedScan:
 
     raw: splats in the frame of their file; None without splats.
     matrix, splat_matrix: from the files to the net's frame.
+    placing: from metres with z up to the net's frame.
+    file_matrix: from the mesh's files to metres with z up; None if they differ in it.
     up: stated axis of the mesh, "" with a transform.
     files: SHA-256 of each file by its name.
     """
@@ -57,6 +68,7 @@ class LoadedScan:
     raw: RawSplats | None = None
     splat_matrix: Matrix | None = None
     placing: Matrix = ()
+    file_matrix: Matrix | None = None
     files: dict[str, str] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
 
@@ -160,9 +172,13 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
     findings = [finding for _, _, raw in meshes for finding in raw.findings]
     words = f"mesh: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices"
     findings.append(note(words))
-    if any(row[3] for row in placing[:3]):
-        shifted = ", ".join(f"{-row[3]:.0f}" for row in placing[:3])
+    origin = local_origin(low, high)
+    if origin.any():
+        shifted = ", ".join(f"{one:.0f}" for one in origin)
         findings.append(note(f"local origin at ({shifted}) m of the source frame"))
+    given = options.georeference
+    if given is not None and not given.crs and given.heading_deg is None:
+        findings.append(note(NORTH_ASSUMED))
     return LoadedScan(
         mesh,
         combine(placing, matrix),
@@ -170,6 +186,7 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
         georeference,
         scale_of(matrix),
         placing=placing,
+        file_matrix=matrix if all(one == matrix for one, _, _ in meshes) else None,
         findings=findings,
     )
 
@@ -260,6 +277,32 @@ def _splat_matrix(
         )
     mirror = options.splat_mirror if own else options.mirror
     return _mirrored(file_matrix(scale or 1.0, up or "+z", transform), mirror)
+
+
+def level_hint(loaded: LoadedScan, options: ScanOptions, normal: Floats) -> str:
+    """Return the transforms for `scan.json` that turn the ground's normal up.
+
+    normal: in the net's frame. Returns "" for files with several frames or a mirrored one.
+    """
+    own = any(
+        getattr(options, f"splat_{name}") is not None for name in ("scale", "up", "transform")
+    )
+    if loaded.file_matrix is None or options.mirror or options.splat_mirror:
+        return ""
+    turn = levelling(unplaced(normal, loaded.placing))
+    found = {"transform": combine(turn, loaded.file_matrix)}
+    if own:
+        transform = read_transform(options.splat_transform)
+        scale, up = options.splat_scale or options.scale, options.splat_up or options.up
+        if transform is None and (scale is None or up is None):
+            return ""
+        splats = file_matrix(scale or 1.0, up or "+z", transform)
+        found["splat_transform"] = combine(turn, splats)
+    rows = ", ".join(
+        f'"{key}": {[[round(one, 9) + 0.0 for one in row] for row in matrix]}'
+        for key, matrix in found.items()
+    )
+    return f"this in {OPTIONS_FILE}, in place of scale and up: {rows}"
 
 
 def splat_hint(loaded: LoadedScan, raw: RawSplats, scale: float | None) -> str:

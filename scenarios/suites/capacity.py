@@ -1,14 +1,16 @@
 """Count the sidewalks, crosswalks and routes of a place on which each kind of scenario fits.
 
 The scenario builders are run a few times for each strip. A count is therefore a lower bound.
+On a scan they are run to the end, with all obstacles, as `cosim run --map` runs them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import islice
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -17,10 +19,11 @@ from cosim.core.errors import CosimError
 from cosim.place.route_line import START_M
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import EventKinds
+from cosim.spec.events import EventKind, EventKinds
 from cosim.spec.robot import COURIER, Robot
+from cosim.spec.scenario import CityMap, Place, Scenario
 from scenarios.events import EVENT_KINDS
-from scenarios.suites.drawing import Refusals, first_of
+from scenarios.suites.drawing import SCAN_TRIES, Refusals, first_of
 from scenarios.suites.long_horizon import (
     avoided_strips,
     draw_way,
@@ -29,8 +32,15 @@ from scenarios.suites.long_horizon import (
     search_way,
     starts,
 )
-from scenarios.suites.reactive import event_spot, strips_of
-from scenarios.suites.unit import STRUCTURES, drawn_along, lies_on, strips_for
+from scenarios.suites.reactive import event_spot, reactive_on, strips_of
+from scenarios.suites.unit import (
+    STRUCTURES,
+    Structure,
+    drawn_along,
+    lies_on,
+    strips_for,
+    unit_along,
+)
 
 _DRAWS: Final = 4
 """Number of draws on each strip."""
@@ -39,12 +49,15 @@ _SLOW: Final = 80
 """Maximum number of crosswalks and corners that are examined, evenly spread, because they are
 slow.
 """
+_MOST_SEED: Final = 2**31 - 1
 _WAYS: Final = 8
+_SCAN_WAYS: Final = 40
+"""Numbers of drawn ways for long routes that are examined, on nets and on scans."""
 _WAY_DRAWS: Final = 120
 
 _NO_STRIP: Final = {
-    "sidewalks": "no sidewalk is wide enough, apart from stairs, bridges and tunnels",
-    "crosswalks": "no crosswalk is without signals",
+    "sidewalk": "no sidewalk is wide enough, apart from stairs, bridges and tunnels",
+    "crossing": "no crosswalk is without signals",
 }
 """Reason that is reported if a structure has no strip."""
 
@@ -103,28 +116,73 @@ def capacity_of(
 ) -> Capacity:
     """Count where each kind of scenario fits a robot on a place. Equal maps give equal counts."""
     rng = np.random.default_rng(0x0FFE)
+    whole = _Whole(street_map, graph, rng, robot) if street_map.scanned else None
+    least = 1 if whole is None else SCAN_TRIES
     events: dict[str, FitCount] = {}
     structures: dict[str, FitCount] = {}
     for name, kind in kinds.items():
         strips = strips_of(kind, street_map, graph)
         slow = kind.layout is None
-        spot = partial(event_spot, kind, street_map=street_map, rng=rng, robot=robot)
-        events[name] = _fit_count(
-            strips, "crosswalks" if slow else "sidewalks", _SLOW if slow else _SIDEWALKS, spot
+        spot: Callable[[Strip], object] = (
+            partial(event_spot, kind, street_map=street_map, rng=rng, robot=robot)
+            if whole is None
+            else partial(whole.event, kind)
         )
+        what = "crosswalks" if slow else _sidewalks(street_map)
+        events[name] = _fit_count(strips, what, _SLOW if slow else _SIDEWALKS, spot, least=least)
     for structure in STRUCTURES:
         strips = strips_for(structure, street_map, graph, robot)
-        way = partial(
-            drawn_along, structure, street_map=street_map, graph=graph, rng=rng, robot=robot
+        way: Callable[[Strip], object] = (
+            partial(
+                drawn_along, structure, street_map=street_map, graph=graph, rng=rng, robot=robot
+            )
+            if whole is None
+            else partial(whole.unit, structure)
         )
-        what = "crosswalks" if lies_on(structure) == "crossing" else "sidewalks"
-        most = _SLOW
-        structures[structure] = _fit_count(
-            strips, what, _SIDEWALKS if structure == "straight" else most, way, _NO_STRIP[what]
-        )
+        kind_of_strip = lies_on(structure)
+        what = "crosswalks" if kind_of_strip == "crossing" else "sidewalks"
+        if structure == "straight":
+            what = _sidewalks(street_map)
+        most = _SIDEWALKS if structure == "straight" else _SLOW
+        structures[structure] = _fit_count(strips, what, most, way, _NO_STRIP[kind_of_strip], least)
     return Capacity(
         events=events, structures=structures, routes=_routes(street_map, graph, rng, robot)
     )
+
+
+class _Whole(NamedTuple):
+    """Inputs from which whole scenarios are drawn on a scan."""
+
+    street_map: StreetMap
+    graph: WalkGraph
+    rng: np.random.Generator
+    robot: Robot
+
+    @property
+    def place(self) -> Place:
+        return CityMap(map=self.street_map.name)
+
+    def event(self, kind: EventKind, strip: Strip) -> Scenario:
+        """Draw a reactive scenario on a strip, with a seed of its own."""
+        seed = int(self.rng.integers(_MOST_SEED))
+        return reactive_on(
+            strip, kind, self.place, self.street_map, self.rng, seed, kind.name, robot=self.robot
+        )
+
+    def unit(self, structure: Structure, strip: Strip) -> Scenario:
+        """Draw a unit scenario on a strip, with a seed of its own."""
+        seed = int(self.rng.integers(_MOST_SEED))
+        route, crossings = drawn_along(
+            structure, strip, self.street_map, self.graph, self.rng, self.robot
+        )
+        return unit_along(
+            structure, route, crossings, self.place, self.street_map, seed, structure, self.robot
+        )
+
+
+def _sidewalks(street_map: StreetMap) -> str:
+    """Return the name of what `sidewalks_of` returns."""
+    return "stretches of sidewalk" if street_map.scanned else "sidewalks"
 
 
 def _fit_count(
@@ -133,15 +191,18 @@ def _fit_count(
     most: int,
     draw: Callable[[Strip], object],
     no_strip: str = "",
+    least: int = 1,
 ) -> FitCount:
     """Count the strips on which a draw succeeds; at most `most` are examined.
 
     no_strip: reason for an empty list of strips.
+    least: number of draws on all of them together.
     """
     chosen = [strips[int(i)] for i in np.linspace(0, len(strips) - 1, min(most, len(strips)))]
     refusals = Refusals()
+    draws = max(_DRAWS, math.ceil(least / max(len(chosen), 1)))
     found = sum(
-        any(_fits(partial(draw, strip), refusals) for _ in range(_DRAWS)) for strip in chosen
+        any(_fits(partial(draw, strip), refusals) for _ in range(draws)) for strip in chosen
     )
     reason = "" if found else refusals.most_frequent or no_strip
     return FitCount(
@@ -166,7 +227,8 @@ def _routes(
         (usable, partial(search_way, street_map, graph, rng, usable, avoided)),
     ):
         if some and not found:
-            ways = list(islice(_drawn(draw, refusals), _WAYS))
+            most = _SCAN_WAYS if street_map.scanned else _WAYS
+            ways = list(islice(_drawn(draw, refusals), most))
             looked_at += len(ways)
             found = sum(
                 _fits(partial(lone_route, street_map, way, fences_along, robot), refusals)

@@ -15,6 +15,8 @@ from cosim.spec.selection import select_scenarios
 from scenarios.events import EVENT_KINDS
 
 _HERE = Path(__file__).parent
+_OF_RUN = "scenarios.json"
+"""File of a run folder with its scenarios."""
 
 _NAMES = ("unit", "reactive", "long-horizon", "scans")
 _FILES = {name: _HERE / f"{name}.json" for name in _NAMES}
@@ -24,8 +26,8 @@ SUITES: Mapping[str, Path] = MappingProxyType(
 
 
 def load_suite(name: str) -> Suite:
-    """A shipped suite by name, or one of the user's by the path of its .json file, or of an own
-    scenario's .toml.
+    """Load a shipped suite by name, or one of the user's by the path of its .json file, of an own
+    scenario's .toml, or of a run folder.
 
     Raises UsageError with the valid names, SpecError naming the file and the field.
 
@@ -36,9 +38,15 @@ def load_suite(name: str) -> Suite:
         return read_suite(Path(name), EVENT_KINDS)
     if name.endswith(".toml"):
         return _own(Path(name))
+    if name not in SUITES and _is_run(name):
+        return read_suite(Path(name) / _OF_RUN, EVENT_KINDS)
     if name not in SUITES:
         raise unknown("suite", name, [*SUITES, "path/to/suite.json", "path/to/own.toml"])
     return _shipped(name)
+
+
+def _is_run(name: str) -> bool:
+    return (Path(name) / _OF_RUN).is_file()
 
 
 @cache
@@ -70,7 +78,10 @@ def holding(scenario_id: str) -> Suite:
         if scenario_id in (here := [s.id for s in whole.scenarios]):
             return whole
         ids += here
-    raise unknown("scenario", scenario_id, ids)
+    raise UsageError(
+        f"{unknown('scenario', scenario_id, ids)} For one that was drawn by --map, give the run "
+        "folder by --suite."
+    )
 
 
 def one_scenario(
@@ -79,11 +90,12 @@ def one_scenario(
     """Find one scenario by its id, or by the path of its file: the suite with it alone, and of how
     many it is one.
 
-    suite: where to look for the id; by default in the shipped suites. which: of a file, the id or
-    the number, counted from 1; by default the first. Raises UsageError with the valid choices,
-    SpecError for a file with faults.
+    suite: where to look for the id; by default in the shipped suites.
+    which: of a file or a run folder, the id or the number, counted from 1; by default the first.
+
+    Raises UsageError with the valid choices, SpecError for a file with faults.
     """
-    if not name.endswith((".json", ".toml")):
+    if not name.endswith((".json", ".toml")) and not _is_run(name):
         if which is not None:
             raise UsageError(
                 f"--scenario chooses from a file, and '{name}' is a scenario's id: leave "
@@ -95,7 +107,7 @@ def one_scenario(
         raise UsageError(
             f"{name} is a file: leave --suite out, and choose one of its scenarios by --scenario"
         )
-    if name.endswith(".json"):
+    if not name.endswith(".toml"):
         whole = load_suite(name)
         one = _picked([scenario.id for scenario in whole.scenarios], which)
         return msgspec.structs.replace(whole, scenarios=(whole.scenarios[one],)), len(

@@ -26,6 +26,8 @@ from sumo_nets.crowd.free_space import LocalWalkableArea
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 
 TRIES: Final = 400
+SCAN_TRIES: Final = 800
+"""Numbers of draws, and of those on scans, which have few places."""
 _STEP_M: Final = 5.0
 """Distance between the points of a route at which the room of people is measured, m."""
 FREE_M2: Final = 20.0
@@ -65,15 +67,15 @@ class Refusals:
         return self._counts.most_common(1)[0][0] if self._counts else ""
 
 
-def first_that_fits(draw: Callable[[], Scenario], failure: str) -> Scenario:
-    """Return the first of TRIES draws that is not refused.
+def first_that_fits(draw: Callable[[], Scenario], failure: str, tries: int = TRIES) -> Scenario:
+    """Return the first of a number of draws that is not refused.
 
     Raises SpecError with `failure` and the count of each reason.
     """
     refusals = Refusals()
-    found = first_of((draw for _ in range(TRIES)), refusals)
+    found = first_of((draw for _ in range(tries)), refusals)
     if found is None:
-        raise SpecError(f"{failure} in {TRIES} draws: {refusals}")
+        raise SpecError(f"{failure} in {tries} draws: {refusals}")
     return found
 
 
@@ -137,7 +139,7 @@ def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) 
 
     People spread evenly over the length of sidewalks, so narrow sidewalks have less room for each.
     The crowd is as dense as leaves each person FREE_M2 on all but CROWDED_SHARE of the route's
-    sidewalks. Nobody walks where they are narrower than `passing_width_m`.
+    sidewalks. On sidewalks narrower than `passing_width_m`, no ground counts as free.
     There are no groups where three abreast fill a sidewalk of the route.
     A crowd without a density is unchanged.
     """

@@ -26,10 +26,18 @@ from cosim.spec.events import Event, EventKind, SidewalkLayout
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
-from scenarios.suites.drawing import bare_scenario, first_that_fits, people_of, wider_m
+from scenarios.suites.drawing import (
+    SCAN_TRIES,
+    TRIES,
+    bare_scenario,
+    first_that_fits,
+    people_of,
+    wider_m,
+)
 from scenarios.suites.gate_fences import Gate, drawn_gate
 from scenarios.suites.lanes import with_lanes_blocked
 from scenarios.suites.long_horizon import route_crossings
+from scenarios.suites.stretches import middle_at, sidewalks_of, straight_along
 
 LIMIT_S = 60.0
 """Time limit of a scenario that the expert has not solved yet."""
@@ -54,9 +62,6 @@ _ASLANT: Final = tuple(
 """Ways over a crosswalk that are tried in this order: angle to its line, offset from its middle in
 metres.
 """
-ENDS_CLEAR_M = 6.0
-"""Least distance of route and event from the ends of their sidewalk, in metres."""
-BEND_M = 0.15
 _STEP_M: Final = 3.0
 """Distance between the points of a straight route, in metres: the suite's file stays small."""
 _SPEEDS_MPS = (1.1, 1.65)
@@ -127,37 +132,78 @@ def build_reactive(
     if not strips:
         what = "crossing" if kind.layout is None else "sidewalk"
         raise MapError(f"map '{street_map.name}' has no {what} for '{kind.name}'")
-    if wanted is None:
-        wanted = drawn_wanted(np.random.default_rng([seed, place.seed, 0xD4A3, named]))
+    properties = (
+        itertools.repeat(wanted)
+        if wanted
+        else _wanted_in_turn(
+            np.random.default_rng([seed, place.seed, 0xD4A3, named]), scanned=street_map.scanned
+        )
+    )
     in_turn = _in_turn([one for one in strips if _may_hold(kind, one)] or strips, rng)
 
     def draw() -> Scenario:
-        at = event_spot(kind, next(in_turn), street_map, rng, robot, wanted)
-        bare = bare_scenario(
-            Polyline(at.route),
-            at.crossings,
-            place,
-            street_map,
-            suite="reactive",
-            seed=seed,
-            scenario_id=scenario_id,
-            time_limit_s=LIMIT_S,
-            robot=robot,
+        strip, now = next(in_turn), next(properties)
+        return reactive_on(
+            strip, kind, place, street_map, rng, seed, scenario_id, robot=robot, wanted=now
         )
-        of_kind = {"structure": kind.name, "ends_at": kind.ends_at}
-        whole = msgspec.structs.replace(
-            bare,
-            crowd=NO_CROWD,
-            ends_on_failure=True,
-            obstacles=at.fences,
-            events=(_event_at(kind, at, wanted, rng, robot),),
-            **of_kind,
-        )
-        return with_lanes_blocked(whole, kind, street_map)
 
     return first_that_fits(
-        draw, f"no place for '{kind.name}' on '{street_map.name}' with seed {seed}"
+        draw,
+        f"no place for '{kind.name}' on '{street_map.name}' with seed {seed}",
+        SCAN_TRIES if street_map.scanned else TRIES,
     )
+
+
+def reactive_on(
+    strip: Strip,
+    kind: EventKind,
+    place: Place,
+    street_map: StreetMap,
+    rng: np.random.Generator,
+    seed: int,
+    scenario_id: str,
+    *,
+    robot: Robot = COURIER,
+    wanted: Wanted | None = None,
+) -> Scenario:
+    """Draw a scenario of one kind of event on a strip. Raises SpecError if it does not fit.
+
+    wanted: what was drawn before the place; drawn here if None.
+    """
+    if wanted is None:
+        wanted = drawn_wanted(rng)
+    at = event_spot(kind, strip, street_map, rng, robot, wanted)
+    bare = bare_scenario(
+        Polyline(at.route),
+        at.crossings,
+        place,
+        street_map,
+        suite="reactive",
+        seed=seed,
+        scenario_id=scenario_id,
+        time_limit_s=LIMIT_S,
+        robot=robot,
+    )
+    of_kind = {"structure": kind.name, "ends_at": kind.ends_at}
+    whole = msgspec.structs.replace(
+        bare,
+        crowd=NO_CROWD,
+        ends_on_failure=True,
+        obstacles=at.fences,
+        events=(_event_at(kind, at, wanted, rng, robot),),
+        **of_kind,
+    )
+    return with_lanes_blocked(whole, kind, street_map)
+
+
+def _wanted_in_turn(rng: np.random.Generator, *, scanned: bool) -> Iterator[Wanted]:
+    """Yield drawn properties for one draw after another: always the first ones.
+
+    On a scan, others follow after a while. It has few places, and may have none for a long route.
+    """
+    first = drawn_wanted(rng)
+    for number in itertools.count():
+        yield drawn_wanted(rng) if scanned and number >= TRIES // 4 else first
 
 
 def drawn_wanted(rng: np.random.Generator) -> Wanted:
@@ -171,11 +217,12 @@ def strips_of(kind: EventKind, street_map: StreetMap, graph: WalkGraph) -> list[
     """Return the strips on which a kind of event may fit, sorted by id. Nothing is drawn for this
     check.
     """
-    wanted = "crossing" if kind.layout is None else "sidewalk"
+    if kind.layout is not None:
+        return sidewalks_of(street_map, graph)
     strips = [
         street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)
     ]
-    return [strip for strip in strips if strip.kind == wanted and strip.going == "plain"]
+    return [strip for strip in strips if strip.kind == "crossing" and strip.going == "plain"]
 
 
 def _may_hold(kind: EventKind, strip: Strip) -> bool:
@@ -242,18 +289,23 @@ def _along(
     robot: Robot,
     wanted: Wanted,
 ) -> EventSpot:
-    half_m = strip.width_m / 2
     gate = layout.gate_half_m
     least_m = (layout.half_width_m if gate is None else gate[0]) + wider_m(robot)
-    if half_m < least_m:
-        raise SpecError(f"the sidewalk is narrower than {2.0 * least_m:.2g} m")
+    narrow = SpecError(f"the sidewalk is narrower than {2.0 * least_m:.2g} m")
+    if strip.width_m / 2 < least_m:
+        raise narrow
     assert kind.trigger_m is not None
     trigger_m = _drawn_trigger_m(kind.trigger_m, layout.after_m, wanted.length_m, rng)
     low_m, high_m = event_range_m(trigger_m, layout.after_m, wanted.length_m)
     event_m = low_m + wanted.share * (high_m - low_m)
-    line = straight_along(strip, max(wanted.length_m, event_m), rng)
+    line, half_m = straight_along(strip, max(wanted.length_m, event_m), rng)
+    if half_m < least_m:
+        raise narrow
     pose = line.at(event_m)
-    found = Gate(0.0, half_m) if gate is None else drawn_gate(gate, half_m, pose, rng, robot)
+    found = Gate(0.0, half_m)
+    if gate is not None:
+        pose, half_m = middle_at(strip, pose, half_m)
+        found = drawn_gate(gate, half_m, pose, rng, robot)
     sin, cos = math.sin(pose.heading_rad), math.cos(pose.heading_rad)
     aside = pose.x_m - found.left_m * sin, pose.y_m + found.left_m * cos
     return EventSpot(
@@ -299,21 +351,6 @@ def event_share(scenario: Scenario, kind: EventKind) -> float:
     if high_m - low_m < 0.9 * _BAND_M:
         return 0.5
     return (event.route_s_m - low_m) / (high_m - low_m)
-
-
-def straight_along(strip: Strip, length_m: float, rng: np.random.Generator) -> Polyline:
-    """Draw a straight line of a length along a sidewalk. Raises SpecError if none fits."""
-    line = strip.line[:, :2] if rng.random() < 0.5 else strip.line[::-1, :2]
-    middle = Polyline(line)
-    room_m = middle.length_m - length_m - 2 * ENDS_CLEAR_M
-    if room_m < 0.0:
-        raise SpecError("the sidewalk is too short")
-    start_m = ENDS_CLEAR_M + float(rng.uniform(0.0, room_m))
-    chord = Polyline(np.stack([middle.at(start_m).xy, middle.at(start_m + length_m).xy]))
-    between = middle.points[(middle.s_m > start_m) & (middle.s_m < start_m + length_m)]
-    if any(abs(chord.project(x, y)[1]) > BEND_M for x, y in between.tolist()):
-        raise SpecError("the sidewalk is not straight")
-    return chord
 
 
 def stepped(line: Polyline, length_m: float, step_m: float = 1.0) -> Floats:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import NamedTuple, cast
 
-from cosim.core.errors import MapError, SpecError, unknown
+import msgspec
+
+from cosim.core.errors import MapError, SpecError, UsageError, unknown
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventKinds
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
+from cosim.spec.selection import select_scenarios
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites import long_horizon, reactive, unit
@@ -69,6 +73,31 @@ def suite_on_map(
         scenarios=tuple(passable(scenario, street_map, robot) for scenario in scenarios),
         description=f"Drawn on {name}. {' '.join(left_out)}".strip(),
     )
+
+
+def drawn_on_map(
+    scenario_id: str, called: str, robot: Robot = COURIER, roughness: float = 0.0
+) -> Suite:
+    """Draw the scenario with an id of `suite_on_map` again: the suite with it alone.
+
+    Raises UsageError for an id that is not drawn on this place, and the errors of `suite_on_map`.
+    """
+    where = resolve_place(called, roughness)
+    name = where.map if isinstance(where, CityMap) else where.name
+    of_place = re.fullmatch(rf"(?:(\w+)-)?{re.escape(name)}-(\d{{3,}})", scenario_id)
+    what, seed = of_place.groups() if of_place else ("", "0")
+    if of_place is None or not (what is None or what in EVENT_KINDS or what in STRUCTURES):
+        raise UsageError(
+            f"scenario '{scenario_id}' is none of map '{name}': its scenarios are called "
+            f"EVENT-{name}-SEED, STRUCTURE-{name}-SEED and {name}-SEED, such as "
+            f"straight-{name}-000"
+        )
+    if what in EVENT_KINDS:
+        return suite_on_map("reactive", called, int(seed), 1, roughness, (what,), robot=robot)
+    if what is None:
+        return suite_on_map("long-horizon", called, int(seed), 1, roughness, robot=robot)
+    whole = suite_on_map("unit", called, int(seed), None, roughness, robot=robot)
+    return msgspec.structs.replace(whole, scenarios=select_scenarios(whole, [scenario_id]))
 
 
 class _Drawn(NamedTuple):

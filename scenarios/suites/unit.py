@@ -20,7 +20,7 @@ from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
-from scenarios.suites.drawing import TRIES, Refusals, bare_scenario, first_of
+from scenarios.suites.drawing import SCAN_TRIES, TRIES, Refusals, bare_scenario, first_of
 from scenarios.suites.long_horizon import TURNED_OVER_M, on_car_paths_m, on_road_m
 from scenarios.suites.obstacles import with_obstacles
 from scenarios.suites.reactive import (
@@ -28,8 +28,8 @@ from scenarios.suites.reactive import (
     NO_CROWD,
     over_crossing,
     stepped,
-    straight_along,
 )
+from scenarios.suites.stretches import sidewalks_of, straight_along
 
 Structure = Literal["straight", "curve", "crosswalk"]
 STRUCTURES: Final[tuple[Structure, ...]] = get_args(Structure)
@@ -69,29 +69,43 @@ def build_unit(
     def draw(strips: list[Strip]) -> Scenario:
         strip = strips[int(rng.integers(len(strips)))]
         route, crossings = drawn_along(structure, strip, street_map, graph, rng, robot, way_m)
-        bare = bare_scenario(
-            route,
-            crossings,
-            place,
-            street_map,
-            suite="unit",
-            seed=seed,
-            scenario_id=scenario_id,
-            time_limit_s=LIMIT_S,
-            robot=robot,
-        )
-        whole = msgspec.structs.replace(
-            bare, crowd=NO_CROWD, ends_on_failure=True, structure=structure
-        )
-        return with_obstacles(whole, street_map)
+        return unit_along(structure, route, crossings, place, street_map, seed, scenario_id, robot)
 
     refusals = Refusals()
+    tries = SCAN_TRIES if street_map.scanned else TRIES
     for name in rng.permutation(sorted(classes)).tolist():
-        if found := first_of((partial(draw, classes[name]) for _ in range(TRIES)), refusals):
+        if found := first_of((partial(draw, classes[name]) for _ in range(tries)), refusals):
             return found
     raise SpecError(
         f"no place for '{structure}' on '{street_map.name}' with seed {seed}: {refusals}"
     )
+
+
+def unit_along(
+    structure: Structure,
+    route: Polyline,
+    crossings: tuple[RouteCrossing, ...],
+    place: Place,
+    street_map: StreetMap,
+    seed: int,
+    scenario_id: str,
+    robot: Robot = COURIER,
+) -> Scenario:
+    """Build the scenario along a route of `drawn_along`. Raises SpecError if obstacles do not
+    fit."""
+    bare = bare_scenario(
+        route,
+        crossings,
+        place,
+        street_map,
+        suite="unit",
+        seed=seed,
+        scenario_id=scenario_id,
+        time_limit_s=LIMIT_S,
+        robot=robot,
+    )
+    whole = msgspec.structs.replace(bare, crowd=NO_CROWD, ends_on_failure=True, structure=structure)
+    return with_obstacles(whole, street_map)
 
 
 def lies_on(structure: Structure) -> Literal["sidewalk", "crossing"]:
@@ -105,12 +119,15 @@ def strips_for(
     """Return the strips on which a structure may fit, sorted by id. Nothing is drawn for this
     check.
     """
-    strips = [
-        street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)
-    ]
-    usable = [
-        strip for strip in strips if strip.kind == lies_on(structure) and strip.going == "plain"
-    ]
+    if structure == "straight":
+        usable = sidewalks_of(street_map, graph)
+    else:
+        strips = [
+            street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)
+        ]
+        usable = [
+            strip for strip in strips if strip.kind == lies_on(structure) and strip.going == "plain"
+        ]
     return [strip for strip in usable if _may_be(strip, structure, robot)]
 
 
@@ -125,7 +142,7 @@ def drawn_along(
 ) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
     """Draw a route along a strip, with its crossings. Raises CosimError if it is unsuitable."""
     if structure == "straight":
-        route, crossings = _straight(strip, rng, way_m)
+        route, crossings = _straight(strip, rng, robot, way_m)
     elif structure == "curve":
         route = _round_corner(street_map, graph, strip, rng, robot)
         crossings = ()
@@ -154,14 +171,21 @@ def _may_be(strip: Strip, structure: Structure, robot: Robot) -> bool:
     """Return whether a structure may fit on a strip. Nothing is drawn for this check."""
     if structure == "crosswalk":
         return not strip.signalised and None not in strip.corners
-    return strip.width_m >= robot.width_m + 2.0 * _BESIDE_ROBOT_M
+    return strip.width_m >= _least_width_m(robot)
+
+
+def _least_width_m(robot: Robot) -> float:
+    return robot.width_m + 2.0 * _BESIDE_ROBOT_M
 
 
 def _straight(
-    strip: Strip, rng: np.random.Generator, way_m: tuple[float, float]
+    strip: Strip, rng: np.random.Generator, robot: Robot, way_m: tuple[float, float]
 ) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
     length_m = float(rng.uniform(*way_m))
-    return Polyline(stepped(straight_along(strip, length_m, rng), length_m)), ()
+    line, half_m = straight_along(strip, length_m, rng)
+    if 2.0 * half_m < _least_width_m(robot):
+        raise SpecError(f"the sidewalk is narrower than {_least_width_m(robot):.2g} m")
+    return Polyline(stepped(line, length_m)), ()
 
 
 def _crosswalk(

@@ -6,11 +6,14 @@ import time
 
 import numpy as np
 import pytest
+import shapely
 
 from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
-from cosim.place.scan import HeightGrid, ScanMesh, Splats
+from cosim.place.scan import HeightGrid, ScanArea, ScanMesh, Splats
+from cosim.place.scan_areas import draft_areas, walkable_ground
 from physics.scans.ground import closed_holes, height_grid, slope
+from physics.scans.hidden import behind_walls
 
 SIZE_M = 40.0
 CURB_M = 0.12
@@ -182,3 +185,33 @@ def test_scans_without_ground_are_refused() -> None:
         height_grid(mesh_of(ground[:0]), None, 0.25)
     with pytest.raises(MapError, match=r"0\.5 m, but it must be 0\.1 to 0\.25 m"):
         height_grid(mesh_of(ground), None, 0.5)
+
+
+def front(x0: float, x1: float, y: float, high: float) -> Floats:
+    """A house front as an app scans it: one sheet whose front faces -y, (T, 3, 3)."""
+    a, b = (x0, y), (x1, y)
+    low = [(*a, -0.2), (*b, -0.2)]
+    top = [(*a, high), (*b, high)]
+    return np.array([(low[0], low[1], top[1]), (low[0], top[1], top[0])])
+
+
+def test_ground_behind_house_fronts_is_not_drafted() -> None:
+    """Of a street with ground before and behind its fronts, the draft is the ground before them; drawn
+    areas are not affected."""
+    mesh = mesh_of(
+        sheet(0.0, 0.0, 60.0, 20.0, 1.0, 0.0),
+        front(0.0, 28.0, 8.0, 4.0),
+        front(30.0, 60.0, 8.0, 4.0),
+        box(40.0, 2.0, 40.3, 2.3, 0.0, 3.0),
+    )
+    grid = height_grid(mesh, None, 0.25)
+    hidden = behind_walls(mesh, grid)
+    (area,) = draft_areas(grid, slope(grid), hidden)
+    assert area.polygon.area == pytest.approx(60.0 * 8.0, rel=0.08)
+    # Of the 720 m2 behind, the part in line with the gap between the houses is in view.
+    assert shapely.difference(area.polygon, shapely.box(0.0, 0.0, 60.0, 8.0)).area < 25.0
+    assert not (hidden & ~grid.blocked)[: at(grid, 0.0, 7.5)[0]].any()
+    (with_yard,) = draft_areas(grid, slope(grid))
+    assert with_yard.polygon.area > 1000.0
+    drawn = [ScanArea("sidewalk", shapely.box(5.0, 10.0, 20.0, 15.0))]
+    assert walkable_ground(drawn, grid).area == pytest.approx(75.0)

@@ -11,9 +11,10 @@ import shapely
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, Command, Street
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, ScanMesh
+from cosim.results.run_setup import appearance_of
 from cosim.spec.camera import CameraSpec
 from physics.cameras.bullet_camera import BulletCamera
-from physics.cameras.choice import appearance_of, renderer_of
+from physics.cameras.choice import renderer_of
 from physics.cameras.gl.camera import GlCamera
 from physics.dynamics.world import BulletWorld
 from physics.ground.tiles import tiles_touching

@@ -12,7 +12,7 @@ import pytest
 import shapely
 
 from cosim.core.errors import MapError, UsageError
-from cosim.place.scan import Georeference, ScanArea
+from cosim.place.scan import Georeference, ScanArea, encode_areas
 from cosim.place.scan_areas import (
     corridor,
     draft_areas,
@@ -21,7 +21,6 @@ from cosim.place.scan_areas import (
     read_way,
     to_local,
     walkable_ground,
-    write_areas,
 )
 from tests.support.flat_scans import STREET_GRID, flat_grid, street_areas
 
@@ -38,13 +37,14 @@ def feature(kind: str, geometry: dict[str, Any]) -> dict[str, Any]:
     return {"type": "Feature", "properties": {"kind": kind}, "geometry": geometry}
 
 
-def written(path: Path, *features: dict[str, Any], **members: str) -> Path:
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features, **members}))
+def written(path: Path, *features: dict[str, Any], frame: str | None = "local") -> Path:
+    stated = {} if frame is None else {"frame": frame}
+    path.write_text(json.dumps({"type": "FeatureCollection", **stated, "features": features}))
     return path
 
 
 def test_local_and_wgs84_files_give_equal_areas(tmp_path: Path) -> None:
-    """Areas in degrees near the georeference are those in metres; the frame may be named."""
+    """Areas in degrees near the georeference are those in metres of the map, whose frame is named."""
     degrees = np.array([[13.1955, 55.6982], [13.1957, 55.6982], [13.1957, 55.6983]])
     metres = to_local(degrees, LUND)
     assert metres[1, 0] - metres[0, 0] == pytest.approx(12.57, abs=0.02)
@@ -54,21 +54,62 @@ def test_local_and_wgs84_files_give_equal_areas(tmp_path: Path) -> None:
         for r in (degrees, metres)
     ]
     files = [
-        written(tmp_path / f"{i}.geojson", feature("sidewalk", ring))
-        for i, ring in enumerate(rings)
+        written(tmp_path / f"{i}.geojson", feature("sidewalk", ring), frame=frame)
+        for i, (ring, frame) in enumerate(zip(rings, (None, "local"), strict=True))
     ]
     one, other = (read_areas(path, GRID, LUND)[0].polygon for path in files)
     assert shapely.hausdorff_distance(one, other) < 1e-6
     named = written(tmp_path / "named.geojson", feature("sidewalk", rings[0]), frame="wgs84")
-    with pytest.raises(MapError, match=r"WGS84, but the scan has no georeference"):
-        read_areas(named, GRID, None)
+    assert read_areas(named, GRID, LUND)[0].polygon.equals(one)
+
+
+FAR = Georeference(latitude_deg=-33.0, longitude_deg=151.0)
+DEGREES = square(13.1955, 55.6982, 2e-4)
+METRES = square(3.0, 2.0)
+CONFUSED: dict[str, tuple[dict[str, Any], str | None, Georeference | None, str]] = {
+    "metres without frame": (
+        METRES,
+        None,
+        LUND,
+        r"3 to 7 and 2 to 6, are no degrees in a small area: for metres .* \"frame\": \"local\"",
+    ),
+    "metres without frame and georeference": (METRES, None, None, r"are no degrees"),
+    "metres as degrees": (METRES, "wgs84", LUND, "no degrees .* but its frame is 'wgs84'"),
+    "degrees without georeference": (
+        DEGREES,
+        None,
+        None,
+        r"13\.1955 to 13\.1957 and 55\.6982 .*, are degrees, .* --georeference LATITUDE,LONGITUDE",
+    ),
+    "degrees as metres": (DEGREES, "local", LUND, "are degrees, but its frame is 'local'"),
+    "degrees as metres without georeference": (DEGREES, "local", None, "with --georeference"),
+    "degrees elsewhere": (DEGREES, None, FAR, "far from the scan, at longitude 151 .* -33"),
+}
+
+
+@pytest.mark.parametrize("name", CONFUSED)
+def test_metres_and_degrees_are_not_confused(tmp_path: Path, name: str) -> None:
+    """Areas and paths in another unit than their frame are refused with their range and remedy."""
+    geometry, frame, there, words = CONFUSED[name]
+    path = written(tmp_path / "a.geojson", feature("sidewalk", geometry), frame=frame)
+    with pytest.raises(MapError, match=words):
+        read_areas(path, GRID, there)
+    line = {"type": "LineString", "coordinates": geometry["coordinates"][0][:3]}
+    path = written(tmp_path / "way.geojson", feature("", line), frame=frame)
+    with pytest.raises(MapError, match=r"are (no )?degrees"):
+        read_way(path, there)
+    if frame == "local" and there is None:
+        route = {"route": line["coordinates"]}
+        (tmp_path / "way.json").write_text(json.dumps(route))
+        with pytest.raises(MapError, match=r"way\.json: .* are degrees, .* --georeference"):
+            read_way(tmp_path / "way.json", there)
 
 
 def test_areas_survive_writing_and_reading(tmp_path: Path) -> None:
     """What is written for editing reads back as it was, holes included."""
     holed = shapely.box(1, 1, 9, 9) - shapely.box(3, 3, 5, 5)
     areas = [ScanArea("sidewalk", holed), ScanArea("obstacle", shapely.box(6, 6, 7, 7))]
-    write_areas(areas, tmp_path / "areas.geojson")
+    (tmp_path / "areas.geojson").write_bytes(encode_areas(areas, step_m=0.01))
     read = read_areas(tmp_path / "areas.geojson", GRID, LUND)
     assert [area.kind for area in read] == ["sidewalk", "obstacle"]
     assert all(a.polygon.equals(b.polygon) for a, b in zip(areas, read, strict=True))
@@ -126,7 +167,9 @@ def test_walked_paths_of_both_formats_are_equal(tmp_path: Path) -> None:
     assert way[0] == pytest.approx(to_local(origin, LUND)[0])
     line = {"type": "LineString", "coordinates": [*origin.tolist(), [13.1957, 55.6983]]}
     path = written(
-        tmp_path / "way.geojson", {"type": "Feature", "properties": {}, "geometry": line}
+        tmp_path / "way.geojson",
+        {"type": "Feature", "properties": {}, "geometry": line},
+        frame=None,
     )
     assert read_way(path, LUND)[0] == pytest.approx(way[0])
     (tmp_path / "short.json").write_text('{"route": [[0, 0]]}')
@@ -166,18 +209,16 @@ def test_walkable_ground_is_drawn_ground_less_what_stands() -> None:
         walkable_ground(street_areas(), nothing)
 
 
-def test_drafts_are_large_level_free_pieces() -> None:
-    """Steep, blocked and unmeasured ground is left out, and specks too."""
+def test_a_draft_is_the_largest_level_free_piece() -> None:
+    """Steep, blocked and unmeasured ground is left out, and so is what is behind it."""
     grade = np.zeros(GRID.heights.shape, dtype=np.float32)
     grade[:, 80:84] = 1.0  # a step at x = 20 to 21
     blocked = GRID.blocked.copy()
     blocked[36:44, 40:48] = True  # x 10 to 12, y 9 to 11
-    areas = draft_areas(dataclasses.replace(GRID, blocked=blocked), grade)
-    assert len(areas) == 2
-    for area in areas:
-        assert 360.0 < area.polygon.area < 396.0
-        assert not area.polygon.intersects(shapely.box(20.1, 0, 20.7, 20))
-        assert not area.polygon.contains(shapely.Point(11.0, 10.0))
+    (area,) = draft_areas(dataclasses.replace(GRID, blocked=blocked), grade)
+    assert 360.0 < area.polygon.area < 396.0
+    assert not area.polygon.intersects(shapely.box(20.1, 0, 40.0, 20))
+    assert not area.polygon.contains(shapely.Point(11.0, 10.0))
     with pytest.raises(MapError, match="no level ground of 10 m2"):
         draft_areas(GRID, grade + 1.0)
 

@@ -21,6 +21,7 @@ from cosim.results.compare import (
     groups_of,
 )
 from cosim.results.metrics import METRICS, WORST
+from cosim.results.record import ScanLook
 from cosim.results.run_folder import RunFolder, read_records, read_spec
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event
@@ -171,6 +172,28 @@ def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path
     a, b = (f"front, {width} x 48 px, 75 deg, at 4 Hz" for width in (64, 96))
     assert f"a sees by {a}; b by {b}: a difference may be the camera's" in told.notes
     assert not any("sees by" in note for note in compare_runs([runs / "a", large]).notes)
+
+
+def test_another_look_of_a_scan_is_reported(runs: Path, tmp_path: Path) -> None:
+    """Splats against mesh, other splats or another sun are named; equal looks are not."""
+    looks = {
+        "a": ScanLook(
+            appearance="splats",
+            splats="0123456789abcdef",
+            sun_azimuth_deg=215.0,
+            sun_elevation_deg=38.0,
+        ),
+        "b": ScanLook(appearance="mesh"),
+    }
+    a, b = (rewritten(runs / name, tmp_path / name, scan=look) for name, look in looks.items())
+    assert (
+        "a and b saw scanned places differently, a difference may be the look's (--appearance, or "
+        "another import): in s-000, splats 0123456789abcdef with the sun at 215, 38 and the mesh "
+        "without sun"
+    ) in compare_runs([a, b]).notes
+    same = rewritten(runs / "b", tmp_path / "same", scan=looks["a"])
+    assert not any("saw scanned" in note for note in compare_runs([a, same]).notes)
+    assert not any("saw scanned" in note for note in compare_runs([a, runs / "b"]).notes)
 
 
 def test_a_run_with_injected_pedestrians_is_marked(

@@ -610,6 +610,55 @@ def test_areas_come_from_openstreetmap_through_the_georeference(tmp_path: Path) 
     assert "OpenStreetMap" in " ".join(str(one) for one in checked.findings)
 
 
+def test_a_heading_turns_the_scan_to_north(tmp_path: Path) -> None:
+    """Latitude and longitude alone state the assumed heading and the remedy; with a heading, +y of the
+    scan points there, and a system of coordinates has none."""
+    (tmp_path / "mesh.glb").write_bytes(glb(street()))
+
+    def loaded(words: str) -> scan_sources.LoadedScan:
+        given = {"georeference": parse_georeference(words)}
+        return scan_sources.load_mesh(tmp_path, read_options(tmp_path, given))[0]
+
+    plain, stated, east = (loaded(f"55.698,13.195{rest}") for rest in ("", ",0", ",90"))
+    said = [one.words for one in plain.findings if "is taken as north, heading 0" in one.words]
+    assert len(said) == 1 and "third number of --georeference" in said[0]
+    assert not any("taken as north" in one.words for one in (*stated.findings, *east.findings))
+    assert np.array_equal(plain.mesh.vertices, stated.mesh.vertices)
+    turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    there = np.array(sorted((plain.mesh.vertices @ turn.T).round(4).tolist()))
+    assert np.array(sorted(east.mesh.vertices.round(4).tolist())) == pytest.approx(there, abs=1e-3)
+    with pytest.raises(CosimError, match=r"heading_deg is 720, but must be -360 to 360"):
+        loaded("55.698,13.195,720")
+    (tmp_path / "scan.json").write_text('{"georeference": {"crs": "EPSG:25833", "heading_deg": 3}}')
+    with pytest.raises(CosimError, match="EPSG:25833 has its own north: leave it out"):
+        scan_sources.load_mesh(tmp_path, read_options(tmp_path, {}))
+
+
+@pytest.mark.parametrize("heading", ["", ",33"])
+def test_the_remedy_of_a_tilted_scan_levels_it(scan: Path, heading: str) -> None:
+    """The refusal has the transforms for scan.json; with them the ground is level, and the splats are
+    on the mesh."""
+    turn = _turned(12.0)
+    (scan / "mesh.glb").write_bytes(glb(turn(street())))
+    cloud = splats_of(street())
+    cloud.centres = turn(Street(cloud.centres, street().triangles, street().colours)).vertices
+    (scan / "splats.ply").write_bytes(gaussian_ply(cloud))
+    there = {"georeference": parse_georeference(f"55.698,13.195{heading}")}
+    (words,) = _refused(_words(scan, **there))
+    found = re.search(r'this in scan\.json, in place of scale and up: ("transform".*\]\])$', words)
+    assert found is not None, words
+    (scan / "scan.json").write_text("{" + found[1] + "}")
+    again = _words(scan, splat_scale=None, splat_up=None, areas=None, **there)
+    assert _refused(again) == []
+    (level,) = (one for one in again if "degrees off the up axis" in one)
+    assert float(level.split()[4]) < 0.3
+    assert any(re.search(r"splats to mesh: 0\.0", one) for one in again)
+
+
+def _refused(said: list[str]) -> list[str]:
+    return [words for words in said if words.startswith("refused")]
+
+
 def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
     """An .obj with its texture in another file is read from a folder, with the texture's colour."""
     from PIL import Image

@@ -10,18 +10,19 @@ from pathlib import Path
 import pytest
 import shapely
 
-from cosim.core.errors import SpecError
+from cosim.core.errors import SpecError, UsageError
 from cosim.place.scan import ScanArea
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.scenario import CityMap
+from cosim.spec.scenario import CityMap, write_suite
 from scenarios.places.chosen_areas import replace_areas
 from scenarios.places.nets import place
 from scenarios.places.scan_import import import_scan
 from scenarios.places.scan_options import ScanOptions, read_options
 from scenarios.runs.net_transfer import Fetched, Nets
+from scenarios.suites.catalog import one_scenario
 from scenarios.suites.long_horizon import build_long_horizon
-from scenarios.suites.sample import suite_on_map
+from scenarios.suites.sample import drawn_on_map, suite_on_map
 from sumo_nets.maps.map_store import map_hash, map_net, maps_folder, read_map
 from sumo_nets.maps.place_names import resolve_place
 from tests.conftest import Cosim
@@ -112,7 +113,8 @@ def test_areas_of_a_stored_scan_are_replaced(cosim: Cosim, scan: str, tmp_path: 
     features = json.loads(draft.read_text())["features"]
     assert features and features[0]["properties"]["kind"] == "sidewalk"
     x, y = before.walkable.centroid.x, before.walkable.centroid.y
-    way = {"type": "LineString", "coordinates": [[x - 6.0, y], [x + 6.0, y]]}
+    points = [[x - 6.0, y], [x + 6.0, y]]
+    way = {"type": "LineString", "frame": "local", "coordinates": points}
     (tmp_path / "way.geojson").write_text(json.dumps(way))
     done = cosim(
         "scan", "areas", "replaced", "--way", str(tmp_path / "way.geojson"), "--width", "2"
@@ -148,3 +150,31 @@ def test_scans_are_sent_to_workers_whole(
     got = read_map(where)
     assert got.net_hash == sent.net_hash and got.walkable.equals(sent.walkable)
     assert sorted(p.name for p in (maps_folder() / scan / "scan").iterdir()) == names
+
+
+def test_a_drawn_scenario_is_found_by_its_id(cosim: Cosim, tmp_path: Path) -> None:
+    """`cosim look` draws it again by --map, or finds it in the run folder; the errors name both."""
+    suites = {
+        kind: suite_on_map(kind, "flat-street", 3, count)
+        for kind, count in (("reactive", 4), ("unit", None), ("long-horizon", 1))
+    }
+    for whole in suites.values():
+        for scenario in whole.scenarios:
+            assert drawn_on_map(scenario.id, "flat-street").scenarios == (scenario,)
+    with pytest.raises(
+        UsageError, match=r"is none of map 'flat-street': .* straight-flat-street-0"
+    ):
+        drawn_on_map("frontal-corridor-003", "flat-street")
+    wanted = suites["unit"].scenarios[1]
+    write_suite(suites["unit"], tmp_path / "scenarios.json")
+    assert one_scenario(str(tmp_path), which=wanted.id)[0].scenarios == (wanted,)
+    assert one_scenario(wanted.id, str(tmp_path))[0].scenarios == (wanted,)
+    picture = tmp_path / "look.png"
+    options = ("--map", "flat-street", "--size", "64x36", "-o", str(picture))
+    done = cosim("look", wanted.id, *options)
+    assert done.returncode == 0, done.stderr
+    assert picture.stat().st_size > 500 and wanted.id in done.stdout
+    lost = cosim("look", wanted.id)
+    assert lost.returncode == 2 and "give the run folder by --suite" in " ".join(
+        lost.stderr.split()
+    )

@@ -146,7 +146,9 @@ def _drive(
             look,
         )
         people = (
-            _somebody(route, 0.5 * route.length_m + _PERSON_M) if scene == "person" else NO_PEOPLE
+            _standing_person(route, 0.5 * route.length_m + _PERSON_M)
+            if scene == "person"
+            else NO_PEOPLE
         )
         seen = []
         for number in range(count):
@@ -165,7 +167,7 @@ def _drive(
     return Drive(scene, tuple(seen))
 
 
-def _somebody(route: Polyline, s_m: float) -> People:
+def _standing_person(route: Polyline, s_m: float) -> People:
     """Return one adult in the middle of the way, facing the robot."""
     pose = route.at(s_m)
     return People.of(
