@@ -205,13 +205,13 @@ class Trainer:
         behind = shot.high * sky + (1.0 - shot.high) * ground
         return found[0, ..., :3] + (1.0 - alpha[0]) * behind, found[0, ..., 3]
 
-    @torch.no_grad()
     def draw(self, photo: Photo) -> NDArray[np.float32]:
         """Return a picture (H, W, 3) from the place of a photo, 0 to 1, without its exposure."""
-        drawn, _ = self._drawn(self._shot(photo), torch.zeros(3, device=self._settings.device))
+        with torch.no_grad():
+            black = torch.zeros(3, device=self._settings.device)
+            drawn, _ = self._drawn(self._shot(photo), black)
         return np.asarray(drawn.clamp(0.0, 1.0).cpu().numpy(), dtype=np.float32)
 
-    @torch.no_grad()
     def rows(self) -> NDArray[np.void]:
         """Return the splats as rows of a 3DGS .ply file, in the frame of the model."""
         params = {name: one.detach().cpu().numpy() for name, one in self._params.items()}
@@ -236,7 +236,8 @@ class Trainer:
         if len(points) > room:
             chosen = np.sort(self._rng.choice(len(points), room, replace=False))
             points, colours = points[chosen], colours[chosen]
-        far = cKDTree(points).query(points, k=min(4, len(points)))[0][:, 1:].mean(axis=1)
+        near: Floats = np.asarray(cKDTree(points).query(points, k=min(4, len(points)))[0])
+        far = near[:, 1:].mean(axis=1)
         size = np.log(np.clip(far, 1e-4 * self._unit, 0.5 * self._unit))
         whole = {
             "means": points,
