@@ -77,6 +77,7 @@ class _Persons(Protocol):
     ) -> None: ...
 
     setSpeed: Callable[[str, float], None]
+    setMinGap: Callable[[str, float], None]
     remove: Callable[[str], None]
 
 
@@ -84,6 +85,12 @@ class _Cars(Protocol):
     getIDList: Callable[[], Sequence[str]]
     getNextTLS: Callable[[str], Sequence[tuple[str, int, float, str]]]
     getWaitingTime: Callable[[str], float]
+    getLaneID: Callable[[str], str]
+    getLanePosition: Callable[[str], float]
+    getRoute: Callable[[str], Sequence[str]]
+    getRouteIndex: Callable[[str], int]
+    setSpeed: Callable[[str, float], None]
+    setSpeedMode: Callable[[str, int], None]
 
     def add(
         self, name: str, route: str, /, *, typeID: str, departLane: str, departPos: str

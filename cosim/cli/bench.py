@@ -172,6 +172,7 @@ def bench_people(jobs: int) -> None:
     _show_by_density(found)
     _show_free(found)
     _show_nearest(found)
+    _show_following(found)
     _show_gaps(found)
     for note in _NOTES:
         out.print(note, highlight=False)
@@ -228,6 +229,17 @@ def _show_nearest(found: Comparison) -> None:
     heads = (_percent(NEAREST_PERCENT), "ours", "dist.", "in groups", "persons/m2")
     columns = [*tables.names(""), *tables.figures(*heads)]
     tables.show(out, columns, rows, title="Nearest neighbour, m")
+
+
+def _show_following(found: Comparison) -> None:
+    from scenarios.tools.bench.people import FOLLOWED, FOLLOWING_BIN_M, largest_share, mean_sd
+
+    out.print(
+        f"People that follow each other within 2 m, at {FOLLOWED.density:g} persons/m2 in one "
+        f"direction: {_spread(mean_sd(found.following_m))} m apart; at most "
+        f"{largest_share(found.following_m):.1%} within {100 * FOLLOWING_BIN_M:g} cm.",
+        highlight=False,
+    )
 
 
 def _show_gaps(found: Comparison) -> None:

@@ -83,8 +83,8 @@ class Island(msgspec.Struct, frozen=True):
 class Problem(msgspec.Struct, frozen=True):
     """Problem at one strip or corner.
 
-    kind: island, narrow, on_road, stacked, driven_over, steep, never_green, always_green, level or
-        misfit.
+    kind: island, narrow, on_road, stacked, driven_over, steep, short_green, never_green,
+        always_green, level or misfit.
     piece: id of the strip or corner.
     """
 
@@ -174,6 +174,7 @@ def check_map(
         *_problems("stacked", stacked),
         *_corner_problems("driven_over", driven_over),
         *_problems("steep", [s for s in strips if s.id in street_map.steep]),
+        *_problems("short_green", [s for s in crossings if s.short_green]),
     ]
     if facts is not None:
         for kind in ("never_green", "always_green", "levels", "misfits"):
@@ -211,6 +212,7 @@ def check_map(
             *_elevation_notes(street_map),
             *_stairs_notes(sidewalks),
             *_driven_over_notes(driven_over),
+            *_short_green_notes(crossings),
             *_net_notes(facts),
         ),
         problems=tuple(problems),
@@ -319,6 +321,16 @@ def _driven_over_notes(corners: Mapping[str, object]) -> list[str]:
     return [
         f"cars turn over {len(corners)} corners, crossings apart: routes keep off there: "
         f"{_first_few([*corners])}"
+    ]
+
+
+def _short_green_notes(crossings: Sequence[Strip]) -> list[str]:
+    short = [s.id for s in crossings if s.short_green]
+    if not short:
+        return []
+    return [
+        f"{len(short)} crossings have a green too short to walk, by a program that is not fixed: "
+        f"long routes keep off them: {_first_few(short)}"
     ]
 
 

@@ -72,6 +72,7 @@ class Strip:
     driveways: arc lengths of `line` at which driveways cross the sidewalk, in metres.
     going: surface. Bridges and tunnels share their place on the map with another level.
     plan: program of a crossing's signal; None without a signal, or if only SUMO knows its state.
+    short_green: whether a signal without a plan has a green too short to walk.
     """
 
     id: str
@@ -90,6 +91,7 @@ class Strip:
     driveways: tuple[float, ...] = ()
     going: Literal["plain", "steps", "bridge"] = "plain"
     plan: SignalPlan | None = None
+    short_green: bool = False
 
     @property
     def length_m(self) -> float:

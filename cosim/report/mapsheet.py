@@ -38,6 +38,7 @@ MARKS: Final[dict[str, tuple[Rgb255, str]]] = {
     "on_road": ((220, 0, 0), "mostly on the road"),
     "stacked": ((250, 90, 60), "over or under a road"),
     "driven_over": ((150, 0, 90), "cars turn over the corner"),
+    "short_green": ((200, 120, 120), "green too short to walk"),
     "never_green": ((120, 0, 0), "signal never green"),
     "always_green": ((0, 120, 200), "signal always green"),
     "misfit": ((90, 60, 30), "signal without a program that fits"),

@@ -290,7 +290,9 @@ def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], S
 
 
 def avoided_strips(street_map: StreetMap) -> set[str]:
-    """Return the strips that searches exclude: stairs, bridges, tunnels, and sidewalks on roads."""
+    """Return the strips that searches exclude: stairs, bridges, tunnels, sidewalks on roads, and
+    crossings whose green is too short to walk.
+    """
     sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
     shares = dict(
         zip([s.id for s in sidewalks], on_road_shares(street_map, sidewalks), strict=True)
@@ -298,7 +300,7 @@ def avoided_strips(street_map: StreetMap) -> set[str]:
     return {
         s.id
         for s in street_map.strips.values()
-        if s.going != "plain" or shares.get(s.id, 0.0) > AVOIDED_SHARE
+        if s.going != "plain" or s.short_green or shares.get(s.id, 0.0) > AVOIDED_SHARE
     }
 
 
@@ -369,6 +371,8 @@ def draw_way(
         raise SpecError("the way passes its goal")
     if any(street_map.strips[port.strip].going != "plain" for port in way):
         raise SpecError("the way leads over stairs, a bridge or a tunnel")
+    if any(street_map.strips[port.strip].short_green for port in way):
+        raise SpecError("the way crosses at a signal whose green is too short to walk")
     crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
     if crossed < _least_crossings(street_map, target_m):
         raise SpecError("the way crosses too few streets")

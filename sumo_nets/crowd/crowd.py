@@ -37,6 +37,7 @@ from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets import engine
+from sumo_nets.crowd.braking import BrakingForRobot
 from sumo_nets.crowd.demand import (
     LEAVE_MARGIN_M,
     VEHICLE_REACH_M,
@@ -47,6 +48,7 @@ from sumo_nets.crowd.demand import (
 )
 from sumo_nets.crowd.demand_log import Entrances
 from sumo_nets.crowd.empty_street import TICK_MS, sumo_start
+from sumo_nets.crowd.following_gaps import FollowingGaps
 from sumo_nets.crowd.free_space import InnerGround
 from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.lights import Signals, SumoLights, WaitingSpots
@@ -164,8 +166,10 @@ class SumoCrowd(Crowd):
         tick = self.street.tick
         with sumo_errors(f"stepping from tick {tick}"):
             x_m, y_m = robot.pose[:2]
+            self._braking.update(self._found[1], None if absent else robot.pose)
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
+                self._gaps.keep(persons)
                 self._pedestrians.roll(
                     x_m, y_m, _seen(sumo.person.getWaitingTime, persons), self._waits_at_red
                 )
@@ -207,7 +211,9 @@ class SumoCrowd(Crowd):
         self._signals = Signals(SumoLights(sumo, self._map), self._map)
         self._kerbs = WaitingSpots(self._map)
         self._together = GroupCohesion(sumo, self._map.strips, TICK_MS / 1000)
+        self._gaps = FollowingGaps(sumo)
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
+        self._braking = BrakingForRobot(sumo, self._half_m, self._drivers.size_m, TICK_MS / 1000)
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
@@ -230,10 +236,16 @@ class SumoCrowd(Crowd):
         self.entrances = Entrances()
         if self._before is not None:
             return replayed_demand(
-                sumo, self._before, self._map, self._spec, self._closed, self._together
+                sumo,
+                self._before,
+                self._map,
+                self._spec,
+                self._closed,
+                self._together,
+                self._gaps,
             )
         logged = sumo, self.entrances, self._map, self._spec
-        people = Pedestrians(*logged, rng_persons, self._closed, self._together)
+        people = Pedestrians(*logged, rng_persons, self._closed, self._together, self._gaps)
         return people, Drivers(*logged, rng_vehicles)
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:

@@ -15,6 +15,7 @@ from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import walk_graph_of
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
+from sumo_nets.crowd.following_gaps import FollowingGaps
 from sumo_nets.crowd.free_space import EntrySpot, LocalWalkableArea, Spots
 from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
@@ -86,6 +87,7 @@ class Pedestrians:
         rng: np.random.Generator,
         closed: frozenset[Port],
         together: GroupCohesion,
+        gaps: FollowingGaps,
     ) -> None:
         self._engine = engine
         self._entrances = entrances
@@ -93,6 +95,7 @@ class Pedestrians:
         self._rng = rng
         self._closed = closed
         self._together = together
+        self._gaps = gaps
         self.ages = entrances.ages
         self._graph = walk_graph_of(street_map)
         self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
@@ -106,7 +109,8 @@ class Pedestrians:
         )
         self._edge_spots = Spots(_at_edge(street_map) if street_map.scanned else (), step_m=2.0)
         self._room = None if spec.density is None else LocalWalkableArea(street_map, spec.radius_m)
-        self._groups = GroupDraws(spec, rng.spawn(1)[0])
+        rng_groups, self._rng_gaps = rng.spawn(2)
+        self._groups = GroupDraws(spec, rng_groups)
 
     def fill(self, x_m: float, y_m: float) -> None:
         """Let all persons enter before the episode."""
@@ -205,8 +209,9 @@ class Pedestrians:
             walk = self._one_way(walk, forward)
             speed_mps = group.speed_at(drawn_mps)
             names = [self._name(age) for age in group.ages]
-            for name, xy in zip(names, places, strict=True):
-                self._add(name, spot, walk, speed_mps, xy)
+            gaps_m = group.gaps_m(self._rng_gaps)
+            for name, xy, gap_m in zip(names, places, gaps_m, strict=True):
+                self._add(name, spot, walk, speed_mps, xy, gap_m)
             self._together.join(names, speed_mps, walk)
             self._groups.entered()
             taken = np.concatenate([taken, places])
@@ -241,16 +246,34 @@ class Pedestrians:
         return name
 
     def _add(
-        self, name: str, spot: EntrySpot, walk: list[str], speed_mps: float, xy: tuple[float, float]
+        self,
+        name: str,
+        spot: EntrySpot,
+        walk: list[str],
+        speed_mps: float,
+        xy: tuple[float, float],
+        gap_m: float,
     ) -> None:
         first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
         until_m = _END_SHARES[self._dead_end(walk[-1])] * last_m
         angle_deg = heading_to_sumo(spot.pose.heading_rad)
         entry = PersonEntry(
-            name, spot.edge, spot.share * first_m, tuple(walk), until_m, speed_mps, xy, angle_deg
+            name,
+            spot.edge,
+            spot.share * first_m,
+            tuple(walk),
+            until_m,
+            speed_mps,
+            xy,
+            angle_deg,
+            gap_m,
         )
         self._entrances.people[self._engine.simulation.getTime()].append(entry)
+        self._let_in(entry)
+
+    def _let_in(self, entry: PersonEntry) -> None:
         entry.enter(self._engine)
+        self._gaps.enter(entry.name, entry.gap_m)
 
     def _dead_end(self, edge: str) -> int | None:
         """Return the end of a walk's last edge at the edge of a scan; None elsewhere."""
@@ -380,11 +403,14 @@ def replayed_demand(
     spec: CrowdSpec,
     closed: frozenset[Port],
     together: GroupCohesion,
+    gaps: FollowingGaps,
 ) -> tuple[ReplayedPedestrians, ReplayedDrivers]:
     """Return pedestrians and vehicles that repeat the entries and exits of `before` at the same
     times."""
     unused_rng = np.random.default_rng(0)
-    people = ReplayedPedestrians(engine, before, street_map, spec, unused_rng, closed, together)
+    people = ReplayedPedestrians(
+        engine, before, street_map, spec, unused_rng, closed, together, gaps
+    )
     return people, ReplayedDrivers(engine, before, street_map, spec, unused_rng)
 
 
@@ -409,7 +435,7 @@ class ReplayedPedestrians(Pedestrians):
         entered = []
         for one in self._entrances.people.get(self._engine.simulation.getTime(), ()):
             if isinstance(one, PersonEntry):
-                one.enter(self._engine)
+                self._let_in(one)
                 entered.append(one)
             elif one in here:
                 self._engine.person.remove(one)

@@ -26,6 +26,7 @@ class PersonEntry(NamedTuple):
     mps: walking speed, m/s.
     xy: start position, metres.
     angle_deg: SUMO's angle, degrees.
+    gap_m: distance that the person keeps to people ahead, from front to back, metres.
     """
 
     name: str
@@ -36,6 +37,7 @@ class PersonEntry(NamedTuple):
     mps: float
     xy: tuple[float, float]
     angle_deg: float
+    gap_m: float
 
     def enter(self, engine: Sumo) -> None:
         """Add the person to SUMO. SUMO starts everybody at the right edge, so the person is

@@ -35,6 +35,12 @@ GROUP_STRIPE_M: Final = 0.64
 ROW_M: Final = 0.8
 """Distance between the rows of a group, metres."""
 
+GAP_M: Final = (0.3, 1.5)
+"""Range of the gaps that single walkers keep to people ahead, from front to back, metres. SUMO's
+people are 0.215 m long, so middles are 0.5 to 1.7 m apart."""
+GROUP_GAP_M: Final = (0.3, 0.55)
+"""Range of the gaps of a group's members, metres: less than the distance between rows."""
+
 
 CHILDREN_SHARE = 0.10
 """Share of children where the spec sets no ages."""
@@ -73,6 +79,12 @@ class PersonGroup(NamedTuple):
             for row, n in enumerate(rows)
             for k in range(n)
         ]
+
+    def gaps_m(self, rng: np.random.Generator) -> list[float]:
+        """Draw the gap of each member to people ahead, metres."""
+        low_m, high_m = GAP_M if self.size == 1 else GROUP_GAP_M
+        gaps_m: list[float] = rng.uniform(low_m, high_m, self.size).tolist()
+        return gaps_m
 
 
 class GroupDraws:

@@ -12,14 +12,17 @@ from collections.abc import Mapping
 from typing import Final
 
 from sumo_nets.city.signals import ALL_RED_S, CLEARING_MPS, WALK_S, YELLOW_S
-from sumo_nets.net.net_facts import GREEN_LETTERS, crossing_links, crossing_signals
+from sumo_nets.net.net_facts import crossing_links, crossing_signals
+from sumo_nets.net.signal_plans import (
+    GREEN_LETTERS,
+    REACTION_S,
+    WALK_MPS,
+    greens,
+    required_green_s,
+)
 
 PLAIN_TYPES = ("static", "actuated", "delay_based")
 """Program types that run their phases in order, so that one can be added."""
-_WALK_MPS: Final = 1.2
-"""Walking speed for the required length of a green, m/s."""
-_REACTION_S: Final = 4.0
-"""Latest start within a green for which it must suffice, seconds."""
 _SHORTEST_S: Final = 10.0
 """Other greens are not shortened below this duration, seconds."""
 _PHASE: Final = frozenset(("duration", "state", "name"))
@@ -134,7 +137,7 @@ def extend_greens(root: ET.Element) -> list[str]:
             else "no cycle is longer"
         )
         changes.append(
-            f"green too short to walk at {_WALK_MPS:g} m/s after {_REACTION_S:g} s: longer for "
+            f"green too short to walk at {WALK_MPS:g} m/s after {REACTION_S:g} s: longer for "
             f"{crossings} crossings of {len(changed)} signals, by up to {longest_s:g} s; {cycles}"
         )
     if left:
@@ -153,7 +156,7 @@ def _required_green_s(root: ET.Element) -> dict[str, dict[int, float]]:
     }
     needs: dict[str, dict[int, float]] = defaultdict(dict)
     for crossing, (signal, link) in crossing_links(root).items():
-        need_s = lengths_m.get(crossing, 0.0) / _WALK_MPS + _REACTION_S
+        need_s = required_green_s(lengths_m.get(crossing, 0.0))
         needs[signal][link] = max(need_s, needs[signal].get(link, 0.0))
     return dict(needs)
 
@@ -188,23 +191,8 @@ def _short_links(logic: ET.Element, wanted: Mapping[int, float]) -> list[int]:
     return [
         link
         for link, need_s in wanted.items()
-        if any(sum(durations[p] for p in run) < need_s - 1e-6 for run in _greens(states, link))
+        if any(sum(durations[p] for p in run) < need_s - 1e-6 for run in greens(states, link))
     ]
-
-
-def _greens(states: list[str], link: int) -> list[list[int]]:
-    """Return the phases of each green of a link, in cyclic order; empty for permanent green."""
-    shown = [link < len(state) and state[link] in GREEN_LETTERS for state in states]
-    if all(shown):
-        return []
-    runs: list[list[int]] = []
-    first = shown.index(False)
-    for k in range(first, first + len(shown)):
-        if shown[k % len(shown)]:
-            if not shown[(k - 1) % len(shown)]:
-                runs.append([])
-            runs[-1].append(k % len(shown))
-    return runs
 
 
 def _lengthened(
@@ -212,7 +200,7 @@ def _lengthened(
 ) -> list[float] | None:
     """Return durations with sufficient greens; None if a green cannot be extended."""
     states = [phase.get("state", "") for phase in logic.findall("phase")]
-    runs = [(run, need_s) for link, need_s in wanted.items() for run in _greens(states, link)]
+    runs = [(run, need_s) for link, need_s in wanted.items() for run in greens(states, link)]
     after = list(durations)
     for run, need_s in runs:
         lack_s = need_s - sum(after[p] for p in run)

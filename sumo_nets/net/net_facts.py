@@ -20,9 +20,7 @@ from cosim.place.terrain import IMPLAUSIBLE_GRADE
 from sumo_nets.net.elevation import off_ground
 from sumo_nets.net.net_file import allows
 from sumo_nets.net.raw_file import describe_root, net_bytes
-
-GREEN_LETTERS = frozenset("Gg")
-"""Letters of signal states in which a link may go."""
+from sumo_nets.net.signal_plans import GREEN_LETTERS
 
 
 def read_facts(path: Path) -> NetFacts:

@@ -189,12 +189,20 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
             polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], end_corners
         )
     plans = raw.programs.plans(raw.links, signalised)
+    lengths_m = {
+        name: float(np.hypot(*np.diff(lines[k], axis=0).T).sum())
+        for k, name in enumerate(walk)
+        if name in signalised
+    }
+    short = raw.programs.short_greens(raw.links, lengths_m) - plans.keys()
     strips: dict[str, Strip] = {}
     for k, (name, (edge, _, index)) in enumerate(walk.items()):
         ends = ports.get((name, 0)), ports.get((name, 1))
         built = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends)
         strips[name] = (
-            replace(built, signalised=True, plan=plans.get(name)) if name in signalised else built
+            replace(built, signalised=True, plan=plans.get(name), short_green=name in short)
+            if name in signalised
+            else built
         )
     roads = {
         lane["id"]: Lane(

@@ -18,8 +18,14 @@ from cosim.place.street_map import SignalPlan
 _LOGIC: Final = frozenset(("id", "type", "programID", "offset"))
 _PHASE: Final = frozenset(("duration", "state", "name"))
 _SECONDS: Final = re.compile(r"(-?\d{1,9})(?:\.(\d{1,3}))?")
-_WALK: Final = "Gg"
+GREEN_LETTERS: Final = frozenset("Gg")
+"""Letters of signal states in which a link may go."""
+WALK_MPS: Final = 1.2
+"""Walking speed for the required length of a green, m/s."""
+REACTION_S: Final = 4.0
+"""Latest start within a green for which it must suffice, seconds."""
 _OFF: Final = "off"
+_ROUNDING_S: Final = 1e-6
 
 
 @dataclass(slots=True)
@@ -82,8 +88,61 @@ class SignalPrograms:
         return SignalPlan(
             offset_ms,
             tuple(durations_ms),
-            tuple(phase["state"][index] in _WALK for phase in phases),
+            tuple(phase["state"][index] in GREEN_LETTERS for phase in phases),
         )
+
+    def short_greens(
+        self, links: Sequence[Mapping[str, str]], lengths_m: Mapping[str, float]
+    ) -> frozenset[str]:
+        """Return those crossings that have a green too short to walk.
+
+        links: connections to the crossings.
+        lengths_m: lengths of the crossings, metres.
+        """
+        programs: dict[str, list[list[Mapping[str, str]]]] = {}
+        for logic, phases in zip(self.logics, self.phases, strict=True):
+            programs.setdefault(logic.get("id", ""), []).append(phases)
+        return frozenset(
+            to
+            for link in links
+            if (to := link.get("to", "")) in lengths_m
+            and (index := link.get("linkIndex", "")).isdecimal()
+            and any(
+                green_s < required_green_s(lengths_m[to]) - _ROUNDING_S
+                for phases in programs.get(link.get("tl", ""), ())
+                for green_s in _greens_s(phases, int(index))
+            )
+        )
+
+
+def required_green_s(length_m: float) -> float:
+    """Return the seconds of green that a crossing of this length needs."""
+    return length_m / WALK_MPS + REACTION_S
+
+
+def greens(states: Sequence[str], link: int) -> list[list[int]]:
+    """Return the phases of each green of a link, in cyclic order; empty for permanent green."""
+    shown = [link < len(state) and state[link] in GREEN_LETTERS for state in states]
+    if all(shown):
+        return []
+    runs: list[list[int]] = []
+    first = shown.index(False)
+    for k in range(first, first + len(shown)):
+        if shown[k % len(shown)]:
+            if not shown[(k - 1) % len(shown)]:
+                runs.append([])
+            runs[-1].append(k % len(shown))
+    return runs
+
+
+def _greens_s(phases: Sequence[Mapping[str, str]], link: int) -> list[float]:
+    """Return the duration of each green of a link, seconds; empty if durations are no numbers."""
+    try:
+        durations_s = [float(phase.get("duration", "")) for phase in phases]
+    except ValueError:
+        return []
+    runs = greens([phase.get("state", "") for phase in phases], link)
+    return [sum(durations_s[p] for p in run) for run in runs]
 
 
 def _ms(seconds: str) -> int | None:

@@ -41,7 +41,12 @@ from scenarios.events import EVENT_KINDS, react
 from scenarios.places.nets import place
 from scenarios.suites import long_horizon, unit
 from scenarios.suites.catalog import SUITES, load_suite
-from scenarios.suites.long_horizon import build_long_horizon, on_car_paths_m, on_road_m
+from scenarios.suites.long_horizon import (
+    avoided_strips,
+    build_long_horizon,
+    on_car_paths_m,
+    on_road_m,
+)
 from scenarios.suites.proofs import read_proofs
 from scenarios.suites.sample import suite_on_map
 from scenarios.suites.unit import build_unit
@@ -427,6 +432,21 @@ def test_routes_keep_off_stairs_and_bridges() -> None:
         "every long sidewalk is a stair, a bridge, a tunnel or on a road (1 times)): import "
         "another area" in said
     )
+
+
+@pytest.mark.engine
+def test_routes_keep_off_greens_that_are_too_short() -> None:
+    """A map with routes has none left when every crossing has a green too short to walk."""
+    where = CityMap(map="sumo-fkk-in")
+    street_map = read_map(where)
+    short = {
+        name: dataclasses.replace(strip, short_green=strip.kind == "crossing")
+        for name, strip in street_map.strips.items()
+    }
+    street_map = dataclasses.replace(street_map, strips=short)
+    with pytest.raises(SpecError, match="signal whose green is too short to walk"):
+        build_long_horizon(where, street_map, WalkGraph(street_map), 0, "short-green")
+    assert {name for name, one in short.items() if one.short_green} <= avoided_strips(street_map)
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)

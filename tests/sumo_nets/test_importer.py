@@ -45,6 +45,7 @@ from sumo_nets.maps.signal_check import extend_greens, repair_signals
 from sumo_nets.net.net_facts import crossing_signals, read_facts
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.signal_plans import SignalPrograms
 from tests.conftest import Cosim
 from tests.sumo_nets.conftest import kept
 
@@ -703,6 +704,19 @@ def test_greens_too_short_to_walk_are_lengthened() -> None:
         assert extend_greens(special) == [
             "green too short to walk at 1 signals, left as it is (not a fixed program): J"
         ] and ET.tostring(special) == ET.tostring(ET.fromstring(other))
+
+
+def test_crossings_with_greens_too_short_to_walk_are_found() -> None:
+    """A crossing of 12 m needs 14 s in each of its greens, also in one over the end of the
+    cycle."""
+    links = [{"to": ":c", "tl": "J", "linkIndex": "1"}]
+    for last_s, short in ((5.0, set()), (4.9, {":c"})):
+        programs = SignalPrograms()
+        programs.add("tlLogic", "net", {"id": "J", "type": "actuated", "programID": "0"})
+        for duration_s, state in ((5.0, "GG"), (40.0, "Gr"), (4.0, "rG"), (last_s, "rg")):
+            programs.add("phase", "tlLogic", {"duration": str(duration_s), "state": state})
+        assert programs.short_greens(links, {":c": 12.0}) == short
+        assert not programs.short_greens(links, {":c": 0.5})
 
 
 @pytest.mark.engine

@@ -17,6 +17,8 @@ from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 VIEW_BINDING: Final = 1
 TILE_PX: Final = 8
 """Side of a tile in pixels."""
+BATCH: Final = 256
+"""Splats of a tile that its invocations fetch together, with one pixel for each invocation."""
 NEAR_M: Final = 0.2
 """Minimum depth of the centre of a drawn splat, metres."""
 BLUR_PX2: Final = 0.3
@@ -406,18 +408,56 @@ layout(r32f, binding = 1) writeonly uniform image2D median;
 layout(binding = {LIMITS_UNIT}) uniform sampler2D limits;
 #endif
 const uint NONE = 0xffffffffu;
+#if ROWS == 1
+shared uint held[{BATCH}];
+shared vec4 held_first[{BATCH}];
+shared uvec4 held_second[{BATCH}];
+shared bool open;
+#endif
 float depth_at(uint record, vec2 pixel) {{
     float z = uintBitsToFloat(records[record + 1u].z);
     float slope = dot(slopes[record / 2u], pixel - uintBitsToFloat(records[record].xy));
     return z * z / (z - clamp(slope, -{STRAY} * z, {STRAY} * z));
 }}
+vec2 at;
+float left[ROWS], limit[ROWS];
+uint middle[ROWS];
+vec3 sum[ROWS];
+bool paint(uint r, vec4 one, uvec4 second) {{
+    // Blend a splat; return whether all pixels of the invocation are full.
+    vec3 two = uintBitsToFloat(second.xyz);
+    uint rgb = second.w;
+    vec3 colour = vec3(rgb & 0xffu, (rgb >> 8) & 0xffu, (rgb >> 16) & 0xffu);
+    vec2 off = at - one.xy;
+    float most = 0.0;
+    for (int j = 0; j < ROWS; ++j) {{
+        float y = off.y + float(j);
+        precise float px = one.z * off.x;
+        precise float py = one.w * y;
+        precise float p = px + py;
+        precise float q = two.x * y;
+        precise float power = two.y - (p * p + q * q);
+        float share = power > -7.99435344 ? left[j] * exp2(power) : 0.0;
+#ifdef LIMITED
+        bool ground = rgb >= 0x1000000u;
+        share = two.z < (ground ? limit[j] : abs(limit[j])) ? share : 0.0;
+#endif
+        share = left[j] < {FULL} ? 0.0 : share;
+        sum[j] += share * colour;
+        left[j] -= share;
+        middle[j] = middle[j] == NONE && left[j] < 0.5 ? r : middle[j];
+#ifdef LIMITED
+        most = max(most, limit[j] == 0.0 ? 0.0 : left[j]);
+#else
+        most = max(most, left[j]);
+#endif
+    }}
+    return most < {FULL};
+}}
 void main() {{
     ivec2 here = ivec2(gl_GlobalInvocationID.xy) * ivec2(1, ROWS);
-    vec2 at = vec2(here) + 0.5;
+    at = vec2(here) + 0.5;
     uint tile = gl_WorkGroupID.y * sizes.z + gl_WorkGroupID.x;
-    float left[ROWS], limit[ROWS];
-    uint middle[ROWS];
-    vec3 sum[ROWS];
     for (int j = 0; j < ROWS; ++j) {{
         left[j] = 1.0;
         middle[j] = NONE;
@@ -427,39 +467,31 @@ void main() {{
 #endif
     }}
     uint end = starts[tile + 1u];
+#if ROWS == 1
+    uint lane = gl_LocalInvocationIndex;
+    bool full = false;
+    for (uint start = starts[tile]; start < end; start += {BATCH}u) {{
+        uint count = min(end - start, {BATCH}u);
+        barrier();
+        open = false;
+        for (uint k = lane; k < count; k += {TILE_PX * TILE_PX}u) {{
+            held[k] = 2u * lists[start + k];
+            held_first[k] = uintBitsToFloat(records[held[k]]);
+            held_second[k] = records[held[k] + 1u];
+        }}
+        barrier();
+        for (uint k = 0u; k < count && !full; ++k)
+            full = paint(held[k], held_first[k], held_second[k]);
+        if (!full) open = true;
+        barrier();
+        if (!open) break;
+    }}
+#else
     for (uint k = starts[tile]; k < end; ++k) {{
         uint r = 2u * lists[k];
-        uvec4 second = records[r + 1u];
-        vec4 one = uintBitsToFloat(records[r]);
-        vec3 two = uintBitsToFloat(second.xyz);
-        uint rgb = second.w;
-        vec3 colour = vec3(rgb & 0xffu, (rgb >> 8) & 0xffu, (rgb >> 16) & 0xffu);
-        vec2 off = at - one.xy;
-        float most = 0.0;
-        for (int j = 0; j < ROWS; ++j) {{
-            float y = off.y + float(j);
-            precise float px = one.z * off.x;
-            precise float py = one.w * y;
-            precise float p = px + py;
-            precise float q = two.x * y;
-            precise float power = two.y - (p * p + q * q);
-            float share = power > -7.99435344 ? left[j] * exp2(power) : 0.0;
-#ifdef LIMITED
-            bool ground = rgb >= 0x1000000u;
-            share = two.z < (ground ? limit[j] : abs(limit[j])) ? share : 0.0;
-#endif
-            share = left[j] < {FULL} ? 0.0 : share;
-            sum[j] += share * colour;
-            left[j] -= share;
-            middle[j] = middle[j] == NONE && left[j] < 0.5 ? r : middle[j];
-#ifdef LIMITED
-            most = max(most, limit[j] == 0.0 ? 0.0 : left[j]);
-#else
-            most = max(most, left[j]);
-#endif
-        }}
-        if (most < {FULL}) break;
+        if (paint(r, uintBitsToFloat(records[r]), records[r + 1u])) break;
     }}
+#endif
     for (int j = 0; j < ROWS; ++j) {{
         ivec2 pixel = here + ivec2(0, j);
         if (all(lessThan(pixel, ivec2(sizes.xy)))) {{

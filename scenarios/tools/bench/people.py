@@ -62,6 +62,14 @@ _SPEED_FRAMES: Final = 2
 SIDEWALK_WIDTH_M: Final = 3.2
 """The sidewalks' width: five stripes of SUMO's, as most of a city's sidewalks have."""
 WINDOW_M: Final = 2.0
+_WALKS_MPS: Final = 0.3
+"""Speed from which a person walks, m/s."""
+_SAME_WAY: Final = 0.9
+"""Cosine of the angle between two people below which they walk in different directions."""
+FOLLOWING_M: Final = 2.0
+"""Largest distance of a person that follows another, metres."""
+FOLLOWING_BIN_M: Final = 0.02
+"""Width of the intervals in which following distances are counted, metres."""
 _SIDE_M: Final = 30.0
 _BUILT: Final = ("--walkingareas", "--offset.disable-normalization", "--junctions.corner-detail=8")
 _SETTLE_S: Final = 20.0
@@ -196,6 +204,30 @@ def nearest_m(tracks: pd.DataFrame) -> Floats:
     ):
         if len(rows) > 1:
             found[rows] = np.asarray(KDTree(xy[rows]).query(xy[rows], k=2)[0])[:, 1]
+    return found
+
+
+def following_m(tracks: pd.DataFrame) -> Floats:
+    """Return (K,) the distance to the nearest person ahead, metres, for each row; inf for a person
+    that follows nobody.
+
+    Both walk in the same direction, one behind the other.
+    """
+    ends = tracks.groupby("id")[["x", "y"]]
+    step = (ends.shift(-_SPEED_FRAMES) - ends.shift(_SPEED_FRAMES)).to_numpy(dtype=float)
+    way = np.hypot(step[:, 0], step[:, 1])
+    walks = way > _WALKS_MPS * 2 * _SPEED_FRAMES / FRAMES_HZ
+    heading = step / np.where(walks, way, 1.0)[:, None]
+    xy = tracks[["x", "y"]].to_numpy(dtype=float)
+    found = np.full(len(xy), np.inf)
+    for rows in tracks[walks].groupby("frame").indices.values():
+        mine = np.flatnonzero(walks)[rows]
+        to = xy[mine][None] - xy[mine][:, None]
+        dx, dy = heading[mine, 0][:, None], heading[mine, 1][:, None]
+        ahead = dx * to[..., 0] + dy * to[..., 1]
+        aside = dx * to[..., 1] - dy * to[..., 0]
+        same = (heading[mine] @ heading[mine].T > _SAME_WAY) & (np.abs(aside) < GROUP_STRIPE_M / 2)
+        found[mine] = np.where(same & (ahead > 0.0), ahead, np.inf).min(axis=1)
     return found
 
 
@@ -424,7 +456,8 @@ def walk_round(
 def _round_the_block(ring: BlockRing, flow: Flow, seed: int) -> Entrances:
     """Start everyone at once at random places; groups, ages and speeds are those of every crowd."""
     rng = np.random.default_rng(seed)
-    draws = GroupDraws(CrowdSpec(groups=flow.groups), rng.spawn(1)[0])
+    rng_groups, rng_gaps = rng.spawn(2)
+    draws = GroupDraws(CrowdSpec(groups=flow.groups), rng_groups)
     lines = [ring.line(side) for side in ring.sides]
     stripes = round(SIDEWALK_WIDTH_M / GROUP_STRIPE_M)
     wanted = round(flow.density * ring.area_m2)
@@ -456,13 +489,14 @@ def _round_the_block(ring: BlockRing, flow: Flow, seed: int) -> Entrances:
         walk = tuple(ring.sides[(side + step * k) % len(ring.sides)] for k in range(4 * _ROUNDS))
         angle_deg = heading_to_sumo(math.atan2(*(step * ahead[::-1]).tolist()))
         mps = group.speed_at(float(rng.uniform(*group.pace_mps)))
-        for (_, _, k), age in zip(here, group.ages, strict=True):
+        gaps_m = group.gaps_m(rng_gaps)
+        for (_, _, k), age, gap_m in zip(here, group.ages, gaps_m, strict=True):
             x_m, y_m = (
                 start + at_m * ahead + (k - (stripes - 1) / 2) * GROUP_STRIPE_M * left
             ).tolist()
             name = f"c{len(entrances.ages)}"
             entrances.ages[name] = age
-            entry = PersonEntry(name, walk[0], at_m, walk, 1.0, mps, (x_m, y_m), angle_deg)
+            entry = PersonEntry(name, walk[0], at_m, walk, 1.0, mps, (x_m, y_m), angle_deg, gap_m)
             entrances.people[begin_s].append(entry)
     return entrances
 
@@ -515,7 +549,8 @@ def walk_across(seconds: float, seed: int) -> tuple[list[Floats], list[Floats]]:
 def _over_the_street(street: OpenCrosswalk, seconds: float, seed: int) -> Entrances:
     """Draw people and vehicles that arrive at random from either side."""
     rng = np.random.default_rng(seed)
-    draws = GroupDraws(CrowdSpec(), rng.spawn(1)[0])
+    rng_groups, rng_gaps = rng.spawn(2)
+    draws = GroupDraws(CrowdSpec(), rng_groups)
     entrances = Entrances()
     begin_s = sumo_start(seed)[1] + TICK_MS / 1000
     kinds = list(VEHICLE_TYPES)
@@ -547,12 +582,17 @@ def _over_the_street(street: OpenCrosswalk, seconds: float, seed: int) -> Entran
             aside_m = float(rng.uniform(-1.2, 1.2))
             x_m, y_m = (start + at_m * ahead + aside_m * np.array([-ahead[1], ahead[0]])).tolist()
             mps = group.speed_at(float(rng.uniform(*group.pace_mps)))
-            entry2 = PersonEntry(name, walk[0], at_m, walk, _WALK_UP_M, mps, (x_m, y_m), angle_deg)
+            (gap_m,) = group.gaps_m(rng_gaps)
+            entry2 = PersonEntry(
+                name, walk[0], at_m, walk, _WALK_UP_M, mps, (x_m, y_m), angle_deg, gap_m
+            )
             entrances.people[at_s].append(entry2)
     return entrances
 
 
 _FREE: Final = Flow(0.05, both_ways=False)
+FOLLOWED: Final = Flow(0.2, both_ways=False)
+"""Ring on which the distances of people that follow each other are measured."""
 
 
 class Nearest(NamedTuple):
@@ -567,13 +607,15 @@ class Comparison(NamedTuple):
 
     by_density: for each interval of DENSITY_EDGES the speed, m/s, and the person-seconds of it, one
     way and both ways. free_mps: the speed of each person walking alone. nearest: of each loose
-    ring. person_first_s, vehicle_first_s: post-encroachment times. vehicles, people: how many came
+    ring. following_m: distances (K,) to the nearest person ahead, below FOLLOWING_M, on FOLLOWED.
+    person_first_s, vehicle_first_s: post-encroachment times. vehicles, people: how many came
     to the crossing.
     """
 
     by_density: tuple[list[tuple[MeanSd, float]], list[tuple[MeanSd, float]]]
     free_mps: Floats
     nearest: list[Nearest]
+    following_m: Floats
     person_first_s: Floats
     vehicle_first_s: Floats
     people: int
@@ -592,11 +634,13 @@ def watch_people(jobs: int, progress: Progress) -> Comparison:
         walking = [pool.apply_async(_density_speed, (flow, _WALK_S, 0)) for flow in dense]
         near = [pool.apply_async(_nearest, (flow, _WALK_S, 0)) for flow in loose]
         free = [pool.apply_async(_free_mps, (_FREE, _WALK_S, seed)) for seed in range(_FREE_SEEDS)]
+        following = pool.apply_async(follow, (FOLLOWED, _WALK_S, 0))
         found = []
         for k, one in enumerate(tasks := [*walking, *near, *free]):
             progress(f"watching people: street {k + 1} of {len(tasks)}")
             found.append(one.get())
         person_first_s, vehicle_first_s, people, vehicles = crossing.get()
+        behind_m = following.get()
     one_way = found[: len(DENSITIES)]
     both_ways = found[len(DENSITIES) : len(dense)]
     nearest = found[len(dense) :]
@@ -604,6 +648,7 @@ def watch_people(jobs: int, progress: Progress) -> Comparison:
         (_binned(one_way), _binned(both_ways)),
         np.concatenate(nearest[len(loose) :]),
         [Nearest(flow, apart_m) for flow, apart_m in zip(loose, nearest, strict=False)],
+        behind_m,
         person_first_s,
         vehicle_first_s,
         people,
@@ -630,6 +675,19 @@ def _density_speed(flow: Flow, seconds: float, seed: int) -> Floats:
 def _nearest(flow: Flow, seconds: float, seed: int) -> Floats:
     ring, tracks = walk_round(flow, seconds, seed)
     return nearest_m(tracks)[on_ground(tracks, ring.straights())]
+
+
+def follow(flow: Flow, seconds: float, seed: int, settle_s: float = _SETTLE_S) -> Floats:
+    """Return (K,) the distances below FOLLOWING_M to people ahead on straight sidewalks, metres."""
+    ring, tracks = walk_round(flow, seconds, seed, settle_s)
+    apart_m = following_m(tracks)[on_ground(tracks, ring.straights())]
+    return apart_m[apart_m < FOLLOWING_M]
+
+
+def largest_share(near_m: Floats) -> float:
+    """Return the share of distances in their most frequent interval of FOLLOWING_BIN_M."""
+    counts, _ = np.histogram(near_m, np.arange(0.0, FOLLOWING_M, FOLLOWING_BIN_M))
+    return float(counts.max() / len(near_m))
 
 
 def _free_mps(flow: Flow, seconds: float, seed: int) -> Floats:
