@@ -469,7 +469,7 @@ def test_a_generated_street_is_recovered_from_a_corrupted_export(tmp_path: Path)
     both = shapely.intersection(walkable, moved).area
     assert both / shapely.union(walkable, moved).area > 0.95
     assert moved.length == pytest.approx(walked.length, rel=0.01)
-    for scenario in suite_on_map("unit", "scan-clean", 0, 3).scenarios:
+    for scenario in suite_on_map("unit", "scan-clean", 0, 2).scenarios:
         exact = proved(scenario)
         assert isinstance(exact, Proof), exact
         shown = limited(scenario, exact.time_s, exact.passing_mps)

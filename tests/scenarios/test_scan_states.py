@@ -53,7 +53,7 @@ def test_the_look_of_a_scan_never_changes_the_state(tmp_path: Path) -> None:
     import_scan(folder, read_options(folder, {}))
     (drawn,) = suite_on_map("unit", "states", 0, 1).scenarios
     scenario = msgspec.structs.replace(
-        drawn, crowd=CrowdSpec(persons=4), ends_on_failure=False, time_limit_s=6.0, obstacles=()
+        drawn, crowd=CrowdSpec(persons=4), ends_on_failure=False, time_limit_s=4.0, obstacles=()
     )
     hashes = {}
     pictures = {}
@@ -69,7 +69,7 @@ def test_the_look_of_a_scan_never_changes_the_state(tmp_path: Path) -> None:
         look = "none" if camera is None else appearance
         hashes[look], pictures[look] = record.state_hash, policy.pictures
     assert hashes["mesh"] == hashes["splats"] == hashes["none"]
-    assert len(pictures["mesh"]) == len(pictures["splats"]) == 12
+    assert len(pictures["mesh"]) == len(pictures["splats"]) == 8
     assert np.abs(pictures["mesh"][-1].astype(float) - pictures["splats"][-1]).mean() > 0.5
     assert not pictures["none"]
     other = run_episode(scenario, Swaying(None, -0.2)).record
