@@ -4,6 +4,7 @@ Imports PyTorch and gsplat, which are not among the project's requirements.
 
 Colours do not depend on the direction of view, as in an imported scan. The sky is a picture behind
 the splats that is not stored. Each photo has a gain and a bias per channel, which average to none.
+Lengths are divided by a unit, because learning rates and noise of gsplat's strategy depend on it.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ from physics.scans.write_splats import SPLAT_ROW
 from scenarios.tools.scans.photos import Photo, Picture
 
 _RATES: Final = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3}
-"""Learning rates of the parameters; that of the means is per unit of distance."""
+"""Learning rates of the parameters."""
 _LAST_RATE: Final = 0.01
 """Learning rate of the means at the end, as a share of the first."""
 _START_SHARE: Final = 0.7
 """Largest share of the splats that start at given points; densification adds the others."""
 _START_OPACITY: Final = 0.5
 _NEAR: Final = 0.03
-"""Distance in units before which nothing is drawn."""
+"""Distance from the eye in units before which nothing is drawn."""
 _SSIM_SHARE: Final = 0.2
 _DEPTH_WEIGHT: Final = 0.05
 _OPACITY_WEIGHT: Final = 0.01
@@ -102,16 +103,14 @@ class Trainer:
         torch.manual_seed(settings.seed)
         self._rng = np.random.default_rng(settings.seed)
         self._settings = settings
-        self._tracked = tracked
         self._unit = _unit(photos, tracked)
+        self._tracked = tracked / self._unit
         # Up in the model's frame: against the mean of the cameras' y axes.
         self._axes = _axes([photo.matrix for photo in photos])
         self._shots = [self._shot(photo) for photo in photos]
-        self._params = self._first(points, colours)
+        self._params = self._first(points / self._unit, colours)
         self._optimizers = {
-            name: torch.optim.Adam(
-                [one], lr=_RATES[name] * (self._unit if name == "means" else 1.0), eps=1e-15
-            )
+            name: torch.optim.Adam([one], lr=_RATES[name], eps=1e-15)
             for name, one in self._params.items()
         }
         device = settings.device
@@ -157,12 +156,12 @@ class Trainer:
         loss = loss + _DEPTH_WEIGHT * self._depth_loss(shot, depth)
         params = self._params
         loss = loss + _OPACITY_WEIGHT * torch.sigmoid(params["opacities"]).mean()
-        loss = loss + _SCALE_WEIGHT * torch.exp(params["scales"]).mean() / self._unit
+        loss = loss + _SCALE_WEIGHT * torch.exp(params["scales"]).mean()
         loss.backward()
         for optimizer in (*self._optimizers.values(), self._others):
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        rate = _RATES["means"] * self._unit * _LAST_RATE ** (step / self._settings.steps)
+        rate = _RATES["means"] * _LAST_RATE ** (step / self._settings.steps)
         self._optimizers["means"].param_groups[0]["lr"] = rate
         self._strategy.step_post_backward(params, self._optimizers, self._state, step, {}, lr=rate)
         with torch.no_grad():
@@ -172,14 +171,13 @@ class Trainer:
         return loss.detach()
 
     def _depth_loss(self, shot: _Shot, depth: Tensor) -> Tensor:
-        """Return the mean difference of inverse depths, per inverse unit."""
+        """Return the mean difference of inverse depths."""
         if not len(shot.depths):
             return depth.sum() * 0.0
         at = torch.nn.functional.grid_sample(
             depth[None, None], shot.pixels, align_corners=False, padding_mode="border"
         ).flatten()
-        near = _NEAR * self._unit
-        return (1.0 / at.clamp(min=near) - 1.0 / shot.depths).abs().mean() * self._unit
+        return (1.0 / at.clamp(min=_NEAR) - 1.0 / shot.depths).abs().mean()
 
     def _drawn(self, shot: _Shot, ground: Tensor) -> tuple[Tensor, Tensor]:
         """Return a picture (H, W, 3) before a sky and a ground colour, and depths (H, W)."""
@@ -195,7 +193,7 @@ class Trainer:
             Ks=shot.intrinsics[None],
             width=width,
             height=height,
-            near_plane=_NEAR * self._unit,
+            near_plane=_NEAR,
             render_mode="RGB+ED",
             packed=False,
         )
@@ -220,9 +218,9 @@ class Trainer:
             seen &= np.isfinite(one.reshape(len(one), -1)).all(axis=1)
         rows = np.zeros(int(seen.sum()), dtype=SPLAT_ROW)
         for k, name in enumerate("xyz"):
-            rows[name] = params["means"][seen, k]
+            rows[name] = self._unit * params["means"][seen, k]
             rows[f"f_dc_{k}"] = params["sh0"][seen, k]
-            rows[f"scale_{k}"] = params["scales"][seen, k]
+            rows[f"scale_{k}"] = params["scales"][seen, k] + math.log(self._unit)
         rows["opacity"] = params["opacities"][seen]
         quats = params["quats"][seen]
         quats = quats / np.sqrt((quats**2).sum(axis=1, keepdims=True))
@@ -238,7 +236,7 @@ class Trainer:
             points, colours = points[chosen], colours[chosen]
         near: Floats = np.asarray(cKDTree(points).query(points, k=min(4, len(points)))[0])
         far = near[:, 1:].mean(axis=1)
-        size = np.log(np.clip(far, 1e-4 * self._unit, 0.5 * self._unit))
+        size = np.log(np.clip(far, 1e-4, 0.5))
         whole = {
             "means": points,
             "scales": np.repeat(size[:, None], 3, axis=1),
@@ -251,13 +249,15 @@ class Trainer:
     def _shot(self, photo: Photo) -> _Shot:
         height, width = photo.rgb.shape[:2]
         sky, elevation = _sky_places(photo, self._axes)
-        local = self._tracked[photo.points] @ photo.matrix[:3, :3].T + photo.matrix[:3, 3]
-        local = local[local[:, 2] > 2.0 * _NEAR * self._unit]
+        matrix = photo.matrix.copy()
+        matrix[:3, 3] /= self._unit
+        local = self._tracked[photo.points] @ matrix[:3, :3].T + matrix[:3, 3]
+        local = local[local[:, 2] > 2.0 * _NEAR]
         pixels = (local / local[:, 2:]) @ photo.intrinsics.T
         pixels = 2.0 * pixels[:, :2] / (width, height) - 1.0
         return _Shot(
             torch.as_tensor(photo.rgb, device=self._settings.device),
-            self._put(photo.matrix),
+            self._put(matrix),
             self._put(photo.intrinsics),
             self._put(sky)[None],
             self._put(elevation > 0.0)[..., None],
