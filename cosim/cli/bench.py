@@ -11,15 +11,16 @@ import typer
 from cosim.cli import tables
 from cosim.cli.console import out, say
 from cosim.cli.exploit import bench_cheats, bench_exploit
-from cosim.cli.options import MEASURE
+from cosim.cli.options import MEASURE, Appears
 from cosim.cli.progress import doing
-from cosim.core.errors import unknown
-from cosim.spec.run_config import help_of
+from cosim.core.errors import UsageError, unknown
+from cosim.spec.run_config import Appearance, help_of
 
 if TYPE_CHECKING:
     from cosim.core.geometry import Floats
     from scenarios.tools.bench.figures import Figure
     from scenarios.tools.bench.people import Comparison, MeanSd
+    from scenarios.tools.bench.realism import Realism
 
 
 _SHARE = [*tables.figures("count"), *tables.labels("of"), *tables.figures("share", "target")]
@@ -281,6 +282,39 @@ def _percentiles(values: Floats, percent: Sequence[float]) -> str:
     return _list(np.percentile(values, percent).tolist())
 
 
+def bench_realism(
+    places: Sequence[str],
+    frames: int,
+    appearance: Appearance,
+    weights: Path | None,
+    folder: Path | None,
+) -> None:
+    """Compare what networks see in pictures with the labels, and print the shares."""
+    from scenarios.tools.bench.realism import CLASSES, SIZES_PX, measure_realism
+
+    if weights is not None and not weights.is_dir():
+        raise UsageError(f"--weights {weights}: no folder; give the one with the networks' files")
+    with doing("driving") as progress:
+        found = measure_realism(places or ("",), frames, appearance, weights, folder, progress)
+    rows: list[tuple[str, ...]] = [("frames", *(str(one.frames) for one in found))]
+    rows += [
+        (f"people {size}, found", *(_found_of(one, size) for one in found)) for size in SIZES_PX
+    ]
+    rows.append(
+        ("false boxes of all boxes", *(f"{one.false} of {one.detections}" for one in found))
+    )
+    rows += [(f"IoU of {name}", *(f"{one.iou[name]:.2f}" for one in found)) for name in CLASSES]
+    heads = tables.figures(*(one.place for one in found))
+    tables.show(out, [*tables.names("YOLOX-nano, ESPNetv2"), *heads], rows)
+    if folder is not None:
+        out.print(f"Pictures with boxes, and realism.json: {folder}", highlight=False)
+
+
+def _found_of(one: Realism, size: str) -> str:
+    found, of = one.people[size]
+    return f"{found} of {of}" + (f" ({found / of:.2f})" if of else "")
+
+
 bench_app = typer.Typer()
 NO_FIGURE = ("none: see below", "")
 
@@ -290,7 +324,8 @@ NO_FIGURE = ("none: see below", "")
     epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench --only driving --compare "
     "../cosim-before`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n`cosim bench "
     "crossings --crossings 40 --jobs 2 --policy orca`  \n`cosim bench exploit --kinds lateral "
-    "--evaluations 400 --jobs 2`  \n`cosim bench exploit --cheats --suite reactive`",
+    "--evaluations 400 --jobs 2`  \n`cosim bench exploit --cheats --suite reactive`  \n`cosim "
+    "bench realism --place my-street --frames 20`",
 )
 def bench(
     what: Annotated[
@@ -299,8 +334,8 @@ def bench(
             metavar="WHAT",
             help="environment (one process, part by part), camera (all of them), "
             "crowd (behaviour of people and vehicles), people (the crowd compared with measured "
-            "people), crossings (a policy, people and vehicles at signals) or exploit (blind "
-            "schedules that solve a suite).",
+            "people), crossings (a policy, people and vehicles at signals), exploit (blind "
+            "schedules that solve a suite) or realism (what networks see in pictures).",
         ),
     ] = "environment",
     only: Annotated[
@@ -371,7 +406,7 @@ def bench(
             "--out",
             metavar="FOLDER",
             help="For `exploit`: where evaluations are stored, and continued; default: "
-            "runs/exploit-SUITE.",
+            "runs/exploit-SUITE. For `realism`: where pictures with boxes are written.",
         ),
     ] = None,
     write: Annotated[
@@ -382,10 +417,27 @@ def bench(
         bool,
         typer.Option("--cheats", help="For `exploit`: drive the table of cheating schedules."),
     ] = False,
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="For `realism`: files of YOLOX-nano and ESPNetv2, as of the policy `follow`.",
+        ),
+    ] = None,
+    places: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--place",
+            metavar="NAME",
+            help="For `realism`: a map; default: the cities of `long-horizon`; repeatable.",
+        ),
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="For `realism`: frames of each place.")] = 100,
+    appearance: Appears = "splats",
 ) -> None:
-    """Measure the speed of an environment process or of cameras, behaviour in traffic, or how far
-    a suite can be solved blind."""
-    choices = ("environment", "camera", "crowd", "people", "crossings", "exploit")
+    """Measure the speed of an environment process or of cameras, behaviour in traffic, how far a
+    suite can be solved blind, or what networks see in pictures."""
+    choices = ("environment", "camera", "crowd", "people", "crossings", "exploit", "realism")
     if what not in choices:
         raise unknown("bench", what, choices)
     if what == "crowd":
@@ -396,6 +448,9 @@ def bench(
         return
     if what == "people":
         bench_people(jobs)
+        return
+    if what == "realism":
+        bench_realism(places or (), frames, appearance, weights, folder)
         return
     if what == "exploit":
         named, sought, goals = (

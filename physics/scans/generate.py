@@ -28,6 +28,8 @@ from cosim.spec.scenario import Light
 from physics.cameras.sky import Sky, sky_of
 from physics.ground.mesh import Ints, Mesh
 from physics.ground.tiles import tiles_touching
+from physics.scans.read_splats import SH_C0
+from physics.scans.write_splats import SPLAT_ROW, write_splats
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, footprints, parts_of
 from physics.street.street_surface import StreetSurface
@@ -56,20 +58,8 @@ _NEAR_SHARE: Final = 0.75
 _BORDER_M: Final = 0.5
 """Longest edge of triangles at the border of the box in metres."""
 _TEXELS: Final = 256
-_SH_C0: Final = 0.28209479177387814
-"""Value of the spherical harmonic of degree 0."""
 _STEPS: Final = (0.7548776662466927, 0.5698402909980532)
 """Steps of the low-discrepancy sequence of points in triangles."""
-SPLAT_ROW: Final = np.dtype(
-    [
-        (name, "<f4")
-        for name in (
-            *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-            *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-        )
-    ]
-)
-"""Row of a 3DGS .ply file."""
 
 
 class SurfaceSplats(NamedTuple):
@@ -313,7 +303,7 @@ def _write_splats(splats: SurfaceSplats, middle: Floats, path: Path) -> None:
     for k, name in enumerate("xyz"):
         rows[name] = splats.centres[:, k] - middle[k]
         rows[f"n{name}"] = splats.normals[:, k]
-        rows[f"f_dc_{k}"] = (splats.colours[:, k] - 0.5) / _SH_C0
+        rows[f"f_dc_{k}"] = (splats.colours[:, k] - 0.5) / SH_C0
     rows["opacity"] = math.log(_OPACITY / (1.0 - _OPACITY))
     rows["scale_0"] = rows["scale_1"] = np.log(_SPREAD * splats.spacings)
     rows["scale_2"] = math.log(_THICKNESS_M)
@@ -324,14 +314,7 @@ def _write_splats(splats: SurfaceSplats, middle: Floats, path: Path) -> None:
     turned /= np.sqrt((turned**2).sum(axis=1, keepdims=True))
     for k in range(4):
         rows[f"rot_{k}"] = turned[:, k]
-    head = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(rows)}",
-        *(f"property float {name}" for name in SPLAT_ROW.names or ()),
-        "end_header",
-    ]
-    path.write_bytes("\n".join(head).encode() + b"\n" + rows.tobytes())
+    write_splats(rows, path)
 
 
 def _write_mesh(pieces: Sequence[_Piece], sky: Sky, middle: Floats, path: Path) -> None:

@@ -41,10 +41,10 @@ from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.policy import example_observation
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import COURIER, ROBOTS, Robot
+from tests.support.follow_weights import WEIGHTS, make_weights
 from tests.support.graphs import tiny_graph
 
 PICTURES = Path(__file__).parent / "pictures"
-WEIGHTS = Path(os.environ.get("COSIM_WEIGHTS") or Path(__file__).parents[3] / "shared" / "weights")
 CAMERA = calibration_of(CameraSpec(512, 288, 60.0), COURIER)
 GROUND = Ground(CAMERA, (512, 288))
 OPEN = np.ones((80, 80), np.bool_)
@@ -54,18 +54,7 @@ NOBODY = np.zeros((0, 2))
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with both graphs, one of them made anew."""
-    if missing := [
-        one.name for one in (ESPNET_WEIGHTS, YOLOX_NANO) if not (WEIGHTS / one.name).is_file()
-    ]:
-        pytest.skip(
-            f"the published weights {', '.join(missing)} are not in {WEIGHTS} (COSIM_WEIGHTS)"
-        )
-    folder = tmp_path_factory.mktemp("weights")
-    (folder / YOLOX_NANO.name).symlink_to(WEIGHTS / YOLOX_NANO.name)
-    (folder / ESPNET_GRAPH.name).write_bytes(
-        street_graph(read_torch_file((WEIGHTS / ESPNET_WEIGHTS.name).read_bytes()))
-    )
-    return folder
+    return make_weights(tmp_path_factory.mktemp("weights"))
 
 
 def picture(name: str) -> NDArray[np.uint8]:

@@ -32,9 +32,14 @@ from scenarios.places.nets import place
 from scenarios.places.scan_import import CheckedScan, check_scan, import_scan
 from scenarios.places.scan_make import crossing_box, make_scan
 from scenarios.places.scan_options import ScanOptions, parse_georeference, read_options
+from scenarios.suites.decoys import limited
+from scenarios.suites.proofs import Proof
+from scenarios.suites.sample import suite_on_map
+from scenarios.tools.build.proving import proved
 from sumo_nets.maps.map_store import maps_folder, read_map
 from tests.conftest import Cosim
 from tests.support.documents import blocks, text_of
+from tests.support.moved_scenarios import moved_scenario
 from tests.support.scans import (
     LENGTH_M,
     Street,
@@ -412,12 +417,13 @@ def _given_of(options: Any) -> dict[str, Any]:
 @pytest.mark.engine
 def test_a_generated_street_is_recovered_from_a_corrupted_export(tmp_path: Path) -> None:
     """In centimetres, y up, turned by 33 degrees, at UTM coordinates, with 5 % of the triangles lost
-    and 3 cm of noise: heights to 3 cm, the walkable area to 95 %, ways to 1 %."""
+    and 3 cm of noise: heights to 3 cm, the walkable area to 95 %, ways to 1 %; and the oracle solves
+    the same scenarios, within the time limits that its times on the good scan give."""
     clean = tmp_path / "clean"
     city = City(seed=7, size_m=300.0)
     x0, y0, x1, y1 = crossing_box(place(city)[1])
     make_scan(city, (x0 + 15, y0 + 10, x1 - 15, y1 - 10), clean, spacing_m=0.5)
-    wanted = check_scan(clean, read_options(clean, {})).scan
+    wanted = import_scan(clean, read_options(clean, {"name": "scan-clean"}))[1].scan
     assert wanted is not None
     angle = np.radians(33)
     turn = np.array(
@@ -463,6 +469,12 @@ def test_a_generated_street_is_recovered_from_a_corrupted_export(tmp_path: Path)
     both = shapely.intersection(walkable, moved).area
     assert both / shapely.union(walkable, moved).area > 0.95
     assert moved.length == pytest.approx(walked.length, rel=0.01)
+    for scenario in suite_on_map("unit", "scan-clean", 0, 2).scenarios:
+        exact = proved(scenario)
+        assert isinstance(exact, Proof), exact
+        shown = limited(scenario, exact.time_s, exact.passing_mps)
+        spoiled = proved(moved_scenario(shown, "scan-spoiled", found, to_net))
+        assert isinstance(spoiled, Proof), spoiled
 
 
 def _write_ply(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import UsageError
 from cosim.place.scan import parse_areas
 from cosim.spec.scenario import City
-from physics.scans.generate import SPLAT_ROW
+from physics.scans.write_splats import SPLAT_ROW
 from scenarios.places.nets import surface_of_place
 from scenarios.places.scan_make import crossing_box, make_scan
 

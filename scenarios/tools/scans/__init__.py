@@ -1,0 +1,1 @@
+"""Tools for scans: training of Gaussian splats from photos."""
