@@ -36,8 +36,14 @@ def turns(rng: np.random.Generator, count: int) -> Floats:
     return np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
 
 
-def street_scan(*, opacity: int = 255, noise_m: float = 0.05, sun: ScanSun | None = None) -> Scan:
-    """Return flat ground with a wall across its left half, x ahead. noise_m: of the splats."""
+def street_scan(
+    *, opacity: int = 255, noise_m: float = 0.05, sun: ScanSun | None = None, walled: bool = True
+) -> Scan:
+    """Return flat ground with a wall across its left half, x ahead.
+
+    noise_m: of the splats.
+    walled: whether the mesh has the wall, too.
+    """
     rng = np.random.default_rng(5)
     at = np.arange(-SIDE_M, SIDE_M, _SPACING_M)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
@@ -64,10 +70,10 @@ def street_scan(*, opacity: int = 255, noise_m: float = 0.05, sun: ScanSun | Non
         rgba,
         np.arange(count) < len(ground),
     )
-    return Scan(_facts(sun), _mesh(), _heights(), _areas(), splats)
+    return Scan(_facts(sun, walled), _mesh(walled), _heights(), _areas(), splats)
 
 
-def _facts(sun: ScanSun | None) -> ScanFacts:
+def _facts(sun: ScanSun | None, walled: bool) -> ScanFacts:
     whole = tuple(tuple(map(float, row)) for row in np.eye(4))
     return ScanFacts(
         name="street",
@@ -76,12 +82,12 @@ def _facts(sun: ScanSun | None) -> ScanFacts:
         up="+z",
         transform=whole,
         sun=sun,
-        mesh_hash="splat-street",
+        mesh_hash="splat-street" if walled else "splat-street without a wall",
         areas_hash="splat-street",
     )
 
 
-def _mesh() -> ScanMesh:
+def _mesh(walled: bool) -> ScanMesh:
     s = SIDE_M
     (y0, y1) = WALL_Y_M
     vertices = np.array(
@@ -90,9 +96,10 @@ def _mesh() -> ScanMesh:
         dtype=np.float32,
     )
     triangles = np.array([(0, 1, 2), (0, 2, 3), (4, 5, 7), (4, 7, 6)], dtype=np.int32)
+    triangles = triangles if walled else triangles[:2]
     colours = np.concatenate([np.tile((120, 130, 110), (4, 1)), np.tile((200, 60, 40), (4, 1))])
     labels = np.array([LABELS["sidewalk"]] * 2 + [LABELS["building"]] * 2, dtype=np.uint8)
-    return ScanMesh(vertices, triangles, colours.astype(np.uint8), labels)
+    return ScanMesh(vertices, triangles, colours.astype(np.uint8), labels[: len(triangles)])
 
 
 def _heights() -> HeightGrid:

@@ -87,10 +87,11 @@ void main() {{
         vec3 at = eye.xyz + metres(far) * ray;
         colour *= shaded(at, normalize(2.0 * surface.rgb - 1.0));
     }}
-    bool own = !none && !covered;
+    bool own = !none && !covered, hidden = none && object < 1.0;
+    vec3 rest = hidden ? colour / max(1.0 - blended.a, 0.05) : behind.rgb;
     float label = own || far >= 1.0 ? behind.a : surface.a;
     float deep = ({FAR_PLANE_M} - {FAR_PLANE_M * NEAR_PLANE_M} / max(middle, {NEAR_PLANE_M})) / {FAR_PLANE_M - NEAR_PLANE_M};
-    pixel = vec4(colour + blended.a * behind.rgb, label);
+    pixel = vec4(colour + blended.a * rest, label);
     gl_FragDepth = own ? object : covered ? min(deep, 1.0) : far;
 }}
 """

@@ -29,6 +29,8 @@ STRAY: Final = 0.3
 """Maximum difference of a pixel's depth from its splat's, as a share."""
 BEHIND_M: Final = 0.12
 """Distance behind the mesh from which objects are covered, metres."""
+HIDDEN_M: Final = 0.5
+"""Distance behind a wall of the mesh from which objects are not drawn at all, metres."""
 STEEP: Final = 0.02
 """Minimum slope of a ray to the ground."""
 NOTHING_M: Final = 1.0e9
@@ -532,6 +534,7 @@ void main() {{
         bool ground = label < {GROUND_LABELS[1]}.5 && label > {GROUND_LABELS[0]}.0 - 0.5;
         float behind = ground ? gap * max(steep, {STEEP}) : gap;
         limit = behind < {BEHIND_M} ? 0.0 : ground ? metres(object) : -metres(object);
+        if (!ground && behind > {HIDDEN_M}) limit = {NOTHING_M:.1f};
     }}
     imageStore(limits, here, vec4(limit));
 }}
@@ -540,5 +543,6 @@ void main() {{
 """Decide by the mesh which splats may cover an object.
 
 An object is covered where it is BEHIND_M behind the mesh: below ground measured vertically, because
-the noise of a scan's ground is long in a flat view.
+the noise of a scan's ground is long in a flat view. HIDDEN_M behind a wall it is not drawn, because
+splats have gaps.
 """
