@@ -1,0 +1,1 @@
+"""Gaits and joint control of legged robots."""
