@@ -1,1 +1,1 @@
-"""Gaits and joint control of legged robots."""
+"""Robots with legs: gaits, joint torques, and detection of falls."""

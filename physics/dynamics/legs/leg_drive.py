@@ -1,0 +1,52 @@
+"""Drive of a robot with legs: a gait, followed by torques."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Final
+
+from cosim.core.errors import EngineError
+from cosim.core.state import STILL, Command
+from cosim.spec.robot import Legs, Robot
+from physics.dynamics.drive import BodyNow, Motors
+from physics.dynamics.legs.gait import Gait
+from physics.dynamics.legs.pd import torques_nm
+from physics.dynamics.legs.trot import Trot
+
+SETTLE_S: Final = 0.5
+"""Time in seconds that a robot with legs stands before its commands count, after it was placed."""
+
+GAITS: Final[Mapping[str, Callable[[Robot, Legs, float], Gait]]] = MappingProxyType({"trot": Trot})
+"""Gaits by name. The arguments are the robot, its legs and the duration of a substep in seconds."""
+
+
+class LegDrive:
+    """Drive of a robot with legs. dt_s: duration of a substep."""
+
+    reads_joints = True
+
+    def __init__(self, robot: Robot, legs: Legs, dt_s: float) -> None:
+        self._legs = legs
+        self._gait = GAITS[legs.gait](robot, legs, dt_s)
+        self._settle = round(SETTLE_S / dt_s)
+        self.reset()
+
+    def reset(self) -> None:
+        """Reset the gait; the robot stands for SETTLE_S."""
+        self._gait.reset()
+        self._waits = self._settle
+
+    def step(self, command: Command, body: BodyNow) -> Motors:
+        """Return the joints' torques in Nm, in the order of `Legs.joints`."""
+        if self._waits:
+            self._waits -= 1
+            command = STILL
+        if not math.isfinite(sum(body.at_m) + sum(body.angles_rad) + sum(body.speeds_radps)):
+            raise EngineError(
+                f"PyBullet: the robot is at {body.at_m} m, its joints at {body.angles_rad} rad "
+                f"with {body.speeds_radps} rad/s"
+            )
+        target = self._gait.step(command, body)
+        return Motors(torques_nm(self._legs, target, body.angles_rad, body.speeds_radps))
