@@ -243,7 +243,45 @@ DOG = Robot(
 )
 """Quadruped of 15 kg with the published masses and lengths of a Go2."""
 
-ROBOTS: Mapping[str, Robot] = {one.name: one for one in (COURIER, SCOUT, DOG)}
+WALKER = Robot(
+    name="walker",
+    urdf="walker.urdf",
+    length_m=0.28,
+    width_m=0.40,
+    height_m=1.32,
+    com_height_m=0.93,
+    drive=Legs(
+        joints=tuple(
+            f"{side}_{part}"
+            for side in ("left", "right")
+            for part in ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+        ),
+        rest_rad=2 * (-0.12, 0.0, 0.0, 0.30, -0.18, 0.0),
+        kp=2 * (100.0, 100.0, 100.0, 150.0, 40.0, 40.0),
+        kd=2 * (2.0, 2.0, 2.0, 4.0, 2.0, 2.0),
+        torque_nm=2 * (88.0, 139.0, 88.0, 139.0, 50.0, 50.0),
+        feet=("left_foot", "right_foot"),
+        trunk=("base",),
+        stand_m=0.7846,
+        span_m=(0.17, 0.237),
+        cycle_s=0.8,
+        gait="network",
+        weights="cf668f75b90d1abf73d2b87612a6e76bccc61ff7e083b63582d3f6aaa3c1759d",
+    ),
+    mounts={
+        "front": Mount((0.09, 0.0, 1.25), 10.0),
+        "left": Mount((0.02, 0.09, 1.24), 10.0, 60.0, most_hz=10.0),
+        "right": Mount((0.02, -0.09, 1.24), 10.0, -60.0, most_hz=10.0),
+    },
+    cruise_mps=0.9,
+    v_max_mps=1.2,
+    w_max_radps=0.65,
+    acceleration_mps2=1.0,
+    acceleration_radps2=2.0,
+)
+"""Humanoid of 32 kg with the published masses and lengths of a G1."""
+
+ROBOTS: Mapping[str, Robot] = {one.name: one for one in (COURIER, SCOUT, DOG, WALKER)}
 """Robots by name."""
 
 

@@ -13,8 +13,11 @@ from typing import Final
 from cosim.core.files import write_atomic
 from physics.robots.dog import DOG_MODEL
 from physics.robots.model import Model
+from physics.robots.walker import WALKER_MODEL
 
-MODELS: Final[Mapping[str, Model]] = MappingProxyType({one.name: one for one in (DOG_MODEL,)})
+MODELS: Final[Mapping[str, Model]] = MappingProxyType(
+    {one.name: one for one in (DOG_MODEL, WALKER_MODEL)}
+)
 """Tables of robots, by the names of their URDF files without ending."""
 
 

@@ -1,4 +1,4 @@
-"""Interface of gaits: joint angles from a command and the measured motion."""
+"""Interface of gaits: joint torques from a command and the measured motion."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ class Gait(Protocol):
         """Return to the first state: the robot stands at rest."""
 
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
-        """Return the target angles in rad for the next substep, in the order of `Legs.joints`.
+        """Return the torques in Nm for the next substep, in the order of `Legs.joints`.
 
         command: within the robot's limits; `STILL` to stand
         body: with joints
+
+        The drive limits the torques. Raises PolicyError for a gait that fails.
         """

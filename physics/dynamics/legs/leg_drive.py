@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-from cosim.core.errors import EngineError
+from cosim.core.errors import EngineError, PolicyError
 from cosim.core.state import STILL, Command
 from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import BodyNow, Motors
 from physics.dynamics.legs.gait import Gait
-from physics.dynamics.legs.pd import torques_nm
+from physics.dynamics.legs.published import published_gait
 from physics.dynamics.legs.trot import Trot
 
 SETTLE_S: Final = 0.5
 """Time in seconds that a robot with legs stands before its commands count, after it was placed."""
 
-GAITS: Final[Mapping[str, Callable[[Robot, Legs, float], Gait]]] = MappingProxyType({"trot": Trot})
+GAITS: Final[Mapping[str, Callable[[Robot, Legs, float], Gait]]] = MappingProxyType(
+    {"trot": Trot, "network": published_gait}
+)
 """Gaits by name. The arguments are the robot, its legs and the duration of a substep in seconds."""
+
+_NONSENSE: Final = 20.0
+"""Largest torque of a gait, as a multiple of the joint's limit. Impacts of the feet cause some."""
 
 
 class LegDrive:
@@ -48,5 +53,21 @@ class LegDrive:
                 f"PyBullet: the robot is at {body.at_m} m, its joints at {body.angles_rad} rad "
                 f"with {body.speeds_radps} rad/s"
             )
-        target = self._gait.step(command, body)
-        return Motors(torques_nm(self._legs, target, body.angles_rad, body.speeds_radps))
+        return Motors(self._limited(self._gait.step(command, body)))
+
+    def _limited(self, torques_nm: Sequence[float]) -> list[float]:
+        """Return torques within the joints' limits.
+
+        Raises PolicyError for NaN, and for a torque that is far beyond its limit.
+        """
+        limits = self._legs.torque_nm
+        for name, torque, most in zip(self._legs.joints, torques_nm, limits, strict=True):
+            if not abs(torque) < _NONSENSE * most:  # also true for NaN
+                raise PolicyError(
+                    f"gait of the robot: torque of joint {name} is {torque:.4g} Nm; its limit is "
+                    f"{most:g} Nm, and gaits may exceed it {_NONSENSE:g} times at most"
+                )
+        return [
+            min(max(torque, -most), most)
+            for torque, most in zip(torques_nm, limits, strict=True)
+        ]

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cosim.spec.robot import Legs
+from physics.dynamics.drive import BodyNow
 
 
 def torques_nm(
-    legs: Legs,
-    target_rad: Sequence[float],
-    angles_rad: Sequence[float],
-    speeds_radps: Sequence[float],
+    kp: Sequence[float], kd: Sequence[float], target_rad: Sequence[float], body: BodyNow
 ) -> list[float]:
-    """Return proportional-derivative torques within the joints' limits."""
+    """Return proportional-derivative torques in Nm, without limits.
+
+    kp, kd: gains in Nm/rad and Nm s/rad
+    """
     return [
-        min(max(kp * (goal - angle) - kd * speed, -most), most)
-        for kp, kd, most, goal, angle, speed in zip(
-            legs.kp,
-            legs.kd,
-            legs.torque_nm,
-            target_rad,
-            angles_rad,
-            speeds_radps,
-            strict=True,
+        stiff * (goal - angle) - damping * speed
+        for stiff, damping, goal, angle, speed in zip(
+            kp, kd, target_rad, body.angles_rad, body.speeds_radps, strict=True
         )
     ]

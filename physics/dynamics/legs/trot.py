@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import BodyNow, towards
+from physics.dynamics.legs.pd import torques_nm
 
 HIP_ASIDE_M: Final = 0.0955
 """Distance in metres of a leg's plane from its hip joint."""
@@ -91,6 +92,7 @@ class Trot:
 
     def __init__(self, robot: Robot, legs: Legs, dt_s: float, gains: TrotGains = GAINS) -> None:
         self._ramps = robot.acceleration_mps2 * dt_s, robot.acceleration_radps2 * dt_s
+        self._legs = legs
         self._dt_s = dt_s
         self._gains = gains
         aside = HIP_ASIDE_M + gains.aside_m
@@ -108,6 +110,10 @@ class Trot:
         self._left_steps = 0
 
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
+        """Return the joints' torques in Nm for the next substep, without limits."""
+        return torques_nm(self._legs.kp, self._legs.kd, self.targets(command, body), body)
+
+    def targets(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the 12 target angles for the next substep."""
         gains, dt_s = self._gains, self._dt_s
         m, (vx, vy, vz), spin = body.rotation, body.velocity_mps, body.spin_radps
