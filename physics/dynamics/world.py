@@ -29,6 +29,7 @@ from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, Legs, Robot
 from cosim.spec.scenario import Barrier
 from physics.dynamics.bodies import Bodies, Moving
+from physics.dynamics.drive import Drive
 from physics.dynamics.drives import drive_of
 from physics.dynamics.legs.watch import LegWatch
 from physics.dynamics.movers import Mover, TickPoses, movers_near
@@ -74,6 +75,7 @@ class BulletWorld:
 
     surface: ground with buildings and props
     barriers, obstacles: additional static bodies of the episode
+    drive: replaces the robot's own drive
     """
 
     def __init__(
@@ -82,12 +84,13 @@ class BulletWorld:
         barriers: Sequence[Barrier] = (),
         robot: Robot = COURIER,
         obstacles: Sequence[Obstacle] = (),
+        drive: Drive | None = None,
     ) -> None:
         self.surface = surface
         self.robot = robot
         self.barriers = tuple(barriers)
         self.obstacles = tuple(obstacles)
-        self._drive = drive_of(robot, SUBSTEP_S)
+        self._drive = drive_of(robot, SUBSTEP_S) if drive is None else drive
         self._watch: LegWatch | None = None
         if isinstance(robot.drive, Legs):
             self._watch = LegWatch(robot.drive, SUBSTEP_S)

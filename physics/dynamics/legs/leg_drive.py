@@ -28,13 +28,17 @@ _NONSENSE: Final = 20.0
 
 
 class LegDrive:
-    """Drive of a robot with legs. dt_s: duration of a substep."""
+    """Drive of a robot with legs.
+
+    dt_s: duration of a substep
+    gait: replaces the robot's own gait
+    """
 
     reads_joints = True
 
-    def __init__(self, robot: Robot, legs: Legs, dt_s: float) -> None:
+    def __init__(self, robot: Robot, legs: Legs, dt_s: float, gait: Gait | None = None) -> None:
         self._legs = legs
-        self._gait = GAITS[legs.gait](robot, legs, dt_s)
+        self._gait = GAITS[legs.gait](robot, legs, dt_s) if gait is None else gait
         self._settle = round(SETTLE_S / dt_s)
         self.reset()
 
