@@ -18,7 +18,7 @@ import numpy as np
 from cosim.core.errors import PolicyError
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
-from physics.dynamics.drive import BodyNow, towards
+from physics.dynamics.drive import BodyNow
 from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_manifest import (
     AngularVelocity,
@@ -65,8 +65,6 @@ class NetworkGait:
         manifest = setup.manifest
         self._manifest = manifest
         self._network = setup.network
-        self._ramps = robot.acceleration_mps2 * dt_s, robot.acceleration_radps2 * dt_s
-        self._limits = robot.v_max_mps, robot.w_max_radps
         self._every = round(1.0 / (manifest.rate_hz * dt_s))
         self._decision_s = self._every * dt_s
         self._order = [legs.joints.index(name) for name in manifest.joints]
@@ -105,8 +103,7 @@ class NetworkGait:
 
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
-        self._v_mps = towards(self._v_mps, command.v_mps, self._ramps[0])
-        self._w_radps = towards(self._w_radps, command.w_radps, self._ramps[1])
+        self._v_mps, self._w_radps = command.v_mps, command.w_radps
         asked = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
         if self._balance is not None and self._stands:
             if not self._frozen:
