@@ -13,6 +13,11 @@ def urdf_path(robot: Robot) -> Path:
     return Path(__file__).parent / robot.urdf
 
 
+def gait_path(robot: Robot) -> Path:
+    """Return the path of the manifest of a robot's own gait."""
+    return Path(__file__).parent / f"{robot.name}_gait.json"
+
+
 def robot_hash(robot: Robot) -> str:
     """Return a hash of a robot's specification and its URDF file."""
     return hashlib.blake2b(

@@ -12,7 +12,7 @@ from cosim.core.state import STILL, Command
 from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import BodyNow, Motors
 from physics.dynamics.legs.gait import Gait
-from physics.dynamics.legs.published import published_gait
+from physics.dynamics.legs.gait_file import published_gait
 from physics.dynamics.legs.trot import Trot
 
 SETTLE_S: Final = 0.5

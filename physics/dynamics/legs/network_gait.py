@@ -50,10 +50,11 @@ _STILL: Final = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class NetworkSetup:
-    """Gait to run: its manifest, checked against the robot, and its network."""
+    """Gait to run: its manifest, checked against the robot, its network, and a hash of both."""
 
     manifest: GaitManifest
     network: Network
+    digest: str
 
 
 class NetworkGait:

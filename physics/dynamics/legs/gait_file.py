@@ -1,0 +1,92 @@
+"""Load a gait: its manifest, and the network beside it or in a folder of weights."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from pathlib import Path
+from typing import Final
+
+from cosim.core.errors import SpecError, UsageError
+from cosim.core.npz import read_open_npz
+from cosim.policies.onnx.weights import NetworkFile, read_file, weights_file
+from cosim.spec.robot import Legs, Robot
+from physics.dynamics.legs.gait_graph import network_of_graph
+from physics.dynamics.legs.gait_manifest import GaitManifest, read_gait_manifest
+from physics.dynamics.legs.network import Network, network_of
+from physics.dynamics.legs.network_gait import NetworkGait, NetworkSetup
+from physics.robots import gait_path
+from physics.robots.make_urdf import MODELS
+
+_ONNX: Final = "onnx:"
+_MOST_BYTES: Final = 64 << 20
+"""Largest size of a gait's network in bytes."""
+
+
+def user_gait(name: str, robot: Robot, substep_s: float) -> NetworkSetup:
+    """Load the gait `onnx:FILE.onnx` with the manifest FILE.json beside it.
+
+    Raises UsageError or SpecError for a missing, invalid or unsuitable file.
+    """
+    path = Path(name.removeprefix(_ONNX))
+    if not name.startswith(_ONNX) or path.suffix != ".onnx":
+        raise UsageError(f"gait '{name}': use onnx:FILE.onnx, with its manifest FILE.json beside")
+    if not path.is_file():
+        raise UsageError(f"gait '{name}': {path} does not exist")
+    manifest_path = path.with_suffix(".json")
+    setup = _load(manifest_path, robot, substep_s)
+    if setup.manifest.model != path.name:
+        raise SpecError(f"{manifest_path}: model is {setup.manifest.model!r}, not {path.name!r}")
+    return setup
+
+
+def published_gait(robot: Robot, legs: Legs, dt_s: float) -> NetworkGait:
+    """Return the gait of a robot's own manifest."""
+    return network_gait(robot, legs, dt_s, _load(gait_path(robot), robot, dt_s))
+
+
+def network_gait(robot: Robot, legs: Legs, dt_s: float, setup: NetworkSetup) -> NetworkGait:
+    """Return a gait for a robot. dt_s: duration of a substep."""
+    return NetworkGait(robot, legs, dt_s, setup, MODELS[robot.name])
+
+
+def _load(manifest_path: Path, robot: Robot, substep_s: float) -> NetworkSetup:
+    manifest = read_gait_manifest(manifest_path)
+    try:
+        manifest.check_robot(robot, substep_s)
+    except SpecError as error:
+        raise SpecError(f"{manifest_path}: {error}") from error
+    facts = manifest.files.get(manifest.model)
+    user = f"robot '{robot.name}', gait '{manifest.name}'"
+    path = weights_file(user, manifest.model, facts, manifest.source, [manifest_path.parent])
+    data = read_file(path, _MOST_BYTES)
+    NetworkFile(manifest.model, manifest.source, facts).check(path, data)
+    try:
+        network = _network(path, data)
+        _check_sizes(manifest, network)
+    except (ValueError, RecursionError) as error:
+        raise SpecError(f"{path}: {error}") from error
+    digest = hashlib.blake2b(manifest_path.read_bytes() + data, digest_size=16).hexdigest()
+    return NetworkSetup(manifest, network, digest)
+
+
+def _network(path: Path, data: bytes) -> Network:
+    if path.suffix == ".onnx":
+        return network_of_graph(data)
+    return network_of(read_open_npz(io.BytesIO(data), most_bytes=_MOST_BYTES))
+
+
+def _check_sizes(manifest: GaitManifest, network: Network) -> None:
+    """Raise ValueError unless inputs and outputs of the network are those of its manifest."""
+    inputs, outputs = manifest.sizes
+    if network.sizes[0] != inputs:
+        parts = ", ".join(
+            f"{term.__struct_config__.tag} {term.count(len(manifest.joints))}"
+            for term in manifest.observation
+        )
+        raise ValueError(
+            f"takes {network.sizes[0]} numbers, and the observation of its manifest has {inputs}: "
+            f"{parts}"
+        )
+    if network.sizes[1] != outputs:
+        raise ValueError(f"has {network.sizes[1]} outputs, and its manifest {outputs} joints")
