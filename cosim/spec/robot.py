@@ -276,8 +276,8 @@ WALKER = Robot(
     cruise_mps=0.9,
     v_max_mps=1.2,
     w_max_radps=0.65,
-    acceleration_mps2=1.0,
-    acceleration_radps2=2.0,
+    acceleration_mps2=1.5,
+    acceleration_radps2=4.0,
 )
 """Humanoid of 32 kg with the published masses and lengths of a G1."""
 

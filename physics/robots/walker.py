@@ -34,9 +34,7 @@ def _trunk() -> Link:
     for left in (1.0, -1.0):
         solids += [
             Solid("sphere", (0.10,), (0.0, left * 0.145, 0.29), colour="dark"),
-            Solid(
-                "cylinder", (0.07, 0.22), (0.0, left * 0.16, 0.19), _NONE, "body", touches=True
-            ),
+            Solid("cylinder", (0.07, 0.22), (0.0, left * 0.16, 0.19), _NONE, "body", touches=True),
             Solid(
                 "cylinder",
                 (0.06, 0.20),

@@ -68,9 +68,7 @@ def read_nodes(data: bytes) -> GraphNodes:
 
 def _parts(message: Message, number: int) -> list[Message]:
     """Return the messages in a field that may be repeated."""
-    return [
-        part for key, part in fields(message) if key == number and isinstance(part, memoryview)
-    ]
+    return [part for key, part in fields(message) if key == number and isinstance(part, memoryview)]
 
 
 def _text(message: Message, number: int) -> str:

@@ -76,7 +76,9 @@ def _read_old(file: io.BytesIO) -> dict[str, NDArray[Any]]:
         if len(numbers) != count * dtype.itemsize:
             raise ValueError("ends too early")
         stored[key] = np.frombuffer(numbers, dtype)
-    return {name: _array(name, tensor, stored[tensor.stored[1]]) for name, tensor in tensors.items()}
+    return {
+        name: _array(name, tensor, stored[tensor.stored[1]]) for name, tensor in tensors.items()
+    }
 
 
 def _read_zip(file: io.BytesIO) -> dict[str, NDArray[Any]]:
@@ -93,7 +95,9 @@ def _read_zip(file: io.BytesIO) -> dict[str, NDArray[Any]]:
             key: np.frombuffer(held.read(f"{folder}data/{key}"), kind)
             for kind, key in {tensor.stored for tensor in tensors.values()}
         }
-    return {name: _array(name, tensor, stored[tensor.stored[1]]) for name, tensor in tensors.items()}
+    return {
+        name: _array(name, tensor, stored[tensor.stored[1]]) for name, tensor in tensors.items()
+    }
 
 
 def _tensors(value: Any, name: str = "") -> Iterator[tuple[str, _Tensor]]:

@@ -84,8 +84,7 @@ def weights_file(
     wanted = f": from {source}" if source else ""
     looked = ", ".join(map(str, places))
     raise UsageError(
-        f"{user}: {name} is missing{size}{wanted}. Looked for in {looked} (set "
-        f"{WEIGHTS_VARIABLE})"
+        f"{user}: {name} is missing{size}{wanted}. Looked for in {looked} (set {WEIGHTS_VARIABLE})"
     )
 
 

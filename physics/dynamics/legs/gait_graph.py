@@ -112,9 +112,11 @@ class _Chain:
 
     def _lstm(self, node: Node) -> None:
         """Read a recurrent layer; ONNX orders its gates input, output, forget, cell."""
-        if node.attributes.get("direction", "forward") != "forward" or set(
-            node.attributes
-        ) - {"direction", "hidden_size", "layout"}:
+        if node.attributes.get("direction", "forward") != "forward" or set(node.attributes) - {
+            "direction",
+            "hidden_size",
+            "layout",
+        }:
             raise ValueError("LSTM must be of one direction, with its usual activations")
         if len(node.inputs) > 7 and node.inputs[7]:
             raise ValueError("LSTM has peepholes, which are not read")
@@ -123,9 +125,7 @@ class _Chain:
         order = np.r_[0:size, 2 * size : 3 * size, 3 * size : 4 * size, size : 2 * size]
         weight, more = self._folded(given[order].T)
         total = (bias[: 4 * size] + bias[4 * size :])[order] + more
-        self._layers.append(
-            Lstm(_narrow(np.concatenate([weight, own[order].T])), _narrow(total))
-        )
+        self._layers.append(Lstm(_narrow(np.concatenate([weight, own[order].T])), _narrow(total)))
         self._go_on(node.outputs[:2])
 
     def _shift(self, node: Node) -> None:

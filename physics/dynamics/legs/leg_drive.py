@@ -72,6 +72,5 @@ class LegDrive:
                     f"{most:g} Nm, and gaits may exceed it {_NONSENSE:g} times at most"
                 )
         return [
-            min(max(torque, -most), most)
-            for torque, most in zip(torques_nm, limits, strict=True)
+            min(max(torque, -most), most) for torque, most in zip(torques_nm, limits, strict=True)
         ]

@@ -160,7 +160,9 @@ class NetworkGait:
         m, (vx, vy, _) = body.rotation, body.velocity_mps
         ahead = (m[0] * vx + m[3] * vy) / math.hypot(m[0], m[3])
         v_more = self._v_more + speed.gain_hz * (self._v_mps - ahead) * self._decision_s
-        w_more = self._w_more + turn.gain_hz * (self._w_radps - body.spin_radps[2]) * self._decision_s
+        w_more = (
+            self._w_more + turn.gain_hz * (self._w_radps - body.spin_radps[2]) * self._decision_s
+        )
         self._v_more = min(max(v_more, -_INTEGRAL_MOST), _INTEGRAL_MOST)
         self._w_more = min(max(w_more, -_INTEGRAL_MOST), _INTEGRAL_MOST)
         return (
@@ -193,7 +195,11 @@ class NetworkGait:
         most = manifest.most_answered
         self._actions = [min(max(value, -most), most) for value in answer.tolist()]
         if not all(map(math.isfinite, self._actions)):
-            bad = [name for name, value in zip(manifest.joints, self._actions, strict=True) if not math.isfinite(value)]
+            bad = [
+                name
+                for name, value in zip(manifest.joints, self._actions, strict=True)
+                if not math.isfinite(value)
+            ]
             raise PolicyError(f"gait '{manifest.name}' answered NaN for {', '.join(bad)}")
         targets = [0.0] * len(self._order)
         for k, rest, scale, action in zip(
@@ -223,7 +229,11 @@ class NetworkGait:
             return [body.speeds_radps[k] for k in self._order]
         if isinstance(term, PastActions):
             return self._actions
-        turns = 2.0 * math.pi * math.fmod(self._count // self._every * self._decision_s / term.period_s, 1.0)
+        turns = (
+            2.0
+            * math.pi
+            * math.fmod(self._count // self._every * self._decision_s / term.period_s, 1.0)
+        )
         return math.sin(turns), math.cos(turns)
 
 
