@@ -190,19 +190,27 @@ def stand(walk: Walk, seconds: float) -> tuple[float, float]:
 
 
 class Wandered(NamedTuple):
-    """Random commands: number, falls, mean errors of speed and yaw rate, largest tilt."""
+    """Motion by random commands.
+
+    commands, fallen: number of commands, and of falls.
+    error_mps, error_radps: mean errors of the mean speeds over the second half of each command.
+    sway_mps, sway_radps: mean standard deviations of the speeds, means of a gait cycle, there.
+    jitter_deg: standard deviation of the trunk's pitch.
+    """
 
     commands: int
     fallen: int
     error_mps: float
     error_radps: float
+    sway_mps: float
+    sway_radps: float
     jitter_deg: float
 
 
 def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> Wandered:
     """Follow random commands of COMMAND_S each.
 
-    A tenth are to stand. The errors are those of the means over the second half of each command.
+    A tenth are to stand.
     """
     draws = np.random.default_rng(seed)
     count = round(60.0 * minutes / COMMAND_S)
@@ -212,12 +220,14 @@ def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> Wandered:
         command = Command(v * robot.v_max_mps, (2.0 * w - 1.0) * robot.w_max_radps)
         command = STILL if rests < 0.1 else command
         motions = walk.drive(command, COMMAND_S)
-        v_mps, w_radps = mean_speeds(motions[len(motions) // 2 :])
-        errors.append((abs(v_mps - command.v_mps), abs(w_radps - command.w_radps)))
+        half = motions[len(motions) // 2 :]
+        speeds = np.array([(m.robot.v_mps, m.robot.w_radps) for m in half])
+        error = np.abs(speeds.mean(axis=0) - (command.v_mps, command.w_radps))
+        errors.append([*error.tolist(), *speeds.std(axis=0).tolist()])
         pitches += [m.robot.legs.pitch_rad for m in motions if m.robot.legs is not None]
-    error = np.array(errors).mean(axis=0).tolist()
+    means = np.array(errors).mean(axis=0).tolist()
     jitter_deg = math.degrees(float(np.std(pitches))) if pitches else 0.0
-    return Wandered(count, walk.fallen, *error, jitter_deg)
+    return Wandered(count, walk.fallen, *means, jitter_deg)
 
 
 def down_curb(robot: Robot, v_mps: float, start_m: float, drive: Drive | None = None) -> int:
