@@ -225,6 +225,7 @@ class StateHash:
         street = step.street_after
         for array in (
             np.array([*robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad]),
+            np.array(() if robot.legs is None else robot.legs.angles_rad),
             step.motion.trace,
             street.people.xy,
             street.people.heading,

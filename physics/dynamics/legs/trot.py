@@ -40,22 +40,24 @@ class TrotGains(NamedTuple):
     lift_m: height of the swinging feet.
     catch_s: shift of the touch-down per difference of measured and commanded speed.
     level: share of a tilt that the legs' lengths undo.
-    v_factor, v_gain_hz: factor and integral gain of the speed.
-    w_factor, w_gain_hz: the same of the yaw rate.
+    v_factor, v_share, v_gain_hz: factor, proportional and integral gain of the speed.
+    w_factor, w_share, w_gain_hz: the same of the yaw rate.
     aside_m: distance of the feet outside of the legs' planes.
     ahead_m: distance of the feet ahead of the hips.
     sink_m: depth below the ground to which feet are pressed at touch-down.
     shake_mps, shake_rad: measured speed and tilt above which a standing robot steps.
     """
 
-    half_period_s: float = 0.111
+    half_period_s: float = 0.11
     height_m: float = 0.255
     lift_m: float = 0.066
-    catch_s: float = 0.035
+    catch_s: float = 0.03
     level: float = 0.35
     v_factor: float = 1.048
+    v_share: float = 0.3
     v_gain_hz: float = 0.65
     w_factor: float = 1.0
+    w_share: float = 0.4
     w_gain_hz: float = 1.5
     aside_m: float = 0.0
     ahead_m: float = 0.0
@@ -132,8 +134,8 @@ class Trot:
         if not self._left_steps:
             self._v_more = self._w_more = 0.0
             return self._angles(m, 0.0)
-        self._correct(ahead, turn)
-        self._carry()
+        self._correct(command, ahead, turn)
+        self._carry(ahead, turn)
         self._swing(ahead, left, turn)
         targets = self._angles(m, math.sin(math.pi * self._phase_s / gains.half_period_s))
         self._phase_s += dt_s
@@ -148,19 +150,21 @@ class Trot:
         for leg in _PAIRS[self._swings]:
             self._lifted[leg] = list(self._feet[leg])
 
-    def _correct(self, ahead: float, turn: float) -> None:
-        """Integrate the errors of speed and yaw rate."""
+    def _correct(self, command: Command, ahead: float, turn: float) -> None:
+        """Integrate the errors of speed and yaw rate, except on the ramps."""
         gains, dt_s = self._gains, self._dt_s
-        v_more = self._v_more + gains.v_gain_hz * (self._v_mps - ahead) * dt_s
-        w_more = self._w_more + gains.w_gain_hz * (self._w_radps - turn) * dt_s
-        self._v_more = min(max(v_more, -_INTEGRAL_MPS), _INTEGRAL_MPS)
-        self._w_more = min(max(w_more, -_INTEGRAL_RADPS), _INTEGRAL_RADPS)
+        if self._v_mps == command.v_mps:
+            v_more = self._v_more + gains.v_gain_hz * (self._v_mps - ahead) * dt_s
+            self._v_more = min(max(v_more, -_INTEGRAL_MPS), _INTEGRAL_MPS)
+        if self._w_radps == command.w_radps:
+            w_more = self._w_more + gains.w_gain_hz * (self._w_radps - turn) * dt_s
+            self._w_more = min(max(w_more, -_INTEGRAL_RADPS), _INTEGRAL_RADPS)
 
-    def _carry(self) -> None:
+    def _carry(self, ahead: float, turn: float) -> None:
         """Move the feet on the ground backwards by the commanded motion."""
         gains, dt_s = self._gains, self._dt_s
-        v = gains.v_factor * self._v_mps + self._v_more
-        w = gains.w_factor * self._w_radps + self._w_more
+        v = gains.v_factor * self._v_mps + self._v_more + gains.v_share * (self._v_mps - ahead)
+        w = gains.w_factor * self._w_radps + self._w_more + gains.w_share * (self._w_radps - turn)
         for leg in _PAIRS[1 - self._swings]:
             foot, (hip_x, hip_y) = self._feet[leg], HIPS_M[leg]
             x, y = hip_x + foot[0], hip_y + foot[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -49,7 +50,7 @@ class Course(Surface):
         x0 = self._profile[0][0]
         x = (x - x0) % self._period_m + x0
         height = np.full(len(x), -np.inf)
-        for (x0, z0), (x1, z1) in zip(self._profile, self._profile[1:], strict=False):
+        for (x0, z0), (x1, z1) in pairwise(self._profile):
             here = (x0 <= x) & (x <= x1)
             share = (x - x0) / (x1 - x0) if x1 > x0 else np.zeros(len(x))
             slope = z0 + share * (z1 - z0) if x1 > x0 else np.full(len(x), max(z0, z1))
@@ -67,7 +68,7 @@ class Course(Surface):
             shift = number * self._period_m
             corners += [(x + shift, z) for x, z in self._profile]
         quads = []
-        for (x0, z0), (x1, z1) in zip(corners, corners[1:], strict=False):
+        for (x0, z0), (x1, z1) in pairwise(corners):
             a, b = max(x0, left), min(x1, right)
             if a > b or (x0, z0) == (x1, z1):
                 continue
@@ -87,9 +88,7 @@ class Course(Surface):
 
 FLAT: Final = Course([(0.0, 0.0), (96.0, 0.0)])
 """Level ground."""
-RAMPS: Final = Course(
-    [(0.0, 0.0), (2.0, 0.0), (3.44, 0.12), (6.0, 0.12), (7.44, 0.0), (9.6, 0.0)]
-)
+RAMPS: Final = Course([(0.0, 0.0), (2.0, 0.0), (3.44, 0.12), (6.0, 0.12), (7.44, 0.0), (9.6, 0.0)])
 """Ramps of 1:12 to the height of a curb."""
 STEPS: Final = Course([(0.0, 0.0), (1.5, 0.0), (1.5, 0.03), (3.0, 0.03), (3.0, 0.0)])
 """Steps of 3 cm."""
@@ -134,9 +133,7 @@ class Walk:
 
 
 @contextmanager
-def walking(
-    robot: Robot, course: Course, pose: Pose, drive: Drive | None = None
-) -> Iterator[Walk]:
+def walking(robot: Robot, course: Course, pose: Pose, drive: Drive | None = None) -> Iterator[Walk]:
     """Provide a robot on a course."""
     with BulletWorld(course, robot=robot, drive=drive) as world:
         yield Walk(world, pose)
@@ -175,12 +172,11 @@ def stop(walk: Walk, v_mps: float) -> tuple[float, float]:
     walk.drive(STILL, 0.5)
     walk.drive(Command(v_mps, 0.0), 4.0)
     begin = walk.robot.pose
-    for ticks in range(_CLOCK.ticks(5.0)):
+    ticks = 0
+    while ticks < _CLOCK.ticks(5.0) and (ticks == 0 or abs(walk.robot.v_mps) >= 0.05):
         walk.tick(STILL)
-        if abs(walk.robot.v_mps) < 0.05:
-            break
-    way_m = math.dist(begin.xy, walk.robot.pose.xy)
-    return _CLOCK.time_s(ticks + 1), way_m
+        ticks += 1
+    return _CLOCK.time_s(ticks), math.dist(begin.xy, walk.robot.pose.xy)
 
 
 def stand(walk: Walk, seconds: float) -> tuple[float, float]:
@@ -194,19 +190,27 @@ def stand(walk: Walk, seconds: float) -> tuple[float, float]:
 
 
 class Wandered(NamedTuple):
-    """Random commands: number, falls, mean errors of speed and yaw rate, largest tilt."""
+    """Motion by random commands.
+
+    commands, fallen: number of commands, and of falls.
+    error_mps, error_radps: mean errors of the mean speeds over the second half of each command.
+    sway_mps, sway_radps: mean standard deviations of the speeds, means of a gait cycle, there.
+    jitter_deg: standard deviation of the trunk's pitch.
+    """
 
     commands: int
     fallen: int
     error_mps: float
     error_radps: float
+    sway_mps: float
+    sway_radps: float
     jitter_deg: float
 
 
 def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> Wandered:
     """Follow random commands of COMMAND_S each.
 
-    A tenth are to stand. The errors are those of the means over the second half of each command.
+    A tenth are to stand.
     """
     draws = np.random.default_rng(seed)
     count = round(60.0 * minutes / COMMAND_S)
@@ -216,12 +220,14 @@ def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> Wandered:
         command = Command(v * robot.v_max_mps, (2.0 * w - 1.0) * robot.w_max_radps)
         command = STILL if rests < 0.1 else command
         motions = walk.drive(command, COMMAND_S)
-        v_mps, w_radps = mean_speeds(motions[len(motions) // 2 :])
-        errors.append((abs(v_mps - command.v_mps), abs(w_radps - command.w_radps)))
+        half = motions[len(motions) // 2 :]
+        speeds = np.array([(m.robot.v_mps, m.robot.w_radps) for m in half])
+        error = np.abs(speeds.mean(axis=0) - (command.v_mps, command.w_radps))
+        errors.append([*error.tolist(), *speeds.std(axis=0).tolist()])
         pitches += [m.robot.legs.pitch_rad for m in motions if m.robot.legs is not None]
-    error = np.array(errors).mean(axis=0).tolist()
+    means = np.array(errors).mean(axis=0).tolist()
     jitter_deg = math.degrees(float(np.std(pitches))) if pitches else 0.0
-    return Wandered(count, walk.fallen, *error, jitter_deg)
+    return Wandered(count, walk.fallen, *means, jitter_deg)
 
 
 def down_curb(robot: Robot, v_mps: float, start_m: float, drive: Drive | None = None) -> int:

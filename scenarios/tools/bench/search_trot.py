@@ -34,8 +34,10 @@ _SPREAD: Final = TrotGains(
     catch_s=0.012,
     level=0.12,
     v_factor=0.04,
+    v_share=0.15,
     v_gain_hz=0.3,
     w_factor=0.08,
+    w_share=0.15,
     w_gain_hz=0.8,
     aside_m=0.01,
     ahead_m=0.01,
@@ -61,7 +63,8 @@ def cost(gains: TrotGains, enough: float = np.inf) -> float:
     for seed, course in enumerate((FLAT, RAMPS, STEPS)):
         with walking(DOG, course, Pose(-40.0, 0.0, 0.0), drive()) as walk:
             found = wander(walk, DOG, _MINUTES, seed)
-        total += found.fallen + found.error_mps + found.error_radps + 0.02 * found.jitter_deg
+        total += found.fallen + 0.02 * found.jitter_deg
+        total += found.error_mps + found.error_radps + found.sway_mps + 0.5 * found.sway_radps
         if total > enough:
             return total
     with walking(DOG, FLAT, Pose(-40.0, 0.0, 0.0), drive()) as walk:

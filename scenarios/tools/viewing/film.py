@@ -221,7 +221,7 @@ class _Reel:
         self._cut = cut
         self._last = last
         self._progress = progress
-        self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
+        self._counts = {"collision": 0, "out_of_lane": 0, "fall": 0, "freezing": 0}
         self._triggered: set[str] = set()
         self._caption = ("", hud.INK)
         self._caption_until = -1
