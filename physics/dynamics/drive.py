@@ -18,6 +18,9 @@ from cosim.spec.robot import Robot, Skid
 
 Vector = tuple[float, float, float]
 
+SUBSTEP_S: Final = 0.005
+"""Duration of a physics substep in seconds."""
+
 _FEED_FORWARD: Final = 1.2
 """Feed-forward gain of the yaw-rate controller."""
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from cosim.spec.robot import Legs, Robot
-from physics.dynamics.drive import Drive, SkidDrive
+from physics.dynamics.drive import SUBSTEP_S, Drive, SkidDrive
+from physics.dynamics.legs.gait_file import network_gait, robot_legs, user_gait
 from physics.dynamics.legs.leg_drive import LegDrive
 
 
@@ -12,3 +13,19 @@ def drive_of(robot: Robot, dt_s: float) -> Drive:
     if isinstance(robot.drive, Legs):
         return LegDrive(robot, robot.drive, dt_s)
     return SkidDrive(robot, robot.drive, dt_s)
+
+
+def gait_drive(robot: Robot, gait: str, dt_s: float = SUBSTEP_S) -> Drive:
+    """Return the drive of a robot with a gait of the user, "onnx:FILE.onnx".
+
+    Raises UsageError or SpecError for a missing, invalid or unsuitable file.
+    """
+    legs = robot_legs(robot, gait)
+    return LegDrive(
+        robot, legs, dt_s, network_gait(robot, legs, dt_s, user_gait(gait, robot, dt_s))
+    )
+
+
+def gait_hash(gait: str, robot: Robot) -> str:
+    """Return the hash of a gait's files. Raises as `gait_drive` does."""
+    return user_gait(gait, robot, SUBSTEP_S).digest

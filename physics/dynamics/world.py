@@ -29,15 +29,12 @@ from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, Legs, Robot
 from cosim.spec.scenario import Barrier
 from physics.dynamics.bodies import Bodies, Moving
-from physics.dynamics.drive import Drive
+from physics.dynamics.drive import SUBSTEP_S, Drive
 from physics.dynamics.drives import drive_of
 from physics.dynamics.legs.watch import LegWatch
 from physics.dynamics.movers import Mover, TickPoses, movers_near
 from physics.ground.tiles import Key, tile_distance, tile_distances_within, tiles_within
 from physics.street.surface import Surface, grounded_obstacles
-
-SUBSTEP_S: Final = 0.005
-"""Duration of a physics substep in seconds."""
 
 PEOPLE_REACH_M: Final = 6.0
 """Distance in metres within which people have collision bodies."""

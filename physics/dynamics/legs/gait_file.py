@@ -10,7 +10,7 @@ from typing import Final
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.npz import read_open_npz
 from cosim.policies.onnx.weights import NetworkFile, read_file, weights_file
-from cosim.spec.robot import Legs, Robot
+from cosim.spec.robot import ROBOTS, Legs, Robot
 from physics.dynamics.legs.gait_graph import network_of_graph
 from physics.dynamics.legs.gait_manifest import GaitManifest, read_gait_manifest
 from physics.dynamics.legs.network import Network, network_of
@@ -28,6 +28,7 @@ def user_gait(name: str, robot: Robot, substep_s: float) -> NetworkSetup:
 
     Raises UsageError or SpecError for a missing, invalid or unsuitable file.
     """
+    robot_legs(robot, name)
     path = Path(name.removeprefix(_ONNX))
     if not name.startswith(_ONNX) or path.suffix != ".onnx":
         raise UsageError(f"gait '{name}': use onnx:FILE.onnx, with its manifest FILE.json beside")
@@ -38,6 +39,14 @@ def user_gait(name: str, robot: Robot, substep_s: float) -> NetworkSetup:
     if setup.manifest.model != path.name:
         raise SpecError(f"{manifest_path}: model is {setup.manifest.model!r}, not {path.name!r}")
     return setup
+
+
+def robot_legs(robot: Robot, gait: str) -> Legs:
+    """Return the legs of a robot. Raises UsageError for wheels."""
+    if isinstance(robot.drive, Legs):
+        return robot.drive
+    walking = ", ".join(name for name, one in ROBOTS.items() if isinstance(one.drive, Legs))
+    raise UsageError(f"gait '{gait}': robot '{robot.name}' has wheels; with legs are {walking}")
 
 
 def published_gait(robot: Robot, legs: Legs, dt_s: float) -> NetworkGait:

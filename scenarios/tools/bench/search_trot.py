@@ -13,9 +13,9 @@ import numpy as np
 
 from cosim.core.geometry import Pose
 from cosim.spec.robot import DOG, Legs
+from physics.dynamics.drive import SUBSTEP_S
 from physics.dynamics.legs.leg_drive import LegDrive
 from physics.dynamics.legs.trot import GAINS, Trot, TrotGains
-from physics.dynamics.world import SUBSTEP_S
 from scenarios.tools.bench.legs import (
     FLAT,
     RAMPS,
