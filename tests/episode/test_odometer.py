@@ -55,7 +55,8 @@ def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
     """1 m aside is counted to a few per cent; over 30 m the heading drifts by 15 degrees."""
     aside = [
         driven(
-            odometer_for("wheel", START, np.random.default_rng(seed), DOG), [START, Pose(0, 1, 0)]
+            odometer_for("wheel", START, np.random.default_rng(seed), DOG),
+            [START, Pose(9.0, 20.0, 0.5 * math.pi)],
         )
         for seed in range(200)
     ]
