@@ -100,10 +100,11 @@ class Walk:
     """A robot on a course, driven by commands.
 
     fallen: number of falls so far
+    robot: its last state
     """
 
     def __init__(self, world: BulletWorld, pose: Pose) -> None:
-        self._world = world
+        self.world = world
         self._down_ticks = 0
         self.fallen = 0
         self.robot = world.place(pose)
@@ -114,13 +115,13 @@ class Walk:
 
     def tick(self, command: Command) -> Motion:
         """Run one tick. A fallen robot is put back standing at its place."""
-        motion = self._world.step(command, _EMPTY, _EMPTY, _CLOCK.substeps)
+        motion = self.world.step(command, _EMPTY, _EMPTY, _CLOCK.substeps)
         self.robot = motion.robot
         self._down_ticks = self._down_ticks + 1 if motion.down else 0
         if self._down_ticks > FALL_TICKS:
             self.fallen += 1
             self._down_ticks = 0
-            self.robot = self._world.place(motion.robot.pose)
+            self.robot = self.world.place(motion.robot.pose)
         return motion
 
     def along(self, v_mps: float, heading_rad: float, most_radps: float = 0.65) -> Motion:
