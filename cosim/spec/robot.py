@@ -246,7 +246,7 @@ DOG = Robot(
 WALKER = Robot(
     name="walker",
     urdf="walker.urdf",
-    length_m=0.28,
+    length_m=0.26,
     width_m=0.40,
     height_m=1.32,
     com_height_m=0.93,
@@ -269,9 +269,9 @@ WALKER = Robot(
         weights="cf668f75b90d1abf73d2b87612a6e76bccc61ff7e083b63582d3f6aaa3c1759d",
     ),
     mounts={
-        "front": Mount((0.09, 0.0, 1.25), 10.0),
-        "left": Mount((0.02, 0.09, 1.24), 10.0, 60.0, most_hz=10.0),
-        "right": Mount((0.02, -0.09, 1.24), 10.0, -60.0, most_hz=10.0),
+        "front": Mount((0.09, 0.0, 1.20), 10.0),
+        "left": Mount((0.02, 0.09, 1.19), 10.0, 60.0, most_hz=10.0),
+        "right": Mount((0.02, -0.09, 1.19), 10.0, -60.0, most_hz=10.0),
     },
     cruise_mps=0.9,
     v_max_mps=1.2,

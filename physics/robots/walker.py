@@ -29,7 +29,8 @@ def _trunk() -> Link:
         Solid("box", (0.02, 0.16, 0.12), (0.081, 0.0, 0.25), colour="lid"),
         Solid("cylinder", (0.07, 0.08), (0.0, 0.0, 0.37), colour="dark", touches=True),
         Solid("sphere", (0.15,), (0.005, 0.0, 0.455), colour="body", touches=True),
-        Solid("box", (0.03, 0.11, 0.06), (0.07, 0.0, 0.465), colour="dark"),
+        Solid("box", (0.03, 0.11, 0.06), (0.07, 0.0, 0.42), colour="dark"),
+        Solid("box", (0.05, 0.16, 0.22), (-0.105, 0.0, 0.22), colour="lid", touches=True),
     ]
     for left in (1.0, -1.0):
         solids += [

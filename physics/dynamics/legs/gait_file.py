@@ -54,6 +54,21 @@ def published_gait(robot: Robot, legs: Legs, dt_s: float) -> NetworkGait:
     return network_gait(robot, legs, dt_s, _load(gait_path(robot), robot, dt_s))
 
 
+def weights_in_words(robot: Robot) -> str:
+    """Describe where the weights of a robot's own gait are, or that they are missing.
+
+    The text begins with a comma, and is empty for a robot without weights.
+    """
+    if not isinstance(robot.drive, Legs) or robot.drive.gait != "network":
+        return ""
+    manifest_path = gait_path(robot)
+    manifest = read_gait_manifest(manifest_path)
+    try:
+        return f", weights {_model_path(manifest_path, manifest)}"
+    except UsageError:
+        return f", weights missing ({manifest.model})"
+
+
 def network_gait(robot: Robot, legs: Legs, dt_s: float, setup: NetworkSetup) -> NetworkGait:
     """Return a gait for a robot. dt_s: duration of a substep."""
     return NetworkGait(robot, legs, dt_s, setup, MODELS[robot.name])
@@ -66,8 +81,7 @@ def _load(manifest_path: Path, robot: Robot, substep_s: float) -> NetworkSetup:
     except SpecError as error:
         raise SpecError(f"{manifest_path}: {error}") from error
     facts = manifest.files.get(manifest.model)
-    user = f"robot '{robot.name}', gait '{manifest.name}'"
-    path = weights_file(user, manifest.model, facts, manifest.source, [manifest_path.parent])
+    path = _model_path(manifest_path, manifest)
     data = read_file(path, _MOST_BYTES)
     NetworkFile(manifest.model, manifest.source, facts).check(path, data)
     try:
@@ -77,6 +91,13 @@ def _load(manifest_path: Path, robot: Robot, substep_s: float) -> NetworkSetup:
         raise SpecError(f"{path}: {error}") from error
     digest = hashlib.blake2b(manifest_path.read_bytes() + data, digest_size=16).hexdigest()
     return NetworkSetup(manifest, network, digest)
+
+
+def _model_path(manifest_path: Path, manifest: GaitManifest) -> Path:
+    """Return the path of a gait's network. Raises UsageError if it is missing."""
+    facts = manifest.files.get(manifest.model)
+    user = f"gait '{manifest.name}' of robot '{manifest.robot}'"
+    return weights_file(user, manifest.model, facts, manifest.source, [manifest_path.parent])
 
 
 def _network(path: Path, data: bytes) -> Network:
