@@ -131,7 +131,7 @@ class Column(NamedTuple):
         """Return the column for one value per tick."""
         array = np.array(values, self.dtype)
         if self.width == VARIES:
-            return array.reshape(len(values), -1) if array.size else np.empty((len(values), 0))
+            return array.reshape(len(values), -1 if array.size else 0)
         return array.reshape((len(values), self.width) if self.width else len(values))
 
 
@@ -175,8 +175,8 @@ class Log:
     reset_s_m (T,): arc length that the robot was reset to after the tick, NaN without a reset
     waits_at_red (T,) bool: whether the robot waits at a red light
     on_carriageway (T,) bool, vehicles_braked (T,): see `cosim.results.traffic`
-    legs (T, 4 + J): of robots with legs: 1 if it is down (`Motion.down`), height of the base frame,
-        roll and pitch of the trunk, J joint angles, metres and rad; (T, 0) for wheels
+    legs (T, 4 + J) float32: of robots with legs: 1 if it is down (`Motion.down`), height of the
+        base frame, roll and pitch of the trunk, J joint angles, metres and rad; (T, 0) for wheels
     people_tick (P,), people_xy (P, 2), people_kind (P,), people_age (P,): people within 30 m once a
         second, with `PersonKind` and `Age`, for pictures
     event_tracks (E, 5): tick, event, person in it, x m, y m, from each event's trigger on
@@ -223,8 +223,10 @@ class Log:
     vehicles_braked: NDArray[np.int64] = field(
         metadata=_column(lambda tick: tick.road.braked, dtype=np.int64, replayed=False)
     )
-    legs: Floats = field(
-        default_factory=lambda: np.empty((0, 0)), metadata=_column(_legs_of, VARIES), kw_only=True
+    legs: NDArray[np.float32] = field(
+        default_factory=lambda: np.empty((0, 0), np.float32),
+        metadata=_column(_legs_of, VARIES, dtype=np.float32),
+        kw_only=True,
     )
     people_tick: NDArray[np.int64]
     people_xy: Floats
@@ -282,7 +284,7 @@ class Log:
                     raise ValueError("plan_sizes, plan_points and answers are not of each other")
                 values["plan_index"] = int(arrays["plan_index"])
             values["tick_s"] = float(values["tick_s"])
-            values.setdefault("legs", np.empty((len(np.atleast_1d(values["pose"])), 0)))
+            values.setdefault("legs", np.empty((len(np.atleast_1d(values["pose"])), 0), np.float32))
             _check_shapes(values)
         except KeyError as error:
             raise RunError(f"{path}: not a trajectory: has no array {error}") from error

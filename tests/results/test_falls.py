@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from cosim.core.geometry import Floats
 from cosim.episode.loop import Step
 from cosim.results.log import Log
 from cosim.results.metrics import compute_metrics
@@ -59,7 +58,7 @@ def test_a_robot_that_a_person_pushes_over_has_not_failed(ends: bool) -> None:
 
 
 def with_legs(one: Log, ticks_down: range) -> Log:
-    rows: Floats = np.zeros((len(one), 16))
+    rows = np.zeros((len(one), 16), np.float32)
     rows[list(ticks_down), 0] = 1.0
     return dataclasses.replace(one, legs=rows)
 

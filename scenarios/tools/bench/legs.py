@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -13,8 +14,9 @@ from numpy.typing import ArrayLike
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose, wrap_angle
+from cosim.core.progress import Progress
 from cosim.core.state import STILL, Command, Motion, RobotState, Street
-from cosim.spec.robot import Robot
+from cosim.spec.robot import COURIER, Robot
 from physics.dynamics.drive import Drive
 from physics.dynamics.world import BulletWorld
 from physics.ground.mesh import Mesh
@@ -251,3 +253,100 @@ def up_curb(
         for _ in range(_CLOCK.ticks(2.5 / v_mps)):
             walk.along(v_mps, 0.0)
         return walk.robot, walk.fallen
+
+
+class LegFigure(NamedTuple):
+    """Measured figure of a robot with legs, and what it should be."""
+
+    name: str
+    value: str
+    target: str = ""
+
+
+CURB_PHASES: Final = 20
+"""Phases of the gait in which a curb is walked down."""
+
+
+def measure(robot: Robot, minutes: float, progress: Progress) -> list[LegFigure]:
+    """Measure a robot with legs. minutes: simulated time of random commands in all."""
+    start = Pose(-40.0, 0.0, 0.0)
+    v_mps = 5 / 6 * robot.cruise_mps
+    rows = []
+    with walking(robot, FLAT, start) as walk:
+        found = straight(walk, v_mps)
+    rows.append(
+        LegFigure(
+            f"10 m at {v_mps:.2g} m/s",
+            f"{found.time_s:.1f} s, {found.aside_m:.2f} m off the line, {found.fallen} falls",
+            "off by less than 0.3 m, no fall",
+        )
+    )
+    rows += [_steady(robot, start, v, 0.0, "") for v in (0.5, v_mps, robot.v_max_mps)]
+    rows += [
+        _steady(robot, start, v, robot.w_max_radps, "yaw rate within 15 %") for v in (v_mps, 0.0)
+    ]
+    with walking(robot, FLAT, start) as walk:
+        stop_s, way_m = stop(walk, v_mps)
+    rows.append(LegFigure("stop", f"{stop_s:.2f} s, {way_m:.2f} m", "0.5 m"))
+    with walking(robot, FLAT, start) as walk:
+        drift_m, turned_deg = stand(walk, 60.0)
+    drift = f"{100 * drift_m:.1f} cm, {turned_deg:.1f} deg"
+    rows.append(LegFigure("standing for 60 s", drift, "5 cm, 3 deg"))
+    rows += _curbs(robot, v_mps)
+    for number, (name, course) in enumerate(
+        (("level ground", FLAT), ("ramps of 1:12", RAMPS), ("steps of 3 cm", STEPS))
+    ):
+        progress(f"random commands on {name}", number / 3)
+        with walking(robot, course, start) as walk:
+            wandered = wander(walk, robot, minutes / 3, number)
+        rows.append(
+            LegFigure(
+                f"{minutes / 3:g} min of random commands, {name}",
+                f"{wandered.fallen} falls; errors {wandered.error_mps:.3f} m/s, "
+                f"{wandered.error_radps:.3f} rad/s; sway {wandered.sway_mps:.3f} m/s, "
+                f"{wandered.sway_radps:.3f} rad/s; pitch {wandered.jitter_deg:.1f} deg",
+                "1 fall in an hour; 0.1 m/s, 0.1 rad/s",
+            )
+        )
+    own, courier = (cpu_ms_per_s(one) for one in (robot, COURIER))
+    rows.append(
+        LegFigure(
+            "physics, CPU ms per simulated s",
+            f"{own:.1f}; courier {courier:.1f}",
+            "1.3 x the courier's in `cosim bench`",
+        )
+    )
+    return rows
+
+
+def _steady(robot: Robot, start: Pose, v_mps: float, w_radps: float, target: str) -> LegFigure:
+    """Measure the mean speeds of a steady command."""
+    command = Command(v_mps, w_radps)
+    with walking(robot, FLAT, start) as walk:
+        walk.drive(command, 3.0)
+        v, w = mean_speeds(walk.drive(command, 4.0))
+    asked = f"{v_mps:.2g} m/s, {w_radps:.2g} rad/s commanded"
+    return LegFigure(asked, f"{v:.2f} m/s, {w:.2f} rad/s", target)
+
+
+def _curbs(robot: Robot, v_mps: float) -> Iterator[LegFigure]:
+    """Measure walks down and up curbs."""
+    for v in (0.5, v_mps):
+        falls = sum(down_curb(robot, v, 0.6 + 0.011 * k) for k in range(CURB_PHASES))
+        target = "no fall" if v == 0.5 else ""
+        name = f"down {100 * CURB_M:.0f} cm at {v:.2g} m/s, {CURB_PHASES} phases"
+        yield LegFigure(name, f"{falls} falls", target)
+        for height_m in (0.03, 0.06, CURB_M):
+            state, fallen = up_curb(robot, v, height_m)
+            over = state.pose.x_m > 0.3
+            said = "falls" if fallen else "climbs" if over else "does not climb"
+            yield LegFigure(f"up {100 * height_m:.0f} cm at {v:.2g} m/s", said)
+
+
+def cpu_ms_per_s(robot: Robot, seconds: float = 20.0) -> float:
+    """Return the CPU time in ms of a simulated second of walking or driving at its pace."""
+    with walking(robot, FLAT, Pose(-40.0, 0.0, 0.0)) as walk:
+        walk.drive(Command(robot.cruise_mps, 0.2), 1.0)
+        began = time.process_time()
+        walk.drive(Command(robot.cruise_mps, 0.2), seconds)
+        return 1000.0 * (time.process_time() - began) / seconds
