@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from onnx import helper
 
+from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.spec.robot import DOG, Legs
 from tests.support.graphs import graph_bytes, port
 
@@ -40,19 +44,56 @@ MANIFEST: dict[str, Any] = {
 def layers_graph(seed: int = 0, sizes: tuple[int, ...] = (45, 16, 12), scale: float = 0.1) -> bytes:
     """Layers with ELU between them."""
     rng = np.random.default_rng(seed)
+    return graph_of_layers(
+        [
+            (
+                (scale * rng.normal(size=(told, given))).astype(np.float32),
+                (scale * rng.normal(size=told)).astype(np.float32),
+            )
+            for given, told in pairwise(sizes)
+        ]
+    )
+
+
+def graph_of_layers(layers: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> bytes:
+    """Layers of weights (outputs, inputs) and biases, with ELU between them."""
     nodes, weights, name = [], {}, "obs"
-    for k, (given, told) in enumerate(zip(sizes, sizes[1:], strict=False)):
-        last = k == len(sizes) - 2
-        weights[f"w{k}"] = (scale * rng.normal(size=(told, given))).astype(np.float32)
-        weights[f"b{k}"] = (scale * rng.normal(size=told)).astype(np.float32)
+    for k, (weight, bias) in enumerate(layers):
+        last = k == len(layers) - 1
+        weights |= {f"w{k}": weight, f"b{k}": bias}
         out = "actions" if last else f"x{k}"
         nodes.append(helper.make_node("Gemm", [name, f"w{k}", f"b{k}"], [out], transB=1))
         name = out
         if not last:
             nodes.append(helper.make_node("Elu", [out], [f"y{k}"]))
             name = f"y{k}"
-    ends = [port("obs", 1, sizes[0])], [port("actions", 1, sizes[-1])]
+    ends = [port("obs", 1, layers[0][0].shape[1])], [port("actions", 1, layers[-1][1].size)]
     return graph_bytes(nodes, *ends, weights)
+
+
+def robot_lab_gait(folder: Path, published: Path) -> Path:
+    """The published network of a Go2 as a gait of the dog, from the folder of its weights."""
+    arrays = read_torch_file((published / "policy.pt").read_bytes())
+    graph = graph_of_layers(
+        [(arrays[f"actor.{k}.weight"], arrays[f"actor.{k}.bias"]) for k in (0, 2, 4, 6)]
+    )
+    joints = {
+        f"{leg}_{part}": {"rest_rad": rest, "kp": 20, "kd": 0.5, "scale": scale}
+        for leg in ("front_right", "front_left", "rear_right", "rear_left")
+        for part, rest, scale in (("hip", 0.0, 0.125), ("thigh", 0.8, 0.25), ("calf", -1.5, 0.25))
+    }
+    observation = [
+        {"what": "command"} if term["what"] == "command" else term for term in OBSERVATION
+    ]
+    return written_gait(
+        folder,
+        graph,
+        name="robot_lab",
+        joints=joints,
+        observation=observation,
+        speed={"most": 1.0},
+        turn={"gain_hz": 1.0, "most": 1.0},
+    )
 
 
 def written_gait(folder: Path, graph: bytes | None = None, **changes: Any) -> Path:

@@ -117,10 +117,12 @@ class Correction(Ranged, frozen=True, kw_only=True):
     """Correction of a commanded speed. The network gets factor * speed plus an integral.
 
     gain_hz: integral gain of the difference between commanded and measured speed.
+    most: largest magnitude that the network gets, m/s or rad/s.
     """
 
     factor: Annotated[float, Within(0.5, 2)] = 1.0
     gain_hz: Annotated[float, Within(0, 10)] = 0.0
+    most: Annotated[float, Within(0, 10, above=True)] = 10.0
 
 
 class AnkleBalance(Ranged, frozen=True, kw_only=True):

@@ -165,10 +165,12 @@ class NetworkGait:
         )
         self._v_more = min(max(v_more, -_INTEGRAL_MOST), _INTEGRAL_MOST)
         self._w_more = min(max(w_more, -_INTEGRAL_MOST), _INTEGRAL_MOST)
+        v = speed.factor * self._v_mps + self._v_more
+        w = turn.factor * self._w_radps + self._w_more
         return (
-            speed.factor * self._v_mps + self._v_more,
+            min(max(v, -speed.most), speed.most),
             0.0,
-            turn.factor * self._w_radps + self._w_more,
+            min(max(w, -turn.most), turn.most),
         )
 
     def _holding(self, x_m: float, y_m: float, heading_rad: float) -> tuple[float, float, float]:
