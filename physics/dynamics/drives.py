@@ -27,5 +27,11 @@ def gait_drive(robot: Robot, gait: str, dt_s: float = SUBSTEP_S) -> Drive:
 
 
 def gait_hash(gait: str, robot: Robot) -> str:
-    """Return the hash of a gait's files. Raises as `gait_drive` does."""
-    return user_gait(gait, robot, SUBSTEP_S).digest
+    """Return the hash of the files of a user's gait; "" for the robot's own one.
+
+    Raises as `gait_drive` does, also if the weights of the robot's own gait are missing.
+    """
+    if gait:
+        return user_gait(gait, robot, SUBSTEP_S).digest
+    drive_of(robot, SUBSTEP_S)
+    return ""

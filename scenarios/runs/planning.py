@@ -166,7 +166,7 @@ def run_spec(
     if manifest.camera is not None:
         for robot in robots:
             check_camera(manifest, robot, options.own_camera)
-    gaits = [gait_hash(options.gait, robot) for robot in robots if options.gait]
+    gaits = [gait_hash(options.gait, robot) for robot in robots]
     setup = RunSetup.of(
         options,
         suite_hash=whole.content_hash,

@@ -97,7 +97,8 @@ def _model_path(manifest_path: Path, manifest: GaitManifest) -> Path:
     """Return the path of a gait's network. Raises UsageError if it is missing."""
     facts = manifest.files.get(manifest.model)
     user = f"gait '{manifest.name}' of robot '{manifest.robot}'"
-    return weights_file(user, manifest.model, facts, manifest.source, [manifest_path.parent])
+    beside = [manifest_path.parent] if manifest.model.endswith(".onnx") else []
+    return weights_file(user, manifest.model, facts, manifest.source, beside)
 
 
 def _network(path: Path, data: bytes) -> Network:
