@@ -48,8 +48,9 @@ def normal(seed: int, *shape: int) -> NDArray[np.float32]:
 def walker_like() -> Network:
     """A random network of the walker's sizes."""
     lstm = Lstm(normal(1, 47 + 64, 256), normal(2, 256))
-    layers = Dense(normal(3, 64, 32), normal(4, 32), "elu"), Dense(
-        normal(5, 32, 12), normal(6, 12), "linear"
+    layers = (
+        Dense(normal(3, 64, 32), normal(4, 32), "elu"),
+        Dense(normal(5, 32, 12), normal(6, 12), "linear"),
     )
     return Network((lstm, *layers))
 
@@ -253,7 +254,10 @@ def test_graphs_of_another_form_are_refused() -> None:
         ({"robot": "walker"}, "is a gait of robot 'walker', not of 'dog'"),
         ({"model": "other.onnx"}, "other.onnx"),
         (
-            {"joints": JOINTS | {"front_left_hip": {"rest_rad": 0, "kp": 9e9, "kd": 1, "scale": 1}}},
+            {
+                "joints": JOINTS
+                | {"front_left_hip": {"rest_rad": 0, "kp": 9e9, "kd": 1, "scale": 1}}
+            },
             r"kp must be in \[0, 2000\]",
         ),
         ({"files": {"tiny.onnx": {"bytes": 7, "blake2b": "0" * 64}}}, "wanted is tiny.onnx"),
@@ -359,7 +363,9 @@ def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> Non
 def test_another_file_makes_no_arrays(tmp_path: Path) -> None:
     """Neither another file, nor arrays of another network."""
     (tmp_path / "motion.pt").write_bytes(b"no weights")
-    with pytest.raises(UsageError, match=r"motion\.pt: 10 bytes, .*wanted is motion\.pt of unitree"):
+    with pytest.raises(
+        UsageError, match=r"motion\.pt: 10 bytes, .*wanted is motion\.pt of unitree"
+    ):
         WALKER_NETWORK.write(tmp_path / "motion.pt", tmp_path)
     with pytest.raises(ValueError, match=r"has no 'memory\.weight_ih_l0'"):
         walker_network({})

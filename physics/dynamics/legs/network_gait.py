@@ -45,6 +45,8 @@ _SLOW_RADPS: Final = 0.1
 """Mean yaw rate over a gait cycle below which a robot may stand."""
 _INTEGRAL_MOST: Final = 0.4
 """Largest integral of an error of speed, m/s or rad/s."""
+_HOLD_AFTER_S: Final = 0.6
+"""Time without a command after which a robot that still moves holds its place."""
 _STILL: Final = 1e-9
 
 
@@ -101,6 +103,7 @@ class NetworkGait:
         self._v_more = self._w_more = 0.0
         self._past: deque[tuple[float, float, float]] = deque(maxlen=self._cycle + 1)
         self._place: tuple[float, float, float] | None = None
+        self._idle_s = 0.0
 
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
@@ -128,7 +131,7 @@ class NetworkGait:
         heading = math.atan2(m[3], m[0])
         self._past.append((x, y, heading))
         if asked:
-            self._place = None
+            self._place, self._idle_s = None, 0.0
             command = self._corrected(body)
         else:
             self._v_more = self._w_more = 0.0
@@ -138,7 +141,8 @@ class NetworkGait:
                 self._stands = self._frozen = self._balance.holds(body)
                 if self._stands:
                     return
-            if slow and self._place is None:
+            self._idle_s += self._decision_s
+            if self._place is None and (slow or self._idle_s > _HOLD_AFTER_S):
                 self._place = x, y, heading
             command = self._holding(x, y, heading)
         self._ask(command, body)
