@@ -40,6 +40,7 @@ class TrotGains(NamedTuple):
     lift_m: height of the swinging feet.
     catch_s: shift of the touch-down per difference of measured and commanded speed.
     level: share of a tilt that the legs' lengths undo.
+    v_start_mps: speed that cancels the drift of steps on the spot.
     v_factor, v_share, v_gain_hz: factor, proportional and integral gain of the speed.
     w_factor, w_share, w_gain_hz: the same of the yaw rate.
     aside_m: distance of the feet outside of the legs' planes.
@@ -48,19 +49,20 @@ class TrotGains(NamedTuple):
     shake_mps, shake_rad: measured speed and tilt above which a standing robot steps.
     """
 
-    half_period_s: float = 0.11
+    half_period_s: float = 0.095
     height_m: float = 0.255
-    lift_m: float = 0.066
-    catch_s: float = 0.03
-    level: float = 0.35
-    v_factor: float = 1.048
-    v_share: float = 0.3
-    v_gain_hz: float = 0.65
-    w_factor: float = 1.0
-    w_share: float = 0.4
-    w_gain_hz: float = 1.5
-    aside_m: float = 0.0
-    ahead_m: float = 0.0
+    lift_m: float = 0.07
+    catch_s: float = 0.0166
+    level: float = 0.342
+    v_start_mps: float = 0.11
+    v_factor: float = 1.046
+    v_share: float = 0.333
+    v_gain_hz: float = 0.967
+    w_factor: float = 0.96
+    w_share: float = 0.44
+    w_gain_hz: float = 0.756
+    aside_m: float = -0.02
+    ahead_m: float = 0.0138
     sink_m: float = 0.0
     shake_mps: float = 0.25
     shake_rad: float = 0.25
@@ -104,7 +106,7 @@ class Trot:
     def reset(self) -> None:
         """Return to standing at rest with both feet of all pairs under the hips."""
         self._v_mps = self._w_radps = 0.0
-        self._v_more = self._w_more = 0.0
+        self._v_more, self._w_more = self._gains.v_start_mps, 0.0
         self._feet = [list(foot) for foot in self._neutral]
         self._lifted = [list(foot) for foot in self._neutral]
         self._phase_s = 0.0
@@ -132,7 +134,7 @@ class Trot:
                 self._begin()
             self._left_steps = _STEPS_TO_STAND
         if not self._left_steps:
-            self._v_more = self._w_more = 0.0
+            self._v_more, self._w_more = gains.v_start_mps, 0.0
             return self._angles(m, 0.0)
         self._correct(command, ahead, turn)
         self._carry(ahead, turn)

@@ -33,6 +33,7 @@ _SPREAD: Final = TrotGains(
     lift_m=0.012,
     catch_s=0.012,
     level=0.12,
+    v_start_mps=0.02,
     v_factor=0.04,
     v_share=0.15,
     v_gain_hz=0.3,
