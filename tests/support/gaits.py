@@ -14,6 +14,7 @@ from onnx import helper
 
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.spec.robot import DOG, Legs
+from tests.support.documents import blocks
 from tests.support.graphs import graph_bytes, port
 
 assert isinstance(DOG.drive, Legs)
@@ -72,28 +73,16 @@ def graph_of_layers(layers: Sequence[tuple[NDArray[np.float32], NDArray[np.float
 
 
 def robot_lab_gait(folder: Path, published: Path) -> Path:
-    """The published network of a Go2 as a gait of the dog, from the folder of its weights."""
+    """The published network of a Go2 as a gait of the dog, with the manifest of the documents."""
     arrays = read_torch_file((published / "policy.pt").read_bytes())
     graph = graph_of_layers(
         [(arrays[f"actor.{k}.weight"], arrays[f"actor.{k}.bias"]) for k in (0, 2, 4, 6)]
     )
-    joints = {
-        f"{leg}_{part}": {"rest_rad": rest, "kp": 20, "kd": 0.5, "scale": scale}
-        for leg in ("front_right", "front_left", "rear_right", "rear_left")
-        for part, rest, scale in (("hip", 0.0, 0.125), ("thigh", 0.8, 0.25), ("calf", -1.5, 0.25))
-    }
-    observation = [
-        {"what": "command"} if term["what"] == "command" else term for term in OBSERVATION
-    ]
-    return written_gait(
-        folder,
-        graph,
-        name="robot_lab",
-        joints=joints,
-        observation=observation,
-        speed={"most": 1.0},
-        turn={"gain_hz": 1.0, "most": 1.0},
-    )
+    (manifest,) = blocks("json", "docs/robots.md")
+    path = folder / "walk.onnx"
+    path.write_bytes(graph)
+    path.with_suffix(".json").write_text(manifest.text)
+    return path
 
 
 def written_gait(folder: Path, graph: bytes | None = None, **changes: Any) -> Path:
