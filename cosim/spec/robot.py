@@ -257,7 +257,7 @@ WALKER = Robot(
             for part in ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
         ),
         rest_rad=2 * (-0.12, 0.0, 0.0, 0.30, -0.18, 0.0),
-        kp=2 * (100.0, 100.0, 100.0, 150.0, 40.0, 40.0),
+        kp=2 * (120.0, 120.0, 120.0, 180.0, 48.0, 48.0),
         kd=2 * (2.0, 2.0, 2.0, 4.0, 2.0, 2.0),
         torque_nm=2 * (88.0, 139.0, 88.0, 139.0, 50.0, 50.0),
         feet=("left_foot", "right_foot"),

@@ -124,14 +124,14 @@ def network_of(arrays: Mapping[str, NDArray[Any]]) -> Network:
     """Return the network with the arrays of `Network.arrays`. Raises ValueError for others."""
     layers: list[Layer] = []
     for i in range(len(arrays) // 2):
-        kinds = [kind for kind in (*ACTIVATIONS, _LSTM) if f"{i}.{kind}.weight" in arrays]
-        if len(kinds) != 1 or f"{i}.{kinds[0]}.bias" not in arrays:
+        found = [kind for kind in ACTIVATIONS if f"{i}.{kind}.weight" in arrays]
+        begin = f"{i}.{found[0] if found else _LSTM}"
+        weight, bias = (arrays.get(f"{begin}.{field}") for field in ("weight", "bias"))
+        if weight is None or bias is None:
             raise ValueError(f"has no weight and bias of layer {i}")
-        weight, bias = (arrays[f"{i}.{kinds[0]}.{field}"] for field in ("weight", "bias"))
         if weight.dtype != np.float32 or bias.dtype != np.float32:
             raise ValueError(f"layer {i} has {weight.dtype} and {bias.dtype}; wanted is float32")
-        kind = kinds[0]
-        layers.append(Lstm(weight, bias) if kind == _LSTM else Dense(weight, bias, kind))
+        layers.append(Dense(weight, bias, found[0]) if found else Lstm(weight, bias))
     if len(arrays) != 2 * len(layers):
         raise ValueError(f"has {len(arrays)} arrays, an odd number")
     return Network(tuple(layers))
