@@ -129,7 +129,7 @@ class Column(NamedTuple):
 
     def array(self, values: Sequence[float | Sequence[float]]) -> NDArray[Any]:
         """Return the column for one value per tick."""
-        array = np.array(values, self.dtype)
+        array: NDArray[Any] = np.array(values, self.dtype)
         if self.width == VARIES:
             return array.reshape(len(values), -1 if array.size else 0)
         return array.reshape((len(values), self.width) if self.width else len(values))

@@ -155,10 +155,9 @@ class TrafficDrawing:
             return
         urdf = urdf_path(model)
         base = turned(roll, pitch, heading)
-        parts = link_parts(urdf)
         for link, (turn, shift) in link_tree(urdf).places(angles).items():
-            if parts[link]:
-                form = self._forms.id(("robot", model.name, link), partial(parts.get, link, ()))
+            if parts := link_parts(urdf)[link]:
+                form = self._forms.id(("robot", model.name, link), partial(tuple, parts))
                 at = base @ shift + (x, y, z)
                 yield form, (*at.tolist(), *angles_of(base @ turn))
 

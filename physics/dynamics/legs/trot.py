@@ -49,20 +49,20 @@ class TrotGains(NamedTuple):
     shake_mps, shake_rad: measured speed and tilt above which a standing robot steps.
     """
 
-    half_period_s: float = 0.095
+    half_period_s: float = 0.1
     height_m: float = 0.255
-    lift_m: float = 0.07
-    catch_s: float = 0.0166
-    level: float = 0.342
-    v_start_mps: float = 0.11
-    v_factor: float = 1.046
-    v_share: float = 0.333
-    v_gain_hz: float = 0.967
-    w_factor: float = 0.96
-    w_share: float = 0.44
-    w_gain_hz: float = 0.756
-    aside_m: float = -0.02
-    ahead_m: float = 0.0138
+    lift_m: float = 0.066
+    catch_s: float = 0.025
+    level: float = 0.35
+    v_start_mps: float = 0.15
+    v_factor: float = 0.92
+    v_share: float = 0.3
+    v_gain_hz: float = 0.65
+    w_factor: float = 1.0
+    w_share: float = 0.7
+    w_gain_hz: float = 1.0
+    aside_m: float = 0.0
+    ahead_m: float = 0.01
     sink_m: float = 0.0
     shake_mps: float = 0.25
     shake_rad: float = 0.25

@@ -228,9 +228,9 @@ def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> Wandered:
         error = np.abs(speeds.mean(axis=0) - (command.v_mps, command.w_radps))
         errors.append([*error.tolist(), *speeds.std(axis=0).tolist()])
         pitches += [m.robot.legs.pitch_rad for m in motions if m.robot.legs is not None]
-    means = np.array(errors).mean(axis=0).tolist()
+    v, w, v_sway, w_sway = np.array(errors).mean(axis=0).tolist()
     jitter_deg = math.degrees(float(np.std(pitches))) if pitches else 0.0
-    return Wandered(count, walk.fallen, *means, jitter_deg)
+    return Wandered(count, walk.fallen, v, w, v_sway, w_sway, jitter_deg)
 
 
 def down_curb(robot: Robot, v_mps: float, start_m: float, drive: Drive | None = None) -> int:
