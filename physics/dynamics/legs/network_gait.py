@@ -45,6 +45,8 @@ _SLOW_RADPS: Final = 0.1
 """Mean yaw rate over a gait cycle below which a robot may stand."""
 _INTEGRAL_MOST: Final = 0.4
 """Largest integral of an error of speed, m/s or rad/s."""
+_LEANS: Final = 0.2
+"""Sine of the trunk's lean above which errors of speed are not integrated: the robot stumbles."""
 _HOLD_AFTER_S: Final = 0.6
 """Time without a command after which a robot that still moves holds its place."""
 _STILL: Final = 1e-9
@@ -91,7 +93,7 @@ class NetworkGait:
     def reset(self) -> None:
         """Return to standing at rest."""
         self._v_mps = self._w_radps = 0.0
-        self._stands = self._frozen = self._balance is not None
+        self._stands = self._balance is not None
         self._frozen = False
         self._start()
 
@@ -139,8 +141,8 @@ class NetworkGait:
             if slow and self._balance is not None and self._balance.feet_level(body):
                 self._balance.begin(body)
                 self._stands = self._frozen = self._balance.holds(body)
-                if self._stands:
-                    return
+            if self._stands:
+                return
             self._idle_s += self._decision_s
             if self._place is None and (slow or self._idle_s > _HOLD_AFTER_S):
                 self._place = x, y, heading
@@ -167,6 +169,8 @@ class NetworkGait:
         w_more = (
             self._w_more + turn.gain_hz * (self._w_radps - body.spin_radps[2]) * self._decision_s
         )
+        if math.hypot(m[6], m[7]) > _LEANS:
+            v_more = w_more = 0.0
         self._v_more = min(max(v_more, -_INTEGRAL_MOST), _INTEGRAL_MOST)
         self._w_more = min(max(w_more, -_INTEGRAL_MOST), _INTEGRAL_MOST)
         v = speed.factor * self._v_mps + self._v_more
