@@ -27,8 +27,6 @@ _HOLDS_M: Final = (-0.045, 0.11)
 """Range of the capture point ahead of the ankles in which the ankles can keep the balance."""
 _ASIDE_M: Final = 0.10
 """Largest distance of the capture point from the middle of the feet to either side."""
-_LEVEL_M: Final = 0.004
-"""Largest difference of the feet's heights when the joints may be frozen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +58,12 @@ class Balance:
         self._behind_m: Triple = (0.0, 0.0, 0.0)
         self._omega_hz = 1.0
 
-    def feet_level(self, body: BodyNow) -> bool:
-        """Return whether both feet are equally low, so that the robot can stand on them."""
+    def lifted_m(self, body: BodyNow) -> float:
+        """Return the height of the left ankle over the right one."""
         left, right = self._feet(self._frames(body))
         m = body.rotation
-        up_m = sum(m[6 + k] * (left[k] - right[k]) for k in range(3))
-        return abs(up_m) < _LEVEL_M
+        x, y, z = left[0] - right[0], left[1] - right[1], left[2] - right[2]
+        return m[6] * x + m[7] * y + m[8] * z
 
     def begin(self, body: BodyNow) -> None:
         """Freeze the joints at their present angles."""

@@ -37,7 +37,7 @@ from physics.robots.model import Model
 
 _HOLD_HZ: Final = 2.0
 """Speed per distance from the place that is held."""
-_HOLD_MOST: Final = 0.3
+_HOLD_MOST: Final = 0.6
 """Largest speed in m/s, and yaw rate in rad/s, of a robot that holds its place."""
 _SLOW_MPS: Final = 0.08
 """Mean speed over a gait cycle below which a robot may stand."""
@@ -47,6 +47,12 @@ _INTEGRAL_MOST: Final = 0.4
 """Largest integral of an error of speed, m/s or rad/s."""
 _LEANS: Final = 0.2
 """Sine of the trunk's lean above which errors of speed are not integrated: the robot stumbles."""
+_LEVEL_M: Final = 0.004
+"""Largest deviation of the feet's heights from those on the ground when the joints are frozen."""
+_EVEN_M: Final = 0.01
+"""Difference of height of the ground under both feet below which it is taken as level."""
+_STEADY_S: Final = 2.0
+"""Time of standing after which a robot that loses its balance may try to stand again."""
 _HOLD_AFTER_S: Final = 0.6
 """Time without a command after which a robot that still moves holds its place."""
 _STILL: Final = 1e-9
@@ -87,6 +93,7 @@ class NetworkGait:
                 tuple(row.stand_kd for row in of),
             )
             self._balance = Balance(model, legs, stance)
+        self._steady = round(_STEADY_S / dt_s)
         self._cycle = max(round(legs.cycle_s / self._decision_s), 1)
         self.reset()
 
@@ -95,6 +102,7 @@ class NetworkGait:
         self._v_mps = self._w_radps = 0.0
         self._stands = self._balance is not None
         self._frozen = False
+        self._may_stand = self._balance is not None
         self._start()
 
     def _start(self) -> None:
@@ -106,6 +114,8 @@ class NetworkGait:
         self._past: deque[tuple[float, float, float]] = deque(maxlen=self._cycle + 1)
         self._place: tuple[float, float, float] | None = None
         self._idle_s = 0.0
+        self._stood = 0
+        self._lifted: deque[float] = deque(maxlen=self._cycle)
 
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
@@ -116,15 +126,27 @@ class NetworkGait:
                 self._balance.begin(body)
                 self._frozen = True
             if not asked and self._balance.holds(body):
+                self._stood += 1
                 return self._balance.torques_nm(body)
-            self._stands = self._frozen = False
-            self._start()
+            self._leave_stance(asked)
         if self._count % self._every == 0:
             self._decide(asked, body)
             if self._stands and self._balance is not None:
                 return self._balance.torques_nm(body)
         self._count += 1
         return torques_nm(*self._gains, self._targets, body)
+
+    def _leave_stance(self, asked: bool) -> None:
+        """Let the network walk again.
+
+        If the robot has not stood for long, as across a slope, it marks time until it walks again.
+        """
+        place = self._place
+        self._may_stand = asked or self._stood >= self._steady
+        self._stands = self._frozen = False
+        self._start()
+        if not self._may_stand:
+            self._place = place
 
     def _decide(self, asked: bool, body: BodyNow) -> None:
         """Query the network, or let the robot stand."""
@@ -133,12 +155,15 @@ class NetworkGait:
         heading = math.atan2(m[3], m[0])
         self._past.append((x, y, heading))
         if asked:
-            self._place, self._idle_s = None, 0.0
+            self._place, self._idle_s, self._may_stand = None, 0.0, self._balance is not None
+            self._lifted.clear()
             command = self._corrected(body)
         else:
             self._v_more = self._w_more = 0.0
             slow = self._is_slow()
-            if slow and self._balance is not None and self._balance.feet_level(body):
+            if self._may_stand and self._balance is not None:
+                self._lifted.append(self._balance.lifted_m(body))
+            if self._balance is not None and self._may_stand and slow and self._on_both_feet():
                 self._balance.begin(body)
                 self._stands = self._frozen = self._balance.holds(body)
             if self._stands:
@@ -148,6 +173,18 @@ class NetworkGait:
                 self._place = x, y, heading
             command = self._holding(x, y, heading)
         self._ask(command, body)
+
+    def _on_both_feet(self) -> bool:
+        """Return whether both feet are on the ground.
+
+        A robot that marks time lifts them in turn. On the ground, their difference of height is in
+        the middle of its range, also on a slope.
+        """
+        ground_m = 0.5 * (max(self._lifted) + min(self._lifted))
+        if abs(ground_m) < _EVEN_M:
+            ground_m = 0.0
+        full = len(self._lifted) == self._cycle
+        return full and abs(self._lifted[-1] - ground_m) < _LEVEL_M
 
     def _is_slow(self) -> bool:
         """Return whether the robot has hardly moved in the last gait cycle."""
