@@ -145,6 +145,7 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     joints: all joints of the robot, in the order of the network.
     observation: parts of the network's input, in its order.
     most_observed, most_answered: limits of the magnitudes of inputs and outputs.
+    most_memory: magnitude of the memory of an LSTM above which the memory is emptied.
     speed, turn: corrections of the commands.
     balance: standing of a biped; without it, the network holds the place by small commands.
     """
@@ -161,6 +162,7 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     observation: Annotated[list[Term], ItemCount(1, 32)]
     most_observed: Annotated[float, Within(0, 1e6, above=True)] = 100.0
     most_answered: Annotated[float, Within(0, 1e6, above=True)] = 100.0
+    most_memory: Annotated[float, Within(0, 1e6, above=True)] = 1e6
     speed: Correction = Correction()
     turn: Correction = Correction()
     balance: AnkleBalance | None = None

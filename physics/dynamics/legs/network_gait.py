@@ -239,6 +239,8 @@ class NetworkGait:
         most = manifest.most_observed
         given = np.array([min(max(value, -most), most) for value in seen], np.float32)
         answer, self._memory = self._network.answer(given, self._memory)
+        if any(np.abs(one).max() > manifest.most_memory for one in self._memory):
+            self._memory = self._network.empty_memory()  # after a stumble it would walk askew
         most = manifest.most_answered
         self._actions = [min(max(value, -most), most) for value in answer.tolist()]
         if not all(map(math.isfinite, self._actions)):
