@@ -385,13 +385,19 @@ class Bodies:
             )
         )
 
-    def robot_state(self) -> RobotState:
-        """Return the robot's pose, velocities and tilt."""
-        (x, y, z) = self.at_m
+    def speeds(self) -> tuple[float, float]:
+        """Return the speed along the heading and the yaw rate."""
         m = self._rotation
         (linear, angular) = self._velocity
         forward = linear[0] * m[0] + linear[1] * m[3] + linear[2] * m[6]
         turn = angular[0] * m[2] + angular[1] * m[5] + angular[2] * m[8]
+        return forward, turn
+
+    def robot_state(self) -> RobotState:
+        """Return the robot's pose, velocities and tilt."""
+        (x, y, z) = self.at_m
+        m = self._rotation
+        forward, turn = self.speeds()
         pose = Pose(x, y, math.atan2(m[3], m[0]))
         state = RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
         if self._legs is None:

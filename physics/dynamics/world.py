@@ -183,7 +183,7 @@ class BulletWorld:
             pose = bodies.step(k, self._drive.step(command, bodies.body_now()))
             trace += pose
             if self._watch is not None:
-                self._watch.add(bodies.robot_state())
+                self._watch.add(bodies.speeds())
             if bodies.watched:
                 found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
         poses = write_protected_copy(trace, shape=(substeps, 3))
@@ -193,7 +193,8 @@ class BulletWorld:
         if self._watch is None:
             return Motion(bodies.robot_state(), poses, contacts)
         ground_m = float(self.surface.heights(np.array([bodies.at_m[:2]]))[0])
-        robot, down = self._watch.judged(ground_m, bodies.trunk_on_ground())
+        touches = bodies.trunk_on_ground()
+        robot, down = self._watch.judged(bodies.robot_state(), ground_m, touches)
         return Motion(robot, poses, contacts, down)
 
     def _watch_near(

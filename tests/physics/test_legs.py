@@ -296,15 +296,14 @@ def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
     legs = legs_of(robot)
     watch = LegWatch(legs, 0.005)
     for z_m, sound in ((0.0, True), (-legs.stand_m, True), (-2.0, False), (5.0, False)):
-        watch.add(RobotState(Pose(1.0, 2.0, 0.0), z_m=z_m))
+        state = RobotState(Pose(1.0, 2.0, 0.0), z_m=z_m)
         if sound:
-            assert watch.judged(0.0, touches=False)[1] == (z_m < 0.0)
+            assert watch.judged(state, 0.0, touches=False)[1] == (z_m < 0.0)
         else:
             with pytest.raises(EngineError, match=r"at \(1, 2, .*it sinks or flies"):
-                watch.judged(0.0, touches=False)
-    watch.add(RobotState(Pose(1.0, 2.0, 0.0), z_m=math.nan))
+                watch.judged(state, 0.0, touches=False)
     with pytest.raises(EngineError, match="nan"):
-        watch.judged(0.0, touches=False)
+        watch.judged(RobotState(Pose(1.0, 2.0, 0.0), z_m=math.nan), 0.0, touches=False)
 
 
 def test_speeds_are_means_over_a_gait_cycle(walk: Walk) -> None:

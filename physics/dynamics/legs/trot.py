@@ -43,6 +43,7 @@ class TrotGains(NamedTuple):
     v_start_mps: speed that cancels the drift of steps on the spot.
     v_factor, v_share, v_gain_hz: factor, proportional and integral gain of the speed.
     w_factor, w_share, w_gain_hz: the same of the yaw rate.
+    y_share, y_gain_hz: share of a sideways speed, and rate of a sideways slip, that are undone.
     aside_m: distance of the feet outside of the legs' planes.
     ahead_m: distance of the feet ahead of the hips.
     sink_m: depth below the ground to which feet are pressed at touch-down.
@@ -59,8 +60,10 @@ class TrotGains(NamedTuple):
     v_share: float = 0.3
     v_gain_hz: float = 0.65
     w_factor: float = 1.0
-    w_share: float = 0.7
-    w_gain_hz: float = 1.0
+    w_share: float = 0.85
+    w_gain_hz: float = 2.0
+    y_share: float = 0.6
+    y_gain_hz: float = 1.0
     aside_m: float = 0.0
     ahead_m: float = 0.01
     sink_m: float = 0.0
@@ -72,7 +75,11 @@ GAINS: Final = TrotGains()
 """Numbers of the quadruped's trot."""
 
 _INTEGRAL_MPS: Final = 0.4
+"""Largest correction of the speed by its integral, in m/s."""
 _INTEGRAL_RADPS: Final = 0.5
+"""Largest correction of the yaw rate by its integral, in rad/s."""
+_ASTRAY_M: Final = 0.15
+"""Largest way in metres that the robot has slipped sideways and walks back."""
 _STEPS_TO_STAND: Final = 4
 """Swings at zero command before the robot stands."""
 
@@ -107,6 +114,7 @@ class Trot:
         """Return to standing at rest with both feet of all pairs under the hips."""
         self._v_mps = self._w_radps = 0.0
         self._v_more, self._w_more = self._gains.v_start_mps, 0.0
+        self._left_m = 0.0
         self._feet = [list(foot) for foot in self._neutral]
         self._lifted = [list(foot) for foot in self._neutral]
         self._phase_s = 0.0
@@ -134,10 +142,10 @@ class Trot:
                 self._begin()
             self._left_steps = _STEPS_TO_STAND
         if not self._left_steps:
-            self._v_more, self._w_more = gains.v_start_mps, 0.0
+            self._v_more, self._w_more, self._left_m = gains.v_start_mps, 0.0, 0.0
             return self._angles(m, 0.0)
         self._correct(command, ahead, turn)
-        self._carry(ahead, turn)
+        self._carry(ahead, left, turn)
         self._swing(ahead, left, turn)
         targets = self._angles(m, math.sin(math.pi * self._phase_s / gains.half_period_s))
         self._phase_s += dt_s
@@ -162,16 +170,18 @@ class Trot:
             w_more = self._w_more + gains.w_gain_hz * (self._w_radps - turn) * dt_s
             self._w_more = min(max(w_more, -_INTEGRAL_RADPS), _INTEGRAL_RADPS)
 
-    def _carry(self, ahead: float, turn: float) -> None:
+    def _carry(self, ahead: float, left: float, turn: float) -> None:
         """Move the feet on the ground backwards by the commanded motion."""
         gains, dt_s = self._gains, self._dt_s
         v = gains.v_factor * self._v_mps + self._v_more + gains.v_share * (self._v_mps - ahead)
         w = gains.w_factor * self._w_radps + self._w_more + gains.w_share * (self._w_radps - turn)
+        self._left_m = min(max(self._left_m + left * dt_s, -_ASTRAY_M), _ASTRAY_M)
+        aside = gains.y_share * left + gains.y_gain_hz * self._left_m
         for leg in _PAIRS[1 - self._swings]:
             foot, (hip_x, hip_y) = self._feet[leg], HIPS_M[leg]
             x, y = hip_x + foot[0], hip_y + foot[1]
             foot[0] -= (v - w * y) * dt_s
-            foot[1] -= w * x * dt_s
+            foot[1] -= (w * x - aside) * dt_s
 
     def _swing(self, ahead: float, left: float, turn: float) -> None:
         """Move the other feet towards their touch-down."""

@@ -36,20 +36,19 @@ class LegWatch:
         """Forget the motion: the robot was put elsewhere, at rest."""
         self._speeds = deque([(0.0, 0.0)] * self._count, maxlen=self._count)
 
-    def add(self, robot: RobotState) -> None:
-        """Add the state after a substep."""
-        self._robot = robot
-        self._speeds.append((robot.v_mps, robot.w_radps))
+    def add(self, speeds: tuple[float, float]) -> None:
+        """Add the speed along the heading and the yaw rate after a substep."""
+        self._speeds.append(speeds)
 
-    def judged(self, ground_m: float, touches: bool) -> tuple[RobotState, bool]:
-        """Return the last state with mean speeds, and whether the robot is down.
+    def judged(self, robot: RobotState, ground_m: float, touches: bool) -> tuple[RobotState, bool]:
+        """Return a state with mean speeds, and whether the robot is down.
 
+        robot: state after the last substep
         ground_m: height of the ground below the robot
         touches: whether the trunk touches the ground
 
         Raises EngineError with the engine's values for an impossible state.
         """
-        robot = self._robot
         over_m = robot.z_m - ground_m
         if not -self._legs.stand_m - _SINKS_M < over_m < _FLIES_M:  # also true for NaN
             raise EngineError(
