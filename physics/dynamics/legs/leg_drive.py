@@ -64,13 +64,16 @@ class LegDrive:
 
         Raises PolicyError for NaN, and for a torque that is far beyond its limit.
         """
-        limits = self._legs.torque_nm
-        for name, torque, most in zip(self._legs.joints, torques_nm, limits, strict=True):
-            if not abs(torque) < _NONSENSE * most:  # also true for NaN
+        limited: list[float] = []
+        for torque, most in zip(torques_nm, self._legs.torque_nm, strict=True):
+            if -most <= torque <= most:
+                limited.append(torque)
+            elif abs(torque) < _NONSENSE * most:  # not for NaN
+                limited.append(math.copysign(most, torque))
+            else:
+                name = self._legs.joints[len(limited)]
                 raise PolicyError(
                     f"gait of the robot: torque of joint {name} is {torque:.4g} Nm; its limit is "
                     f"{most:g} Nm, and gaits may exceed it {_NONSENSE:g} times at most"
                 )
-        return [
-            min(max(torque, -most), most) for torque, most in zip(torques_nm, limits, strict=True)
-        ]
+        return limited

@@ -24,6 +24,8 @@ Memory = tuple[Floats32, ...]
 _LSTM: Final = "lstm"
 _SQUARINGS: Final = 10
 """Squarings in `exponential`, whose argument is divided by 2 to this power first."""
+_COEFFICIENTS: Final = (1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0)
+"""Coefficients of the exponential series, from the fifth power down to the first."""
 _SMALLEST: Final = -40.0
 """Argument below which the exponential function is taken as constant."""
 
@@ -144,9 +146,11 @@ def exponential(x: NDArray[np.float64]) -> NDArray[np.float64]:
     processor.
     """
     small = np.maximum(x, _SMALLEST) * 0.5**_SQUARINGS
-    power = 1.0 + small * (
-        1.0 + small * (1 / 2 + small * (1 / 6 + small * (1 / 24 + small * (1 / 120))))
-    )
+    power = small * _COEFFICIENTS[0]
+    for coefficient in _COEFFICIENTS[1:]:
+        power += coefficient
+        power *= small
+    power += 1.0
     for _ in range(_SQUARINGS):
         power *= power
     return power

@@ -237,7 +237,7 @@ class NetworkGait:
             for value in self._observed(term, command, body)
         ]
         most = manifest.most_observed
-        given = np.array([min(max(value, -most), most) for value in seen], np.float32)
+        given = np.minimum(np.maximum(np.array(seen), -most), most).astype(np.float32)
         answer, self._memory = self._network.answer(given, self._memory)
         if any(np.abs(one).max() > manifest.most_memory for one in self._memory):
             self._memory = self._network.empty_memory()  # after a stumble it would walk askew
