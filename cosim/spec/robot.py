@@ -227,7 +227,7 @@ DOG = Robot(
         trunk=("base",),
         stand_m=0.27,
         span_m=(0.3868, 0.284),
-        cycle_s=0.2,
+        cycle_s=0.21,
         gait="trot",
     ),
     mounts={

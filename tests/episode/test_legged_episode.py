@@ -99,3 +99,12 @@ def test_a_body_that_flies_makes_the_episode_invalid_with_the_engines_values(
     (row,) = cosim.run(suite, Straight(), options=options).to_dict("records")
     assert row["status"] == "invalid"
     assert "it sinks or flies" in row["reason"] and "m/s" in row["reason"]
+
+
+@pytest.mark.parametrize("robot", LEGGED)
+@pytest.mark.parametrize(("suite", "solved"), [("unit", "curve-001"), ("reactive", "lateral-001")])
+def test_the_oracle_solves_scenarios_on_legs(robot: str, suite: str, solved: str) -> None:
+    """One of each suite without a failure."""
+    options = EpisodeOptions(seed=0, robot=robot)
+    (row,) = cosim.run(suite, "orca", scenarios=[solved], options=options).to_dict("records")
+    assert (row["status"], row["success"], row["falls"]) == ("done", 1.0, 0.0), row["reason"]

@@ -50,11 +50,11 @@ class TrotGains(NamedTuple):
     shake_mps, shake_rad: measured speed and tilt above which a standing robot steps.
     """
 
-    half_period_s: float = 0.1
+    half_period_s: float = 0.105
     height_m: float = 0.255
     lift_m: float = 0.066
     catch_s: float = 0.025
-    level: float = 0.35
+    level: float = 0.3
     v_start_mps: float = 0.15
     v_factor: float = 0.92
     v_share: float = 0.3
