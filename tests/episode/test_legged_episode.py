@@ -101,7 +101,6 @@ def test_a_body_that_flies_makes_the_episode_invalid_with_the_engines_values(
     assert "it sinks or flies" in row["reason"] and "m/s" in row["reason"]
 
 
-@pytest.mark.parametrize("robot", LEGGED)
 @pytest.mark.parametrize(("suite", "solved"), [("unit", "curve-001"), ("reactive", "lateral-001")])
 def test_the_oracle_solves_scenarios_on_legs(robot: str, suite: str, solved: str) -> None:
     """One of each suite without a failure."""
