@@ -203,3 +203,25 @@ def wait_until(holds: Callable[[], object]) -> None:
 def without_lines(text: str) -> str:
     """Remove the file and line that a policy's crash names."""
     return re.sub(r" in \w+\.py:\d+", "", text)
+
+
+@pytest.fixture(scope="session")
+def walker_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the humanoid's network, converted from the published file; where that is
+    missing, the test is skipped."""
+    from physics.dynamics.legs.walker import WALKER_NETWORK
+
+    shared = Path(os.environ.get("COSIM_WEIGHTS") or ROOT.parent / "shared" / "weights")
+    published = shared / "unitree_g1" / WALKER_NETWORK.weights.name
+    if not published.is_file():
+        pytest.skip(f"the humanoid's published network {published} is missing (COSIM_WEIGHTS)")
+    folder = tmp_path_factory.mktemp("weights")
+    WALKER_NETWORK.write(published, folder)
+    return folder
+
+
+@pytest.fixture
+def walker_weights(walker_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The humanoid's network in $COSIM_WEIGHTS."""
+    monkeypatch.setenv("COSIM_WEIGHTS", str(walker_folder))
+    return walker_folder

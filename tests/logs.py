@@ -6,14 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from cosim.results.log import COLUMNS, Log
+from cosim.results.log import COLUMNS, VARIES, Log
 
 
 def log_with(ticks: int, **arrays: Any) -> Log:
     """A log of so many ticks without people and events: these arrays, and zeros in all other
     columns."""
     zeros = {
-        name: column.array(np.zeros((ticks, column.width or 1)).tolist())
+        name: column.array(
+            np.zeros((ticks, 0 if column.width == VARIES else column.width or 1)).tolist()
+        )
         for name, column in COLUMNS.items()
     }
     nobody = {

@@ -11,6 +11,7 @@ import typer
 from cosim.cli import tables
 from cosim.cli.console import out, say
 from cosim.cli.exploit import bench_cheats, bench_exploit
+from cosim.cli.legs import bench_legs
 from cosim.cli.options import MEASURE, Appears
 from cosim.cli.progress import doing
 from cosim.core.errors import UsageError, unknown
@@ -325,7 +326,7 @@ NO_FIGURE = ("none: see below", "")
     "../cosim-before`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n`cosim bench "
     "crossings --crossings 40 --jobs 2 --policy orca`  \n`cosim bench exploit --kinds lateral "
     "--evaluations 400 --jobs 2`  \n`cosim bench exploit --cheats --suite reactive`  \n`cosim "
-    "bench realism --place my-street --frames 20`",
+    "bench realism --place my-street --frames 20`  \n`cosim bench legs --robot dog --minutes 60`",
 )
 def bench(
     what: Annotated[
@@ -335,7 +336,8 @@ def bench(
             help="environment (one process, part by part), camera (all of them), "
             "crowd (behaviour of people and vehicles), people (the crowd compared with measured "
             "people), crossings (a policy, people and vehicles at signals), exploit (blind "
-            "schedules that solve a suite) or realism (what networks see in pictures).",
+            "schedules that solve a suite), realism (what networks see in pictures) or legs (how a "
+            "robot with legs walks).",
         ),
     ] = "environment",
     only: Annotated[
@@ -362,8 +364,13 @@ def bench(
         typer.Option(min=1, help="Number of cities; default: 3 for `crowd`, 20 for `crossings`."),
     ] = None,
     minutes: Annotated[
-        float, typer.Option(min=0.1, help="For `crowd`: simulated minutes in each.")
+        float,
+        typer.Option(
+            min=0.1,
+            help="For `crowd`: simulated minutes in each; for `legs`: of random commands in all.",
+        ),
     ] = 10.0,
+    robot: Annotated[str, typer.Option(help="For `legs`: the robot.")] = "dog",
     residents: Annotated[int, typer.Option(min=0, help="For `crowd`: number of residents.")] = 0,
     crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: their number.")] = 200,
     policy: Annotated[str, typer.Option(help="For `crossings`: the policy.")] = "orca",
@@ -436,8 +443,17 @@ def bench(
     appearance: Appears = "splats",
 ) -> None:
     """Measure the speed of an environment process or of cameras, behaviour in traffic, how far a
-    suite can be solved blind, or what networks see in pictures."""
-    choices = ("environment", "camera", "crowd", "people", "crossings", "exploit", "realism")
+    suite can be solved blind, what networks see in pictures, or how a robot with legs walks."""
+    choices = (
+        "environment",
+        "camera",
+        "crowd",
+        "people",
+        "crossings",
+        "exploit",
+        "realism",
+        "legs",
+    )
     if what not in choices:
         raise unknown("bench", what, choices)
     if what == "crowd":
@@ -445,6 +461,9 @@ def bench(
         return
     if what == "crossings":
         bench_crossings(crossings, min(20, crossings) if cities is None else cities, policy, jobs)
+        return
+    if what == "legs":
+        bench_legs(robot, minutes)
         return
     if what == "people":
         bench_people(jobs)

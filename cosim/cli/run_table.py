@@ -68,6 +68,7 @@ SHOWN = (
     ("collisions_per_100m", "C"),
     ("out_of_lane_per_100m", "OL"),
     ("freezings_per_100m", "F"),
+    ("falls_per_100m", "FL"),
     ("velocity_mean_mps", "V"),
 )
 LETTERS = {
@@ -78,11 +79,17 @@ LETTERS = {
     "C": "collisions per 100 m travelled",
     "OL": "out of lane per 100 m travelled",
     "F": "freezings per 100 m travelled",
+    "FL": "falls per 100 m travelled, of robots with legs",
     "V": "mean speed",
 }
 """Meaning of each letter, the same in every table; `D` only where there are decoys."""
-UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
-COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
+UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "FL": "/100m", "V": "m/s"}
+COUNTS = (
+    ("collisions", "collisions"),
+    ("out_of_lane", "out of lane"),
+    ("freezings", "freezings"),
+    ("falls", "falls"),
+)
 MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
 """Metrics in the table of means of a run, with their letters."""
 WITHOUT_PEOPLE = (

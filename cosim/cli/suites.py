@@ -44,6 +44,7 @@ def print_names(out: Console) -> None:
     from cosim.results.table import policy_in_words
     from cosim.spec.goal import GOALS
     from cosim.spec.robot import ROBOTS
+    from physics.dynamics.legs.gait_file import weights_in_words as gait_weights_in_words
     from scenarios.suites.catalog import SUITES, load_suite
 
     for name in SUITES:
@@ -56,7 +57,8 @@ def print_names(out: Console) -> None:
         size = f"{one.length_m:.2f} x {one.width_m:.2f} m"
         out.print(
             f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at "
-            f"{one.w_max_radps:g} rad/s"
+            f"{one.w_max_radps:g} rad/s{gait_weights_in_words(one)}",
+            soft_wrap=True,
         )
         for name, mount in one.mounts.items():
             out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)

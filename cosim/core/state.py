@@ -77,6 +77,19 @@ def write_protect(array: NDArray[Any]) -> NDArray[Any]:
 
 
 @dataclass(frozen=True, slots=True)
+class LegState:
+    """Attitude and joints of a robot with legs.
+
+    roll_rad, pitch_rad: of the trunk, applied before the heading; pitch is positive downwards.
+    angles_rad: joint angles, in the order of `cosim.spec.robot.Legs.joints`.
+    """
+
+    roll_rad: float
+    pitch_rad: float
+    angles_rad: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class RobotState:
     """State of the robot: pose of the base centre on the ground plane and motion of the base.
 
@@ -84,6 +97,9 @@ class RobotState:
     w_radps: yaw rate, counter-clockwise.
     z_m: height of the base frame.
     tilt_rad: angle between the base's up axis and the vertical.
+    legs: attitude and joints of a robot with legs; None for wheels.
+
+    The speeds of a robot with legs are means over its last gait cycle.
     """
 
     pose: Pose
@@ -91,6 +107,7 @@ class RobotState:
     w_radps: float = 0.0
     z_m: float = 0.0
     tilt_rad: float = 0.0
+    legs: LegState | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,11 +302,14 @@ class Motion:
 
     trace: (substeps, 3) x, y, heading of the robot after each substep.
     contacts: in order of substeps, at most one for each (substep, other).
+    down: whether a robot with legs lies or is about to: its trunk touches the ground, leans by more
+        than 60 degrees, or is below 0.45 of its height at rest.
     """
 
     robot: RobotState
     trace: Floats
     contacts: tuple[Contact, ...] = ()
+    down: bool = False
 
 
 @dataclass(frozen=True, slots=True)

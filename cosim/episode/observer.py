@@ -17,8 +17,8 @@ from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.episode_id import episode_id_of, seed_for
 from cosim.spec.goal import TakePicture, goals_for, in_robot_frame
 from cosim.spec.manifest import Manifest
-from cosim.spec.odometry import GpsNoise, Odometry, OdometryKind, WheelNoise
-from cosim.spec.robot import robot_called
+from cosim.spec.odometry import LEG_NOISE, GpsNoise, Odometry, OdometryKind, WheelNoise
+from cosim.spec.robot import COURIER, Legs, Robot, robot_called
 from cosim.spec.scenario import Scenario
 
 
@@ -32,13 +32,15 @@ class Odometer(Protocol):
         """Return the odometry of a robot whose true pose is `pose`."""
 
 
-def odometer_for(kind: OdometryKind, start: Pose, draws: np.random.Generator) -> Odometer:
+def odometer_for(
+    kind: OdometryKind, start: Pose, draws: np.random.Generator, robot: Robot = COURIER
+) -> Odometer:
     """Return the odometry of an episode that starts at a pose.
 
     draws: generator of its errors.
     """
     if kind == "wheel":
-        return WheelOdometer(draws)
+        return WheelOdometer(draws, LEG_NOISE if isinstance(robot.drive, Legs) else WheelNoise())
     return Gps(start, draws) if kind == "gps" else _ExactOdometer(start, reported=kind == "exact")
 
 
@@ -57,7 +59,7 @@ class _ExactOdometer:
 
 
 class WheelOdometer:
-    """Wheel odometry: it counts wheel turns, so it misses resets of the robot."""
+    """Odometry by wheels or legs: it counts turns or steps, so it misses resets of the robot."""
 
     def __init__(self, draws: np.random.Generator, noise: WheelNoise = WheelNoise()) -> None:  # noqa: B008
         self._draws = draws
@@ -69,7 +71,8 @@ class WheelOdometer:
         self._x_m = self._y_m = self._heading_rad = 0.0
 
     def moved(self, before: Pose, after: Pose) -> None:
-        along_m = in_robot_frame(before, after).x_m
+        place = in_robot_frame(before, after)
+        along_m = place.x_m
         turned = wrap_angle(after.heading_rad - before.heading_rad)
         far_m = abs(along_m)
         (one, two) = self._draws.standard_normal(2).tolist()
@@ -82,6 +85,10 @@ class WheelOdometer:
         middle = self._heading_rad + 0.5 * turn
         self._x_m += counted_m * math.cos(middle)
         self._y_m += counted_m * math.sin(middle)
+        if self._noise.sideways:
+            aside_m = self._scale * place.y_m
+            self._x_m -= aside_m * math.sin(middle)
+            self._y_m += aside_m * math.cos(middle)
         self._heading_rad = wrap_angle(self._heading_rad + turn)
 
     def read(self, pose: Pose, time_s: float) -> Odometry:
@@ -142,7 +149,9 @@ class Observer:
         self._known = known
         self._cameras = cameras
         self._goals = goals_for(manifest.goal, scenario, draws("goal"), manifest.picture_size, look)
-        self._odometer = odometer_for(manifest.odometry, scenario.start_pose, draws("odometry"))
+        self._odometer = odometer_for(
+            manifest.odometry, scenario.start_pose, draws("odometry"), self._robot
+        )
         self._calibration = None if spec is None else calibration_of(spec, self._robot)
 
     def moved(self, step: Step, put_back: bool) -> None:

@@ -199,7 +199,9 @@ class PolicyCaller:
         robot = known.robot
         vehicles = known.vehicles
         return Privileged(
-            robot=RobotState(robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad),
+            robot=RobotState(
+                robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad, robot.legs
+            ),
             route=self._route[1],
             route_s_m=known.route_s_m,
             people=known.people.copied(),

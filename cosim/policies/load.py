@@ -50,7 +50,8 @@ def bundle_in_words(folder: Path) -> str:
     bundle = read_bundle_manifest(folder)
     facts = bundle.files.get(bundle.model)
     try:
-        found = f"weights {weights_file(bundle.name, bundle.model, facts, bundle.source, [folder])}"
+        user = f"policy '{bundle.name}'"
+        found = f"weights {weights_file(user, bundle.model, facts, bundle.source, [folder])}"
     except UsageError:
         found = f"weights missing ({bundle.model})"
     origin = bundle.source.partition(",")[0].partition(";")[0]

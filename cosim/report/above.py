@@ -58,6 +58,7 @@ FAILURES: Final[dict[str, Rgb255]] = {
     "collision": (220, 0, 0),
     "out_of_lane": (190, 0, 190),
     "freezing": (0, 140, 200),
+    "fall": (230, 150, 0),
 }
 
 Bounds = tuple[float, float, float, float]

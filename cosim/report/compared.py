@@ -27,6 +27,7 @@ _SUITE_METRICS: Final = (
     "collisions_per_100m",
     "out_of_lane_per_100m",
     "freezings_per_100m",
+    "falls_per_100m",
     "failures_per_100m_route",
     "velocity_mean_mps",
     "pedestrian_collision",

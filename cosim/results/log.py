@@ -22,11 +22,13 @@ from cosim.results.referee import Verdict
 from cosim.results.traffic import RoadState
 
 _PLAN_ARRAYS = {"plan_sizes", "plan_points", "plan_index"}
-_OPTIONAL = {"answers"} | _PLAN_ARRAYS
+_OPTIONAL = {"answers", "legs"} | _PLAN_ARRAYS
 """Arrays that older files lack."""
 _PEOPLE_WIDTHS = {"people_tick": 0, "people_xy": 2, "people_kind": 0, "people_age": 0}
 """Number of columns of each array with one row per person; 0 for a one-dimensional array."""
 _SLOWEST_MPS: Final = 1e-9
+VARIES: Final = -1
+"""Width of a column whose number of values differs between robots."""
 
 
 class Nearness(NamedTuple):
@@ -115,7 +117,7 @@ class Column(NamedTuple):
     """Array of `Log` with one row per tick.
 
     read: extracts the value from a tick
-    width: number of columns, 0 for a one-dimensional array
+    width: number of columns, 0 for a one-dimensional array, VARIES if the robot decides
     dtype: element type
     replayed: False for road measurements, which a replay cannot reproduce
     """
@@ -127,15 +129,26 @@ class Column(NamedTuple):
 
     def array(self, values: Sequence[float | Sequence[float]]) -> NDArray[Any]:
         """Return the column for one value per tick."""
-        return np.array(values, self.dtype).reshape(
-            (len(values), self.width) if self.width else len(values)
-        )
+        array: NDArray[Any] = np.array(values, self.dtype)
+        if self.width == VARIES:
+            return array.reshape(len(values), -1 if array.size else 0)
+        return array.reshape((len(values), self.width) if self.width else len(values))
 
 
 def _column(
     read: Callable[[Tick], float | Sequence[float]], width: int = 0, **more: Any
 ) -> dict[str, Column]:
     return {"column": Column(read, width, **more)}
+
+
+def _legs_of(tick: Tick) -> Sequence[float]:
+    """Return the row of `Log.legs` of a tick."""
+    robot = tick.robot
+    if robot.legs is None:
+        return ()
+    legs = robot.legs
+    down = float(tick.step.motion.down)
+    return (down, robot.z_m, legs.roll_rad, legs.pitch_rad, *legs.angles_rad)
 
 
 def holds_waypoints(path: Path) -> bool:
@@ -162,6 +175,8 @@ class Log:
     reset_s_m (T,): arc length that the robot was reset to after the tick, NaN without a reset
     waits_at_red (T,) bool: whether the robot waits at a red light
     on_carriageway (T,) bool, vehicles_braked (T,): see `cosim.results.traffic`
+    legs (T, 4 + J) float32: of robots with legs: 1 if it is down (`Motion.down`), height of the
+        base frame, roll and pitch of the trunk, J joint angles, metres and rad; (T, 0) for wheels
     people_tick (P,), people_xy (P, 2), people_kind (P,), people_age (P,): people within 30 m once a
         second, with `PersonKind` and `Age`, for pictures
     event_tracks (E, 5): tick, event, person in it, x m, y m, from each event's trigger on
@@ -171,6 +186,7 @@ class Log:
         at its observation, metres; (W, 4) with cosine and sine of the heading, NaN where missing
     plan_index: index of the waypoint of an answer that is followed, from 0
 
+    `Log.load` fills missing `legs` with (T, 0); for wheels the array is omitted from the file.
     Answers still delayed at a reset never took effect (`cosim.episode.command_delay`). `answers` is
     empty in older files. Without waypoints, plan_sizes and plan_points are empty and omitted from
     the file.
@@ -207,6 +223,11 @@ class Log:
     vehicles_braked: NDArray[np.int64] = field(
         metadata=_column(lambda tick: tick.road.braked, dtype=np.int64, replayed=False)
     )
+    legs: NDArray[np.float32] = field(
+        default_factory=lambda: np.empty((0, 0), np.float32),
+        metadata=_column(_legs_of, VARIES, dtype=np.float32),
+        kw_only=True,
+    )
     people_tick: NDArray[np.int64]
     people_xy: Floats
     people_kind: NDArray[np.int8]
@@ -219,6 +240,11 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    @property
+    def on_legs(self) -> bool:
+        """Return whether the robot has legs."""
+        return self.legs.shape[1:] > (0,)
 
     def same(self, tick: Tick) -> bool:
         """Return whether a replayed tick equals the recorded one, bit for bit."""
@@ -234,9 +260,10 @@ class Log:
     def encoded(self) -> bytes:
         """Return the bytes of the compressed .npz file."""
         file = io.BytesIO()
-        names = [
-            f.name for f in fields(self) if len(self.plan_points) or f.name not in _PLAN_ARRAYS
-        ]
+        omitted = set() if len(self.plan_points) else set(_PLAN_ARRAYS)
+        if not self.legs.size:
+            omitted.add("legs")
+        names = [f.name for f in fields(self) if f.name not in omitted]
         arrays = {name: np.asarray(getattr(self, name)) for name in names}
         np.savez_compressed(file, allow_pickle=False, **arrays)
         return file.getvalue()
@@ -257,6 +284,7 @@ class Log:
                     raise ValueError("plan_sizes, plan_points and answers are not of each other")
                 values["plan_index"] = int(arrays["plan_index"])
             values["tick_s"] = float(values["tick_s"])
+            values.setdefault("legs", np.empty((len(np.atleast_1d(values["pose"])), 0), np.float32))
             _check_shapes(values)
         except KeyError as error:
             raise RunError(f"{path}: not a trajectory: has no array {error}") from error
@@ -284,7 +312,9 @@ def _check_shapes(arrays: Mapping[str, Any]) -> None:
     ):
         for name, width in columns.items():
             array = arrays[name]
-            shape = (rows, width) if width else (rows,)
+            shape: tuple[int, ...] = (rows, width) if width else (rows,)
+            if width == VARIES:
+                shape = (rows, *array.shape[1:2])
             if array.dtype.kind not in "biuf" or array.shape != shape:
                 raise ValueError(
                     f"'{name}' is {array.dtype.name} {array.shape}; wanted are numbers {shape}"

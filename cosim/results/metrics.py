@@ -276,6 +276,16 @@ def count(kind: str) -> Callable[[EpisodeFacts], float]:
     return lambda episode: float(sum(kind in ("", failure.kind) for failure in episode.failures))
 
 
+def falls(episode: EpisodeFacts) -> float | None:
+    """Return the number of falls; None for a robot on wheels."""
+    return count("fall")(episode) if episode.log.on_legs else None
+
+
+def falls_per_100m(episode: EpisodeFacts) -> float | None:
+    """Return the falls per 100 m travelled; None for a robot on wheels and below 1 m."""
+    return per_100m("fall", rated_m)(episode) if episode.log.on_legs else None
+
+
 def collisions_with(other_kind: str) -> Callable[[EpisodeFacts], float]:
     """Return a metric that counts collisions with a kind of thing."""
     return lambda episode: float(
@@ -332,6 +342,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
             per_100m("freezing", rated_m),
             pooled=("freezings", "rated_m"),
         ),
+        "falls_per_100m": Metric("1/100 m", False, falls_per_100m, pooled=("falls", "rated_m")),
         "failures_per_100m_progress": Metric(
             "1/100 m", False, per_100m("", progress_m), pooled=("failures", "progress_m")
         ),
@@ -344,6 +355,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions": Metric("", False, count("collision")),
         "out_of_lane": Metric("", False, count("out_of_lane")),
         "freezings": Metric("", False, count("freezing")),
+        "falls": Metric("", False, falls),
         "collisions_pedestrian": Metric("", False, collisions_with("pedestrian")),
         "collisions_vehicle": Metric("", False, collisions_with("vehicle")),
         "collisions_wall": Metric("", False, collisions_with("wall")),

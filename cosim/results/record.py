@@ -228,7 +228,7 @@ RECORD_FILE = FlatFile(
     split structure decoy_of crowd_added run_seed=setup.seed episode robot policy=manifest.name
     policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
     nonstandard goal_protocol=manifest.goal odometry privileged latency_ms real_time renderer
-    versions status reason ended ticks state_hash measures failures walked_into
+    gait gait_hash versions status reason ended ticks state_hash measures failures walked_into
     red_light_entries events injections metric_schema schema clock
     """,
     without="manifest.goals",
@@ -250,6 +250,7 @@ class StateHash:
         street = step.street_after
         for array in (
             np.array([*robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad]),
+            np.array(() if robot.legs is None else robot.legs.angles_rad),
             step.motion.trace,
             street.people.xy,
             street.people.heading,

@@ -12,12 +12,16 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   (`walked_into`) and are no failures. A robot that drives on, or turns a corner into that person,
   has collided.
 - out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
+- fall: for 0.1 s a robot with legs was down (`Motion.down`): its trunk leaned by more than 60
+  degrees, touched the ground, or was below 0.45 of its height at rest. A fall within 1 s after a
+  person walked into the robot is no failure and is recorded with `walked_into`; the robot is reset.
+  A collision or fall resets the robot, so that the one that follows from the other is not counted.
 - freezing, if the episode does not end on a failure: for 10 s the robot was never 0.5 m away from
   its position at their beginning. Waiting before a red crossing of the route does not count. In a
   short episode waiting only costs time.
 - Signals are judged on the crossings of the reference route, by arc length.
-- One kind of failure per tick: collisions before out_of_lane before freezing, with one reset for
-  all of them.
+- One kind of failure per tick: collisions before out_of_lane before falls before freezing, with one
+  reset for all of them.
 - The goal is reached within its radius at the end of the route. It is also reached at any arc
   length if walkable ground leads straight to it: the robot skipped a part of the route. If the
   route passes its goal before its end (a loop), only its end counts.
@@ -53,6 +57,10 @@ from cosim.spec.events import Event, EventState
 from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 
+FALL_S = 0.1
+"""Time, seconds, that a robot is down before it has fallen."""
+_PUSHED_S = 1.0
+"""Time, seconds, after a person walked into the robot in which a fall is the person's fault."""
 FREEZE_WINDOW_S = 10.0
 FREEZE_MOVE_M = 0.5
 _ROUNDING_M = 1e-6
@@ -80,7 +88,7 @@ LOOP_MARGIN_M = 0.5
 CROSSING_LEFT_M = 0.3
 """Distance, metres, before a crossing at which the robot has left it and may enter it again."""
 
-FailureKind = Literal["collision", "out_of_lane", "freezing"]
+FailureKind = Literal["collision", "out_of_lane", "fall", "freezing"]
 Ended = Literal["goal", "stop", "timeout", "failure"]
 Fault = Literal["robot_at_fault", "pedestrian_at_fault", "shared"]
 
@@ -108,7 +116,7 @@ class Failure:
 class Verdict:
     """Judgement of one Step.
 
-    walked_into: contacts at a person's fault, which are no failures
+    walked_into: contacts and falls at a person's fault, which are no failures
     red_light_entry: crossing that was entered at red, if any
     """
 
@@ -140,6 +148,8 @@ class Referee:
         self._touching: dict[str, int] = {}
         self._walked_into: set[str] = set()
         self._still_ticks = self._spot_ticks = 0
+        self._down_ticks = 0
+        self._pushed: tuple[float, str] = (-math.inf, "")
         self._window = FreezeWindow(clock)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
@@ -153,17 +163,45 @@ class Referee:
         contacts = self._contacts(step)
         into = tuple(contact for contact in contacts if contact.fault == "pedestrian_at_fault")
         failures = tuple(contact for contact in contacts if contact.fault != "pedestrian_at_fault")
-        failures = failures or self._out_of_lane(step) or self._freezing(step, waits)
+        fallen = self._fall(step, into)
+        failures = failures or self._out_of_lane(step)
+        if fallen is not None and not failures:
+            if fallen.fault is None:
+                failures = (fallen,)
+            else:
+                into = (*into, fallen)
+                if step.tick + 1 >= self._limit_ticks:
+                    return Verdict((), into, None, "timeout", red, waits)
+                return Verdict((), into, self._put_back(fallen, step), None, red, waits)
+        failures = failures or self._freezing(step, waits)
         if not failures:
             return Verdict((), into, None, self._end(step), red, waits)
         if self._scenario.ends_on_failure:
             return Verdict(failures, into, None, "failure", red, waits)
         if step.tick + 1 >= self._limit_ticks:
             return Verdict(failures, into, None, "timeout", red, waits)
-        reset = self._reset(failures[0], step)
+        reset = self._put_back(failures[0], step)
+        return Verdict(failures, into, reset, None, red, waits)
+
+    def _put_back(self, failure: Failure, step: Step) -> Reset:
+        """Return the reset after a failure, and forget what happened before it."""
+        reset = self._reset(failure, step)
         self._window.clear()
         self._entered.clear()
-        return Verdict(failures, into, reset, None, red, waits)
+        self._down_ticks = 0
+        return reset
+
+    def _fall(self, step: Step, into: tuple[Failure, ...]) -> Failure | None:
+        """Return the fall of a robot with legs in a tick. into: people who walk into it now."""
+        if into:
+            self._pushed = step.tick, into[0].other
+        self._down_ticks = self._down_ticks + 1 if step.motion.down else 0
+        if self._down_ticks <= self._clock.ticks(FALL_S):
+            return None
+        since, person = self._pushed
+        if step.tick - since > self._clock.ticks(_PUSHED_S):
+            return self._failure("fall", step)
+        return self._failure("fall", step, person, "pedestrian", "pedestrian_at_fault")
 
     def _end(self, step: Step) -> Ended | None:
         if self._scenario.ends_at == "stop":

@@ -1,8 +1,9 @@
 """Check a record against the trajectory that was recorded with it.
 
 The trajectory determines its duration, position and speed at each failure, resets, progress,
-freezings, the end, and the go-on rule between trigger and passing. Contacts, leaving the walkable
-area, red light entries and other event outcomes need the engines; they are taken from the record.
+freezings, falls, the end, and the go-on rule between trigger and passing. Contacts, leaving the
+walkable area, red light entries and other event outcomes need the engines; they are taken from the
+record.
 """
 
 from __future__ import annotations
@@ -20,7 +21,15 @@ from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.results.go_on import Passing, is_measured, passing_of, rule_met
 from cosim.results.log import Log
 from cosim.results.record import Record, TriggeredEvent
-from cosim.results.referee import STOP_S, Ended, FreezeWindow, at_goal, is_loop, near_goal
+from cosim.results.referee import (
+    FALL_S,
+    STOP_S,
+    Ended,
+    FreezeWindow,
+    at_goal,
+    is_loop,
+    near_goal,
+)
 from cosim.spec.scenario import Scenario
 
 _ROUNDING_M = 1e-9
@@ -50,6 +59,7 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
     yield from _red_light_entries(record, scenario, log)
     yield from _progress(scenario, log)
     yield from _freezings(record, scenario, log)
+    yield from _falls(record, log)
     yield from _passings(record, scenario, log)
     if record.ended not in (ends := _ends(record, scenario, log)):
         yield Contradiction("ended", record.ended, " or ".join(ends) or "not yet over")
@@ -78,8 +88,9 @@ def _failures_as_driven(record: Record, log: Log) -> Iterator[Contradiction]:
 
 
 def _resets(record: Record, log: Log) -> Iterator[Contradiction]:
-    """Check that the robot is reset after each tick with failures, except the last one."""
-    failed = sorted({failure.tick for failure in record.failures} - {len(log) - 1})
+    """Check that the robot is reset after each tick with failures or falls, except the last."""
+    put_back = (*record.failures, *(one for one in record.walked_into if one.kind == "fall"))
+    failed = sorted({failure.tick for failure in put_back} - {len(log) - 1})
     resets = np.flatnonzero(np.isfinite(log.reset_s_m)).tolist()
     if failed != resets:
         tick = min({*failed} ^ {*resets})
@@ -159,7 +170,8 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
     if scenario.ends_on_failure:
         return
     window = FreezeWindow(Clock())
-    kinds = {failure.tick: failure.kind for failure in record.failures}
+    pushed = [one for one in record.walked_into if one.kind == "fall"]
+    kinds = {failure.tick: failure.kind for failure in (*record.failures, *pushed)}
     for tick, (x_m, y_m, waits) in enumerate(
         zip(
             log.pose[:, 0].tolist(), log.pose[:, 1].tolist(), log.waits_at_red.tolist(), strict=True
@@ -173,6 +185,24 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
             return
         if kind is not None:
             window.clear()
+
+
+def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
+    """Check falls by the referee's rule, in ticks without another failure."""
+    if not log.on_legs:
+        return
+    kinds: dict[int, str] = {failure.tick: failure.kind for failure in record.failures}
+    kinds |= {one.tick: "fall" for one in record.walked_into if one.kind == "fall"}
+    down_ticks = 0
+    for tick, down in enumerate((log.legs[:, 0] > 0.0).tolist()):
+        down_ticks = down_ticks + 1 if down else 0
+        kind = kinds.get(tick)
+        fallen = down_ticks > Clock().ticks(FALL_S)
+        if kind in (None, "fall", "freezing") and fallen != (kind == "fall"):
+            yield Contradiction(f"falls at tick {tick}", int(kind == "fall"), int(fallen))
+            return
+        if kind is not None:
+            down_ticks = 0
 
 
 def _passings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:

@@ -34,6 +34,7 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
     latency_ms: requested latency of commands; in a real-time record the median of the measured ones
     real_time: whether the latency of each answer is measured; such an episode can only be replayed
     renderer: renderer of the policy's pictures
+    gait, gait_hash: gait in place of the robot's own, and the hash of its files; "" without one
     metric_schema: METRIC_SCHEMA of the version that computes the measures, 0 if unknown
     """
 
@@ -44,6 +45,8 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
     latency_ms: float = 0.0
     real_time: bool = False
     renderer: str = NO_RENDERER
+    gait: str = ""
+    gait_hash: str = ""
     versions: dict[str, str]
     metric_schema: int = 0
 
@@ -55,6 +58,7 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
         suite_hash: str = "",
         policy_source: str = "",
         policy_runs: PolicyProcess = "in-process",
+        gait_hash: str = "",
     ) -> RunSetup:
         """Build the set-up that options request, with the installed versions."""
         return cls(
@@ -64,6 +68,8 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
             policy_runs=policy_runs,
             latency_ms=options.latency_ms,
             real_time=options.real_time,
+            gait=options.gait,
+            gait_hash=gait_hash,
             versions=versions(),
             metric_schema=METRIC_SCHEMA,
         )

@@ -26,7 +26,8 @@ class Calibration:
     matrix: (3, 3) K in pixels; (0, 0) is the middle of the upper left pixel.
     distortion: (5,) k1, k2, p1, p2, k3 of Brown's model.
     on_robot: (4, 4) transform from the camera's frame to the robot's: x ahead, y left, z up, origin
-        on the ground below its middle. It ignores the tilt of the robot on uneven ground.
+        on the ground below its middle. It is the camera as mounted on a level robot: it ignores the
+        tilt on uneven ground and the motion of a trunk on legs.
 
     >>> ahead = Calibration(np.eye(3), np.zeros(5), np.eye(4)).on_robot @ [0.0, 0.0, 1.0, 1.0]
     """

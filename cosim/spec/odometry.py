@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
@@ -17,7 +18,7 @@ ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
     {
         "none": "nothing",
         "exact": "where the robot is, without an error",
-        "wheel": "what its wheels count, which does not notice that it was put elsewhere",
+        "wheel": "what its wheels or legs count, which does not notice that it was put elsewhere",
         "gps": "a position with noise and a slow bias, without a heading",
     }
 )
@@ -49,13 +50,14 @@ class Odometry(msgspec.Struct, frozen=True):
 
 
 class WheelNoise(NamedTuple):
-    """Standard deviations of wheel odometry.
+    """Standard deviations of odometry by wheels or legs.
 
     scale: relative error of the distance, constant in an episode.
     turn_scale: relative error of turns, constant in an episode.
     drift_radpm: turn per metre, constant in an episode.
     along_m: error of the distance after one metre, growing with the square root.
     heading_rad: error of the heading after one metre, growing with the square root.
+    sideways: whether motion sideways is counted, as legs do.
     """
 
     scale: float = 0.02
@@ -63,6 +65,18 @@ class WheelNoise(NamedTuple):
     drift_radpm: float = 0.003
     along_m: float = 0.02
     heading_rad: float = 0.01
+    sideways: bool = False
+
+
+LEG_NOISE: Final = WheelNoise(
+    scale=0.03,
+    turn_scale=0.03,
+    drift_radpm=math.radians(0.5),
+    along_m=0.03,
+    heading_rad=0.01,
+    sideways=True,
+)
+"""Errors of odometry by legs: 3 % of the way and 0.5 degrees per metre, as feet slip."""
 
 
 class GpsNoise(NamedTuple):

@@ -103,12 +103,13 @@ MOST_PACE = 100.0
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """Options of an episode. Only robot, latency and collecting noise affect what happens in the
-    street.
+    """Options of an episode. Only robot, gait, latency and collecting noise affect what happens in
+    the street.
 
     seed: seed of the run, for policy ids and seeds (`cosim.spec.episode_id`) and the order of
         episodes. If it is None, a run draws one, and a single Episode uses 0.
     robot: robot in place of the scenario's (`cosim.spec.robot`).
+    gait: gait of a robot with legs in place of its own (`physics.dynamics.legs.gait_file`).
     goal: goal protocol in place of the manifest's (`cosim.spec.goal`).
     own_camera: allow a camera that the robot does not have (`cosim.episode.manifest_checks`). It
         marks the record as nonstandard.
@@ -132,6 +133,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     seed: int | None = None
     robot: str = ""
+    gait: str = ""
     goal: GoalProtocol | None = None
     own_camera: bool = False
     camera: CameraChoice = "auto"
@@ -152,6 +154,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
         return cls(
             seed=config.seed,
             robot=config.robot,
+            gait=config.gait,
             own_camera=config.own_camera,
             goal=goal_called(config.goal) if config.goal else None,
             camera=config.camera,

@@ -1,14 +1,20 @@
 """Table of robots; everything that depends on the robot is derived from it.
 
-A new robot is a row of `ROBOTS` and a URDF. In the URDF, the base frame is on the ground in the
-middle of the robot, x ahead, y left, z up. The base link's centre of mass is `com_height_m` above
-it. Wheels turn forward for positive joint speeds.
+A new robot is a row of `ROBOTS` and a URDF. The base frame is on the ground in the middle of the
+robot, x ahead, y left, z up. Mounts and boxes are given in it.
+
+- Wheels: the base link's frame is the base frame. Its centre of mass is `com_height_m` above it.
+  Wheels turn forward for positive joint speeds.
+- Legs: the base link's frame is in the middle of the trunk, `Legs.stand_m` above the base frame.
+  Its axes are the principal axes of its inertia. Joint angles are those of `Legs.rest_rad` when the
+  robot is put on the ground.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from cosim.core.errors import unknown
 
@@ -32,6 +38,49 @@ class Skid:
     def joints(self) -> tuple[str, ...]:
         """Names of all motor joints, in the order of `physics.dynamics.drive`."""
         return self.left + self.right
+
+    @property
+    def pivot_m(self) -> float:
+        """Height in metres of the point about which the robot leans: the ground."""
+        return 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Legs:
+    """Legs: joints that follow the angles of a gait by torques.
+
+    The torque of a joint is kp * (target - angle) - kd * speed, within its limit.
+
+    joints: names of the joints, in the order of all values per joint.
+    rest_rad: angles at rest, with the feet on the ground.
+    kp, kd: gains per joint, Nm/rad and Nm s/rad.
+    torque_nm: limit per joint.
+    feet: links on which the robot walks.
+    trunk: links that touch the ground only in a fall; "base" is the base link.
+    stand_m: height of the base link's frame above the ground at rest.
+    span_m: length and width of the rectangle of the feet at rest.
+    cycle_s: duration of a gait cycle, over which speeds are averaged.
+    gait: row of `physics.dynamics.legs.GAITS`.
+    weights: SHA-256 of the gait's published network, "" without one.
+    """
+
+    joints: tuple[str, ...]
+    rest_rad: tuple[float, ...]
+    kp: tuple[float, ...]
+    kd: tuple[float, ...]
+    torque_nm: tuple[float, ...]
+    feet: tuple[str, ...]
+    trunk: tuple[str, ...]
+    stand_m: float
+    span_m: tuple[float, float]
+    cycle_s: float
+    gait: Literal["trot", "network"]
+    weights: str = ""
+
+    @property
+    def pivot_m(self) -> float:
+        """Height in metres of the point about which the robot leans: the middle of the trunk."""
+        return self.stand_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +126,8 @@ class Robot:
 
     urdf: file in `physics/robots`, or an absolute path.
     length_m, width_m, height_m: box around the collision body, centred on the base frame.
-    drive: how it moves. Another type than `Skid` needs its counterpart in `physics.dynamics.drive`.
+    com_height_m: height of the base link's centre of mass at rest.
+    drive: how it moves. Its counterpart in the engine is in `physics.dynamics.drive`.
     mounts: camera mounts by name. Every robot has "front", the default of policies.
     cruise_mps: travelling speed.
     v_max_mps, w_max_radps: largest commands, as magnitudes.
@@ -93,7 +143,7 @@ class Robot:
     width_m: float
     height_m: float
     com_height_m: float
-    drive: Skid
+    drive: Skid | Legs
     mounts: Mapping[str, Mount]
     cruise_mps: float
     v_max_mps: float
@@ -158,7 +208,80 @@ SCOUT = Robot(
 )
 """Smaller and more agile robot of 0.50 m x 0.40 m."""
 
-ROBOTS: Mapping[str, Robot] = {one.name: one for one in (COURIER, SCOUT)}
+_DOG_LEGS = ("front_left", "front_right", "rear_left", "rear_right")
+
+DOG = Robot(
+    name="dog",
+    urdf="dog.urdf",
+    length_m=0.74,
+    width_m=0.33,
+    height_m=0.37,
+    com_height_m=0.27,
+    drive=Legs(
+        joints=tuple(f"{leg}_{part}" for leg in _DOG_LEGS for part in ("hip", "thigh", "calf")),
+        rest_rad=4 * (0.0, 0.9495, -1.899),
+        kp=12 * (174.0,),
+        kd=12 * (2.0,),
+        torque_nm=4 * (23.7, 23.7, 35.55),
+        feet=tuple(f"{leg}_foot" for leg in _DOG_LEGS),
+        trunk=("base",),
+        stand_m=0.27,
+        span_m=(0.3868, 0.284),
+        cycle_s=0.21,
+        gait="trot",
+    ),
+    mounts={
+        "front": Mount((0.30, 0.0, 0.37)),
+        "left": Mount((0.20, 0.10, 0.36), yaw_left_deg=60.0, most_hz=10.0),
+        "right": Mount((0.20, -0.10, 0.36), yaw_left_deg=-60.0, most_hz=10.0),
+    },
+    cruise_mps=1.2,
+    v_max_mps=1.5,
+    w_max_radps=0.65,
+    acceleration_mps2=2.0,
+    acceleration_radps2=3.0,
+)
+"""Quadruped of 15 kg with the published masses and lengths of a Go2."""
+
+WALKER = Robot(
+    name="walker",
+    urdf="walker.urdf",
+    length_m=0.26,
+    width_m=0.40,
+    height_m=1.32,
+    com_height_m=0.93,
+    drive=Legs(
+        joints=tuple(
+            f"{side}_{part}"
+            for side in ("left", "right")
+            for part in ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+        ),
+        rest_rad=2 * (-0.12, 0.0, 0.0, 0.30, -0.18, 0.0),
+        kp=2 * (120.0, 120.0, 120.0, 180.0, 48.0, 48.0),
+        kd=2 * (2.0, 2.0, 2.0, 4.0, 2.0, 2.0),
+        torque_nm=2 * (88.0, 139.0, 88.0, 139.0, 50.0, 50.0),
+        feet=("left_foot", "right_foot"),
+        trunk=("base",),
+        stand_m=0.7846,
+        span_m=(0.17, 0.237),
+        cycle_s=0.8,
+        gait="network",
+        weights="cf668f75b90d1abf73d2b87612a6e76bccc61ff7e083b63582d3f6aaa3c1759d",
+    ),
+    mounts={
+        "front": Mount((0.09, 0.0, 1.20), 10.0),
+        "left": Mount((0.02, 0.09, 1.19), 10.0, 60.0, most_hz=10.0),
+        "right": Mount((0.02, -0.09, 1.19), 10.0, -60.0, most_hz=10.0),
+    },
+    cruise_mps=0.9,
+    v_max_mps=1.2,
+    w_max_radps=0.65,
+    acceleration_mps2=1.5,
+    acceleration_radps2=4.0,
+)
+"""Humanoid of 32 kg with the published masses and lengths of a G1."""
+
+ROBOTS: Mapping[str, Robot] = {one.name: one for one in (COURIER, SCOUT, DOG, WALKER)}
 """Robots by name."""
 
 

@@ -112,6 +112,15 @@ class RunConfig:
             panel=_STREET,
         ),
     ] = ""
+    gait: Annotated[
+        str,
+        Option(
+            "Gait of a robot with legs in place of its own: onnx:FILE.onnx, with its manifest "
+            "FILE.json beside it.",
+            metavar="onnx:FILE",
+            panel=_STREET,
+        ),
+    ] = ""
     jobs: Annotated[
         int | None,
         Option(

@@ -19,6 +19,7 @@ from cosim.core.state import LABELS, Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
 from physics.cameras.camera_base import WorldCamera
 from physics.cameras.canvas import BulletCanvas
+from physics.cameras.posture import posture_of
 from physics.cameras.scene import BulletScene
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
 from physics.dynamics.world import BulletWorld
@@ -68,8 +69,7 @@ class BulletCamera(WorldCamera):
             raise EngineError("the camera is not running: use BulletCamera in a 'with' block")
         self._scene.arrange(taken.view, street)
         if robot is not None and body:
-            _, roll, pitch = self._world.surface.lean(robot.pose, self._world.robot.drive.span_m)
-            self._scene.show_robot(robot.pose, robot.z_m, roll, pitch)
+            self._scene.show_robot(posture_of(self._world.surface, self._world.robot, robot))
         rgb, labels, depth = self._canvas.draw(
             taken.eye_m, taken.target_m, taken.size, taken.fov_deg, NEAR_PLANE_M, FAR_PLANE_M
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -113,6 +113,23 @@ class BulletCanvas:
         p.resetBasePositionAndOrientation(
             body, at_m, p.getQuaternionFromEuler(roll_pitch_yaw), self._client
         )
+
+    def put_jointed(
+        self,
+        body: int,
+        at_m: Sequence[float],
+        roll_pitch_yaw: Sequence[float],
+        angles_rad: Mapping[str, float],
+    ) -> None:
+        """Move a loaded robot's base link frame to (3,) metres, and set joints by name."""
+        for joint in range(p.getNumJoints(body, self._client)):
+            name = p.getJointInfo(body, joint, self._client)[1].decode()
+            if name in angles_rad:
+                p.resetJointState(body, joint, angles_rad[name], physicsClientId=self._client)
+        turn = p.getQuaternionFromEuler(roll_pitch_yaw)
+        middle, own = p.getDynamicsInfo(body, -1, self._client)[3:5]
+        at, turn = p.multiplyTransforms(at_m, turn, middle, own)
+        p.resetBasePositionAndOrientation(body, at, turn, self._client)
 
     def put_at(self, body: int, at_m: Sequence[float], turn: Sequence[float]) -> None:
         """Move a body to (3,) metres and rotate it by a quaternion x, y, z, w."""

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Floats, Pose
+from cosim.core.geometry import Floats
 from cosim.core.state import People, Street, Vehicles
 from physics.cameras.canvas import BulletCanvas, Rigs
+from physics.cameras.posture import Posture
 from physics.cameras.view import (
     FORGET_M,
     PERSON_MARGIN_M,
@@ -94,17 +95,16 @@ class BulletScene:
         self._show_furniture(view)
         self._canvas.put_away(self._robot)
 
-    def show_robot(self, pose: Pose, z_m: float, roll_rad: float, pitch_rad: float) -> None:
-        """Place the robot's base frame at a pose, until the next `arrange`."""
+    def show_robot(self, posture: Posture) -> None:
+        """Place the robot's body, until the next `arrange`."""
+        (x, y, z), roll, pitch, heading, angles = posture
+        if angles:
+            self._canvas.put_jointed(self._robot, (x, y, z), (roll, pitch, heading), angles)
+            return
         h = self._model.com_height_m
-        ahead = h * math.sin(pitch_rad)
-        x, y = (
-            pose.x_m + ahead * math.cos(pose.heading_rad),
-            pose.y_m + ahead * math.sin(pose.heading_rad),
-        )
-        self._canvas.put_turned(
-            self._robot, (x, y, z_m + h), (roll_rad, pitch_rad, pose.heading_rad)
-        )
+        ahead = h * math.sin(pitch)
+        x, y = x + ahead * math.cos(heading), y + ahead * math.sin(heading)
+        self._canvas.put_turned(self._robot, (x, y, z + h), (roll, pitch, heading))
 
     def _stream(self, view: View) -> None:
         x, y = float(view.eye_m[0]), float(view.eye_m[1])

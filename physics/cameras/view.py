@@ -15,6 +15,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import RobotState
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import Robot
+from physics.cameras.posture import Posture, posture_of
 from physics.street.surface import Surface
 
 VISIBLE_M: Final = 50.0
@@ -140,16 +141,22 @@ def check_size(width: int, height: int, fov_deg: float) -> None:
 
 
 def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotState) -> Shot:
-    """Return the view of a robot's camera from its mount; it tilts with the ground."""
-    turn = _attitude(surface, model, robot)
+    """Return the view of a robot's camera from its mount.
+
+    It tilts with the ground, or with the trunk of a robot with legs.
+    """
+    posture = posture_of(surface, model, robot)
+    turn = _attitude(posture)
     mount = spec.on(model)
     x, y, z = mount.at_m
+    z -= model.drive.pivot_m
     down, left = math.radians(mount.pitch_down_deg), math.radians(mount.yaw_left_deg)
     ahead = math.cos(down) * math.cos(left)
     aside = math.cos(down) * math.sin(left)
     below = math.sin(down)
-    foot = robot.pose.x_m, robot.pose.y_m, robot.z_m
-    eye = np.array([at + a * x + b * y + c * z for at, (a, b, c) in zip(foot, turn, strict=True)])
+    eye = np.array(
+        [at + a * x + b * y + c * z for at, (a, b, c) in zip(posture.at_m, turn, strict=True)]
+    )
     way = np.array([a * ahead + b * aside - c * below for a, b, c in turn])
     return Shot(eye, eye + way, (spec.width, spec.height), spec.fov_deg)
 
@@ -159,12 +166,10 @@ def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: 
     return Shot(np.asarray(eye_m, dtype=float), np.asarray(target_m, dtype=float), size, fov_deg)
 
 
-def _attitude(
-    surface: Surface, model: Robot, robot: RobotState
-) -> tuple[tuple[float, float, float], ...]:
-    """Return the rotation matrix from the base frame to the world: heading, then surface slope."""
-    _, roll, pitch = surface.lean(robot.pose, model.drive.span_m)
-    cz, sz = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
+def _attitude(posture: Posture) -> tuple[tuple[float, float, float], ...]:
+    """Return the rotation matrix from the base link's frame to the world."""
+    roll, pitch = posture.roll_rad, posture.pitch_rad
+    cz, sz = math.cos(posture.heading_rad), math.sin(posture.heading_rad)
     cy = math.cos(pitch)
     sy = math.sin(pitch)
     cx = math.cos(roll)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -11,10 +12,11 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import PERSON_RADIUS_M, RobotState
-from cosim.spec.robot import Robot
+from cosim.core.state import PERSON_RADIUS_M, LegState, RobotState
+from cosim.spec.robot import Legs, Robot
 from cosim.spec.scenario import Barrier
 from physics.dynamics.bullet import p
+from physics.dynamics.drive import BodyNow, Motors, Vector
 from physics.dynamics.movers import Mover, TickPoses
 from physics.ground.mesh import Mesh, join, pybullet_lists
 from physics.ground.tiles import CURB_M
@@ -40,6 +42,10 @@ _SEARCH_STEP_M: Final = 0.5
 _NO_CHANGE: Final = (0.0, 0.0, 0.0)
 _UNKNOWN: Final = (math.inf, math.inf, math.inf)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
+_BODY_FRICTION: Final = 0.4
+"""Friction coefficient of a robot's links that do not carry it."""
+_FOOT_FRICTION: Final = 1.0
+"""Friction coefficient of feet."""
 _TYRE: Final = {
     "lateralFriction": 1.0,
     "anisotropicFriction": (1.0, 0.3, 1.0),
@@ -62,7 +68,6 @@ class Bodies:
     """A running PyBullet client with all collision bodies of an episode.
 
     at_m: position of the robot's base frame
-    yaw_rate_radps: yaw rate of the robot
     watched: bodies that `robot_contacts` checks
 
     Inactive bodies of people and vehicles are parked far below the ground and reused.
@@ -73,17 +78,19 @@ class Bodies:
         if self._client < 0:
             raise EngineError("PyBullet did not start")
         self._com_height_m = robot.com_height_m
+        self._legs = robot.drive if isinstance(robot.drive, Legs) else None
         self._identities: dict[int, tuple[BodyKind, str]] = {}
         self._idle: dict[Any, list[int]] = {}
         self._active: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
         self._paths: dict[Moving, list[tuple[int, list[_Placement]]]] = {}
         self._final_poses: dict[int, tuple[float, float, float]] = {}
         self.at_m = _UNKNOWN
-        self.yaw_rate_radps = 0.0
         self._searched_at_m = _UNKNOWN
         self._static_near: dict[int, Any] = {}
         self.watched: list[int] = []
         self._target_radps: list[float] = []
+        self._angles: tuple[float, ...] = ()
+        self._speeds: tuple[float, ...] = ()
         self._shapes: dict[Any, int] = {}
         self._call("setGravity", 0.0, 0.0, -9.81)
         self._call(
@@ -101,21 +108,34 @@ class Bodies:
             for j in range(self._call("getNumJoints", self._robot))
         ]
         joints = {info[1].decode(): info[0] for info in infos}
-        self._wheels = [joints[name] for name in robot.drive.joints]
-        self._torques = [robot.drive.torque_nm] * len(self._wheels)
-        self._call(
-            "changeDynamics",
-            self._robot,
-            -1,
-            lateralFriction=0.4,
-            linearDamping=0.0,
-            angularDamping=0.0,
-        )
-        for wheel in self._wheels:
-            self._call(
-                "changeDynamics", self._robot, wheel, linearDamping=0.0, angularDamping=0.0, **_TYRE
-            )
+        self._joints = [joints[name] for name in robot.drive.joints]
+        if isinstance(robot.drive, Legs):
+            links = {"base": -1} | {info[12].decode(): info[0] for info in infos}
+            self._set_up_legs(robot.drive, links)
+        else:
+            self._set_dynamics(-1, lateralFriction=_BODY_FRICTION)
+            for wheel in self._joints:
+                self._set_dynamics(wheel, **_TYRE)
         self._read()
+
+    def _set_dynamics(self, link: int, **more: Any) -> None:
+        """Set contact parameters of a link of the robot, and remove Bullet's damping."""
+        self._call(
+            "changeDynamics", self._robot, link, linearDamping=0.0, angularDamping=0.0, **more
+        )
+
+    def _set_up_legs(self, legs: Legs, links: Mapping[str, int]) -> None:
+        """Set the contacts of feet and body, and make the joints follow torques."""
+        feet = {links[name] for name in legs.feet}
+        for link in links.values():
+            friction = _FOOT_FRICTION if link in feet else _BODY_FRICTION
+            self._set_dynamics(link, lateralFriction=friction)
+        self._trunk = [links[name] for name in legs.trunk]
+        dynamics = self._call("getDynamicsInfo", self._robot, -1)
+        self._middle_m: tuple[float, float, float] = dynamics[3]
+        for joint in self._joints:
+            self._call("changeDynamics", self._robot, joint, jointDamping=0.0)
+            self._call("setJointMotorControl2", self._robot, joint, p.VELOCITY_CONTROL, force=0.0)
 
     def close(self) -> None:
         """Disconnect the client."""
@@ -290,31 +310,45 @@ class Bodies:
         """Put the robot at rest with its base frame at a position and attitude."""
         turn = p.getQuaternionFromEuler(roll_pitch_yaw)
         m = p.getMatrixFromQuaternion(turn)
-        h = self._com_height_m
-        middle = [c + h * up for c, up in zip(xyz_m, (m[2], m[5], m[8]), strict=True)]
+        if self._legs is None:
+            h = self._com_height_m
+            middle = [c + h * up for c, up in zip(xyz_m, (m[2], m[5], m[8]), strict=True)]
+        else:
+            shift = _turned(m, self._middle_m)
+            middle = [c + d for c, d in zip(xyz_m, shift, strict=True)]
+            middle[2] += self._legs.stand_m
         self._call("resetBasePositionAndOrientation", self._robot, middle, turn)
         self._call("resetBaseVelocity", self._robot, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        for wheel in self._wheels:
-            self._call("resetJointState", self._robot, wheel, 0.0, 0.0)
+        rest = (0.0,) * len(self._joints) if self._legs is None else self._legs.rest_rad
+        for joint, angle in zip(self._joints, rest, strict=True):
+            self._call("resetJointState", self._robot, joint, angle, 0.0)
         self._read()
 
-    def step(self, substep: int, speeds_radps: list[float]) -> tuple[float, float, float]:
+    def step(self, substep: int, motors: Motors) -> tuple[float, float, float]:
         """Run one substep; return x, y and heading of the robot's base frame.
 
         substep: index within the tick, from 0
-        speeds_radps: target speeds of the drive joints, in the order of `Skid.joints`
+        motors: values for the joints, in the order of the drive's joints
         """
         for led in self._paths.values():
             for body, way in led:
                 p.resetBasePositionAndOrientation(body, *way[substep], self._client)
-        if speeds_radps != self._target_radps:  # PyBullet keeps the last targets
-            self._target_radps = speeds_radps
+        if motors.limits_nm is None:  # PyBullet forgets torques after a substep
             p.setJointMotorControlArray(
                 self._robot,
-                self._wheels,
+                self._joints,
+                p.TORQUE_CONTROL,
+                forces=motors.values,
+                physicsClientId=self._client,
+            )
+        elif motors.values != self._target_radps:  # PyBullet keeps the last targets
+            self._target_radps = motors.values
+            p.setJointMotorControlArray(
+                self._robot,
+                self._joints,
                 p.VELOCITY_CONTROL,
-                targetVelocities=speeds_radps,
-                forces=self._torques,
+                targetVelocities=motors.values,
+                forces=motors.limits_nm,
                 physicsClientId=self._client,
             )
         p.stepSimulation(self._client)
@@ -322,23 +356,54 @@ class Bodies:
 
     def _read(self) -> tuple[float, float, float]:
         """Read the robot's pose and velocity from the engine."""
-        self._velocity = p.getBaseVelocity(self._robot, self._client)
+        self._velocity: tuple[Vector, Vector] = p.getBaseVelocity(self._robot, self._client)
         (x, y, z), turn = p.getBasePositionAndOrientation(self._robot, self._client)
         self._rotation = m = p.getMatrixFromQuaternion(turn)
-        h = self._com_height_m  # PyBullet reports the centre of mass
-        self.at_m = x, y, _ = x - h * m[2], y - h * m[5], z - h * m[8]
-        self.yaw_rate_radps = self._velocity[1][2]
+        if self._legs is None:
+            h = self._com_height_m  # PyBullet reports the centre of mass
+            self.at_m = x, y, _ = x - h * m[2], y - h * m[5], z - h * m[8]
+        else:
+            dx, dy, dz = _turned(m, self._middle_m)
+            self.at_m = x, y, _ = x - dx, y - dy, z - dz - self._legs.stand_m
+            states = p.getJointStates(self._robot, self._joints, self._client)
+            self._angles = tuple([state[0] for state in states])
+            self._speeds = tuple([state[1] for state in states])
         return x, y, math.atan2(m[3], m[0])
+
+    def body_now(self) -> BodyNow:
+        """Return the measured state of the base link and the joints."""
+        linear, angular = self._velocity
+        return BodyNow(self.at_m, self._rotation, linear, angular, self._angles, self._speeds)
+
+    def trunk_on_ground(self) -> bool:
+        """Return whether a link of the trunk touches anything that is not watched."""
+        return any(
+            contact[8] <= 0.0 and contact[2] not in self._identities
+            for link in self._trunk
+            for contact in p.getContactPoints(
+                bodyA=self._robot, linkIndexA=link, physicsClientId=self._client
+            )
+        )
+
+    def speeds(self) -> tuple[float, float]:
+        """Return the speed along the heading and the yaw rate."""
+        m = self._rotation
+        (linear, angular) = self._velocity
+        forward = linear[0] * m[0] + linear[1] * m[3] + linear[2] * m[6]
+        turn = angular[0] * m[2] + angular[1] * m[5] + angular[2] * m[8]
+        return forward, turn
 
     def robot_state(self) -> RobotState:
         """Return the robot's pose, velocities and tilt."""
         (x, y, z) = self.at_m
         m = self._rotation
-        (linear, angular) = self._velocity
-        forward = linear[0] * m[0] + linear[1] * m[3] + linear[2] * m[6]
-        turn = angular[0] * m[2] + angular[1] * m[5] + angular[2] * m[8]
+        forward, turn = self.speeds()
         pose = Pose(x, y, math.atan2(m[3], m[0]))
-        return RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
+        state = RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
+        if self._legs is None:
+            return state
+        roll, pitch = math.atan2(m[7], m[8]), math.asin(min(max(-m[6], -1.0), 1.0))
+        return replace(state, legs=LegState(roll, pitch, self._angles))
 
     def watch(self, reach_m: float, movers: Iterable[tuple[Moving, Mover]]) -> None:
         """Select the bodies for contact checks.
@@ -388,6 +453,16 @@ class Bodies:
             return getattr(p, call)(*args, **options, physicsClientId=self._client)
         except p.error as error:
             raise EngineError(f"PyBullet: {call}: {error}") from error
+
+
+def _turned(m: tuple[float, ...], v: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return a vector that is rotated by a matrix of nine entries."""
+    x, y, z = v
+    return (
+        m[0] * x + m[1] * y + m[2] * z,
+        m[3] * x + m[4] * y + m[5] * z,
+        m[6] * x + m[7] * y + m[8] * z,
+    )
 
 
 def _wall_box(

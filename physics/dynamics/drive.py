@@ -1,17 +1,25 @@
-"""Skid steering: converts forward speed and yaw rate into wheel speeds.
+"""Drives: convert commands into motions of a robot's joints.
 
-Wheels that slide sideways turn the robot less than their speeds imply, depending on the floor. A
-yaw-rate controller (feed-forward, proportional, integral) closes that gap, as on real robots. Speed
-needs no controller because wheels hardly slip lengthwise. At rest the wheels are locked.
+Skid steering: wheels that slide sideways turn the robot less than their speeds imply, depending on
+the floor. A yaw-rate controller (feed-forward, proportional, integral) closes that gap, as on real
+robots. Speed needs no controller because wheels hardly slip lengthwise. At rest the wheels are
+locked.
+
+Legs are in `physics.dynamics.legs`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple, Protocol
 
 from cosim.core.state import Command
-from cosim.spec.robot import Robot
+from cosim.spec.robot import Robot, Skid
+
+Vector = tuple[float, float, float]
+
+SUBSTEP_S: Final = 0.005
+"""Duration of a physics substep in seconds."""
 
 _FEED_FORWARD: Final = 1.2
 """Feed-forward gain of the yaw-rate controller."""
@@ -26,12 +34,66 @@ _INTEGRAL_MAX_RADPS: Final = 2.0
 """Limit of the integral term in rad/s."""
 
 
-class SkidDrive:
-    """Drive controller of one robot: acceleration ramps and yaw-rate integral."""
+class BodyNow(NamedTuple):
+    """Measured state of a robot's base link and joints.
 
-    def __init__(self, robot: Robot) -> None:
+    at_m: position of the base frame in the world.
+    rotation: nine entries of the base link's rotation matrix, by rows.
+    velocity_mps, spin_radps: velocity of the base link's centre of mass and angular velocity, in
+        the world.
+    angles_rad, speeds_radps: of the joints, if `Drive.reads_joints`; else empty.
+    """
+
+    at_m: Vector
+    rotation: tuple[float, ...]
+    velocity_mps: Vector
+    spin_radps: Vector
+    angles_rad: tuple[float, ...] = ()
+    speeds_radps: tuple[float, ...] = ()
+
+
+class Motors(NamedTuple):
+    """What the motors of all joints do in a substep.
+
+    values: target speeds in rad/s, or torques in Nm.
+    limits_nm: limits of the torques that reach the target speeds; None if `values` are torques.
+    """
+
+    values: list[float]
+    limits_nm: list[float] | None = None
+
+
+class Drive(Protocol):
+    """Controller of one robot's joints."""
+
+    @property
+    def reads_joints(self) -> bool:
+        """Whether `BodyNow` must have the joints."""
+
+    def reset(self) -> None:
+        """Reset the controller to rest."""
+
+    def step(self, command: Command, body: BodyNow) -> Motors:
+        """Return the motors' values for the next substep. Call once per substep.
+
+        command: within the robot's limits (see `cosim.episode.control`)
+        """
+
+
+class SkidDrive:
+    """Drive of a robot on wheels: acceleration ramps and yaw-rate integral.
+
+    dt_s: duration of a substep
+    """
+
+    reads_joints = False
+
+    def __init__(self, robot: Robot, skid: Skid, dt_s: float) -> None:
         self._robot = robot
-        self._zero_speeds = [0.0] * len(robot.drive.joints)
+        self._skid = skid
+        self._dt_s = dt_s
+        self._zero_speeds = [0.0] * len(skid.joints)
+        self._limits_nm = [skid.torque_nm] * len(skid.joints)
         self.reset()
 
     def reset(self) -> None:
@@ -40,17 +102,16 @@ class SkidDrive:
         self._w_radps = 0.0
         self._integral_radps = 0.0
 
-    def joint_speeds(self, command: Command, w_radps: float, dt_s: float) -> list[float]:
-        """Return wheel speeds in rad/s, in the order of `Skid.joints`. Call once per substep.
+    def step(self, command: Command, body: BodyNow) -> Motors:
+        """Return wheel speeds in rad/s, in the order of `Skid.joints`."""
+        return Motors(self._joint_speeds(command, body.spin_radps[2]), self._limits_nm)
 
-        command: within the robot's limits (see `cosim.episode.control`)
-        w_radps: measured yaw rate
-        dt_s: duration of a substep
-        """
+    def _joint_speeds(self, command: Command, w_radps: float) -> list[float]:
+        dt_s = self._dt_s
         robot = self._robot
-        drive = self._robot.drive
-        self._v_mps = _towards(self._v_mps, command.v_mps, robot.acceleration_mps2 * dt_s)
-        self._w_radps = _towards(self._w_radps, command.w_radps, robot.acceleration_radps2 * dt_s)
+        drive = self._skid
+        self._v_mps = towards(self._v_mps, command.v_mps, robot.acceleration_mps2 * dt_s)
+        self._w_radps = towards(self._w_radps, command.w_radps, robot.acceleration_radps2 * dt_s)
         if self._v_mps == 0.0 and self._w_radps == 0.0:
             self._integral_radps = 0.0
             return self._zero_speeds
@@ -65,5 +126,6 @@ class SkidDrive:
         return [left] * len(drive.left) + [right] * len(drive.right)
 
 
-def _towards(value: float, goal: float, step: float) -> float:
+def towards(value: float, goal: float, step: float) -> float:
+    """Return a value that is moved towards a goal by at most a step."""
     return goal if abs(goal - value) <= step else value + math.copysign(step, goal - value)

@@ -26,16 +26,15 @@ from cosim.core.state import (
     write_protected_copy,
 )
 from cosim.spec.obstacle import Obstacle
-from cosim.spec.robot import COURIER, Robot
+from cosim.spec.robot import COURIER, Legs, Robot
 from cosim.spec.scenario import Barrier
 from physics.dynamics.bodies import Bodies, Moving
-from physics.dynamics.drive import SkidDrive
+from physics.dynamics.drive import SUBSTEP_S, Drive
+from physics.dynamics.drives import drive_of
+from physics.dynamics.legs.watch import LegWatch
 from physics.dynamics.movers import Mover, TickPoses, movers_near
 from physics.ground.tiles import Key, tile_distance, tile_distances_within, tiles_within
 from physics.street.surface import Surface, grounded_obstacles
-
-SUBSTEP_S: Final = 0.005
-"""Duration of a physics substep in seconds."""
 
 PEOPLE_REACH_M: Final = 6.0
 """Distance in metres within which people have collision bodies."""
@@ -73,6 +72,7 @@ class BulletWorld:
 
     surface: ground with buildings and props
     barriers, obstacles: additional static bodies of the episode
+    drive: replaces the robot's own drive
     """
 
     def __init__(
@@ -81,12 +81,16 @@ class BulletWorld:
         barriers: Sequence[Barrier] = (),
         robot: Robot = COURIER,
         obstacles: Sequence[Obstacle] = (),
+        drive: Drive | None = None,
     ) -> None:
         self.surface = surface
         self.robot = robot
         self.barriers = tuple(barriers)
         self.obstacles = tuple(obstacles)
-        self._drive = SkidDrive(robot)
+        self._drive = drive_of(robot, SUBSTEP_S) if drive is None else drive
+        self._watch: LegWatch | None = None
+        if isinstance(robot.drive, Legs):
+            self._watch = LegWatch(robot.drive, SUBSTEP_S)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
         self._loaded_at_m = (0.0, 0.0)
@@ -129,10 +133,12 @@ class BulletWorld:
             self._reload_after_m = 0.0
 
     def place(self, pose: Pose) -> RobotState:
-        """Put the robot at rest at a pose, with its wheels on the ground."""
+        """Put the robot at rest at a pose, with its wheels or feet on the ground."""
         bodies = self._engine
         self._load_tiles(pose.x_m, pose.y_m)
         self._drive.reset()
+        if self._watch is not None:
+            self._watch.reset()
         z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
         bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
         return bodies.robot_state()
@@ -174,17 +180,22 @@ class BulletWorld:
             if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
                 x, y, _ = pose
                 close |= self._watch_near(near, x, y)
-            pose = bodies.step(
-                k, self._drive.joint_speeds(command, bodies.yaw_rate_radps, SUBSTEP_S)
-            )
+            pose = bodies.step(k, self._drive.step(command, bodies.body_now()))
             trace += pose
+            if self._watch is not None:
+                self._watch.add(bodies.speeds())
             if bodies.watched:
                 found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
         poses = write_protected_copy(trace, shape=(substeps, 3))
         for kind, mover in close:
             found.update(self._overlaps(kind, mover, poses))
         contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
-        return Motion(bodies.robot_state(), poses, contacts)
+        if self._watch is None:
+            return Motion(bodies.robot_state(), poses, contacts)
+        ground_m = float(self.surface.heights(np.array([bodies.at_m[:2]]))[0])
+        touches = bodies.trunk_on_ground()
+        robot, down = self._watch.judged(bodies.robot_state(), ground_m, touches)
+        return Motion(robot, poses, contacts, down)
 
     def _watch_near(
         self, near: Mapping[Moving, Sequence[Mover]], x_m: float, y_m: float

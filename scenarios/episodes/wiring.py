@@ -38,6 +38,7 @@ from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import join_faults
 from physics.cameras.choice import camera_of, camera_of_choice, drawn_appearance, renderer_of
+from physics.dynamics.drives import gait_drive
 from physics.dynamics.world import BulletWorld
 from physics.street.furniture import Prop, footprints
 from physics.street.surface import Surface
@@ -107,8 +108,9 @@ def staged(
     with ExitStack() as stack:
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
+        motors = gait_drive(robot, options.gait) if options.gait else None
         world = stack.enter_context(
-            BulletWorld(street, scenario.barriers, robot, scenario.obstacles)
+            BulletWorld(street, scenario.barriers, robot, scenario.obstacles, motors)
         )
         crowd = crowd_of(scenario)
         stack.enter_context(crowd)

@@ -25,6 +25,7 @@ from cosim.spec.scenario import Scenario, Suite
 from cosim.spec.selection import pairs_of
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
+from physics.dynamics.drives import gait_hash
 from physics.robots import robot_hash
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello
@@ -158,18 +159,20 @@ def run_spec(
     shared: whether one renderer draws for all episodes.
     shard: the part of the run in the folder, None for all.
     Raises UsageError if a robot lacks the policy's camera, unless the options allow an own camera,
-    or if the policy does not support the goal.
+    if the policy does not support the goal, or if the gait does not fit the robot.
     """
     manifest = with_goal(driver.manifest, options.goal)
     robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
     if manifest.camera is not None:
         for robot in robots:
             check_camera(manifest, robot, options.own_camera)
+    gaits = [gait_hash(options.gait, robot) for robot in robots]
     setup = RunSetup.of(
         options,
         suite_hash=whole.content_hash,
         policy_source=driver.source_hash,
         policy_runs=driver.runs,
+        gait_hash=gaits[0] if gaits else "",
     )
     if manifest.camera is not None:
         drawn_by = renderer_of(chosen_camera(options.camera), options.appearance)

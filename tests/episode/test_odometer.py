@@ -10,7 +10,8 @@ import pytest
 
 from cosim.core.geometry import Pose
 from cosim.episode.observer import Gps, Odometer, WheelOdometer, odometer_for
-from cosim.spec.odometry import GpsNoise, Odometry, WheelNoise
+from cosim.spec.odometry import LEG_NOISE, GpsNoise, Odometry, WheelNoise
+from cosim.spec.robot import DOG
 
 START = Pose(10.0, 20.0, 0.5 * math.pi)
 """Looking north."""
@@ -48,6 +49,27 @@ def test_wheels_without_errors_count_the_way_and_not_what_carries_the_robot() ->
     assert (told.x_m, told.y_m) == pytest.approx((5.0, 5.0), abs=1e-3)
     told = driven(counted, straight(2.0))
     assert told is not None and (told.x_m, told.y_m) == pytest.approx((5.0, 7.0), abs=1e-3)
+
+
+def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
+    """1 m aside is counted to a few per cent; over 30 m the heading drifts by 15 degrees."""
+    aside = [
+        driven(
+            odometer_for("wheel", START, np.random.default_rng(seed), DOG),
+            [START, Pose(9.0, 20.0, 0.5 * math.pi)],
+        )
+        for seed in range(200)
+    ]
+    counted = np.array([one.y_m for one in aside if one is not None])
+    assert counted.mean() == pytest.approx(1.0, abs=0.02)
+    assert counted.std() == pytest.approx(LEG_NOISE.scale, rel=0.2)
+    ends = [
+        driven(odometer_for("wheel", START, np.random.default_rng(seed), DOG), straight(30.0))
+        for seed in range(200)
+    ]
+    headings = np.array([one.heading_rad for one in ends if one is not None], dtype=float)
+    expected = math.hypot(LEG_NOISE.drift_radpm * 30.0, LEG_NOISE.heading_rad * math.sqrt(30.0))
+    assert headings.std() == pytest.approx(expected, rel=0.15)
 
 
 def test_wheels_are_as_wrong_as_declared() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from cosim.core.errors import EngineError, SpecError
 from cosim.spec.robot import COURIER
-from physics.cameras.gl.robot_body import robot_parts
+from physics.cameras.gl.robot_body import link_parts, robot_parts
 from physics.robots import urdf_path
 
 CHASSIS = re.compile(r'<box size="([\d. ]+)"\s*/>')
@@ -53,9 +53,9 @@ def test_a_body_that_cannot_be_drawn_is_named(tmp_path: Path) -> None:
     """A file that is not there, and a shape that is none."""
     with pytest.raises(SpecError, match=r"gone\.stl: cannot be read as a mesh"):
         robot_parts(with_visual(tmp_path, '<mesh filename="gone.stl"/>'))
-    robot_parts.cache_clear()
+    link_parts.cache_clear()
     with pytest.raises(
         EngineError,
-        match=r"a visual shows a capsule; the gl camera draws boxes, cylinders and meshes",
+        match=r"a visual shows a capsule; the gl camera draws boxes, cylinders, spheres and meshes",
     ):
         robot_parts(with_visual(tmp_path, '<capsule radius="1" length="2"/>'))

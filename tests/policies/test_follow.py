@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import UsageError
 from cosim.core.state import STILL, Command
 from cosim.episode.manifest_checks import calibration_of
-from cosim.policies.follow.espnetv2 import read_torch_file, street_graph
+from cosim.policies.follow.espnetv2 import street_graph
 from cosim.policies.follow.networks import (
     ESPNET_GRAPH,
     ESPNET_WEIGHTS,
@@ -39,6 +39,7 @@ from cosim.policies.follow.policy import (
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.policy import example_observation
+from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import COURIER, ROBOTS, Robot
 from tests.support.follow_weights import WEIGHTS, make_weights

@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 
 import cosim
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import ROBOTS, Legs
 from cosim.spec.scenario import Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.catalog import load_suite
@@ -66,3 +68,13 @@ def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: 
     assert not table[["success", "spl", "route_completion"]].iloc[0].any()
     assert table[["pedestrian_collision", "left_lane"]].isna().all(axis=None)
     assert "no rates: 1 crashed" in " ".join(ran.stdout.split())
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("robot", [name for name in ROBOTS if isinstance(ROBOTS[name].drive, Legs)])
+def test_legs_gain_a_cheat_nothing(robot: str) -> None:
+    """Walking straight ahead or standing solves no event with a robot on legs, either."""
+    options = EpisodeOptions(seed=0, robot=robot)
+    for policy, kinds in (("straight", ("obstructing", "gesturing")), ("stop", ("frontal",))):
+        table = cosim.run("reactive", policy, scenarios=scenarios_of(kinds, 1), options=options)
+        assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0

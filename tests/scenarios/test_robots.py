@@ -312,8 +312,12 @@ def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
     assert "robot   scout  0.50 x 0.40 m, travels at 2 m/s" in cosim("list").stdout
 
 
+WHEELED = [name for name, one in ROBOTS.items() if isinstance(one.drive, Skid)]
+"""Robots on wheels; for legs see `tests.physics.test_legs`."""
+
+
 @pytest.mark.engine
-@pytest.mark.parametrize("name", [*ROBOTS, "barrow"])
+@pytest.mark.parametrize("name", [*WHEELED, "barrow"])
 def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
     """Its collision body fills the outline, its wheels stand where they should, its mass is where
     it should be."""
@@ -338,6 +342,7 @@ def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
     assert high == pytest.approx([*half, robot.height_m], abs=0.01) and low == pytest.approx(
         [-half[0], -half[1], 0.0], abs=0.01
     )
+    assert isinstance(robot.drive, Skid)
     ahead, aside = (0.5 * span for span in robot.drive.span_m)
     radius = robot.drive.wheel_radius_m
     for side, joints in ((aside, robot.drive.left), (-aside, robot.drive.right)):
@@ -346,7 +351,7 @@ def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("name", [*ROBOTS, "barrow"])
+@pytest.mark.parametrize("name", [*WHEELED, "barrow"])
 def test_every_robot_reaches_its_limits_upright(name: str, barrow: Robot) -> None:
     """At its pace, at its highest speed in a curve, and turning on the spot: within 5 % of the
     command."""

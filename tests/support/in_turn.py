@@ -22,6 +22,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import ROBOTS
 from cosim.spec.scenario import City, CrowdSpec, Light, Scenario
+from physics.dynamics.legs.gait_file import weights_in_words
 from scenarios.episodes.episode import Episode
 from scenarios.places.nets import place
 
@@ -37,6 +38,7 @@ _CROWDS = (
     CrowdSpec(persons=5, vehicles=4, residents=4),
     CrowdSpec(persons=0, vehicles=0),
 )
+_ROBOTS = [name for name, one in ROBOTS.items() if "missing" not in weights_in_words(one)]
 _DRIVES = Command(1.0, 0.2)
 
 
@@ -68,7 +70,7 @@ def drawn() -> Iterator[tuple[Scenario, Manifest]]:
                 goal=route[-1],
                 route=route,
                 crowd=_CROWDS[k // 6],
-                robot=list(ROBOTS)[k % 5 % len(ROBOTS)],
+                robot=_ROBOTS[k % 5 % len(_ROBOTS)],
                 light=Light(hour=20.5) if k % 7 == 3 else Light(),
             ),
             Manifest("turn", camera=CameraSpec(64, 48) if k % 12 == 0 else None),

@@ -95,4 +95,4 @@ def weights_in_words() -> str:
 
 
 def _found(weights: NetworkFile) -> Path:
-    return weights_file("follow", weights.name, weights.facts, weights.source)
+    return weights_file("policy 'follow'", weights.name, weights.facts, weights.source)

@@ -115,12 +115,16 @@ class Converter:
     weights: Published file.
     make: Converts the file's bytes to the graph's bytes.
     graph: Returns the graph's file; its facts are None if any version may be written.
+    versions: Packages that write the graph as required, and how to install them.
     """
 
     module: str
     weights: NetworkFile
     make: Callable[[bytes], bytes]
     graph: Callable[[], NetworkFile]
+    versions: str = (
+        "this onnx writes it otherwise than versions 1.19 to 1.23: pip install 'onnx<1.24'"
+    )
 
     def write(self, path: Path, folder: Path) -> Path:
         """Convert the file at `path` and write the graph into a folder; return its path.
@@ -134,8 +138,7 @@ class Converter:
         if graph.facts is not None and found.blake2b != graph.facts.blake2b:
             raise MachineError(
                 f"{graph.name}: would be {found.bytes} bytes, BLAKE2b {found.blake2b}, and a run "
-                f"takes {graph.facts.in_words}: this onnx writes it otherwise than versions 1.19 "
-                "to 1.23: pip install 'onnx<1.24'"
+                f"takes {graph.facts.in_words}: {self.versions}"
             )
         out = folder / graph.name
         try:

@@ -52,11 +52,11 @@ def external_files(data: bytes) -> list[str]:
     """Return names of files with weights of the graph. Raises ValueError for an invalid file."""
     found = set[str]()
     for tensor in _tensors(memoryview(data)):
-        for number, entry in _fields(tensor):
+        for number, entry in fields(tensor):
             if number == _EXTERNAL and isinstance(entry, memoryview):
                 texts = {
                     key: bytes(text).decode()
-                    for key, text in _fields(entry)
+                    for key, text in fields(entry)
                     if isinstance(text, memoryview)
                 }
                 if texts.get(_KEY) == "location":
@@ -73,11 +73,11 @@ def non_finite_weights(data: bytes) -> list[str]:
 
 
 def _is_finite(tensor: memoryview) -> bool:
-    fields = dict(_fields(tensor))
-    kind, raw = fields.get(_TYPE), fields.get(_RAW)
+    found = dict(fields(tensor))
+    kind, raw = found.get(_TYPE), found.get(_RAW)
     if kind not in _DTYPES:
         return True
-    raw = fields.get({_FLOAT: _FLOATS, _DOUBLE: _DOUBLES}.get(kind, _RAW), raw)
+    raw = found.get({_FLOAT: _FLOATS, _DOUBLE: _DOUBLES}.get(kind, _RAW), raw)
     if not isinstance(raw, memoryview) or len(raw) % np.dtype(_DTYPES[kind]).itemsize:
         return True
     numbers: NDArray[Any] = np.frombuffer(raw, _DTYPES[kind])
@@ -87,13 +87,13 @@ def _is_finite(tensor: memoryview) -> bool:
 
 
 def _name(tensor: memoryview) -> str:
-    name = dict(_fields(tensor)).get(_NAME, b"")
+    name = dict(fields(tensor)).get(_NAME, b"")
     return bytes(name).decode(errors="replace") if isinstance(name, memoryview) else ""
 
 
 def _tensors(model: memoryview) -> Iterator[memoryview]:
     """Yield all tensors of a model, including those of constants, functions and subgraphs."""
-    if not any(_PARTS["model"].get(number) == "graph" for number, _ in _fields(model)):
+    if not any(_PARTS["model"].get(number) == "graph" for number, _ in fields(model)):
         raise ValueError("has no graph")
     messages = [("model", model)]
     while messages:
@@ -101,26 +101,26 @@ def _tensors(model: memoryview) -> Iterator[memoryview]:
         if kind == "tensor":
             yield message
             continue
-        for number, part in _fields(message):
+        for number, part in fields(message):
             if (held := _PARTS[kind].get(number)) is not None:
                 if not isinstance(part, memoryview):
                     raise ValueError(f"has a {held} that is none")
                 messages.append((held, part))
 
 
-def _fields(message: memoryview) -> Iterator[_Field]:
+def fields(message: memoryview) -> Iterator[_Field]:
     """Yield number and value of each field of a protobuf message. Raises ValueError if invalid."""
     at = 0
     while at < len(message):
-        key, at = _varint(message, at)
+        key, at = varint(message, at)
         number = key >> 3
         wire = key & 7
         if wire == 0:
-            value, at = _varint(message, at)
+            value, at = varint(message, at)
             yield number, value
             continue
         if wire == 2:
-            length, at = _varint(message, at)
+            length, at = varint(message, at)
         elif wire in (1, 5):
             length = 8 if wire == 1 else 4
         else:
@@ -131,7 +131,7 @@ def _fields(message: memoryview) -> Iterator[_Field]:
         at += length
 
 
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
+def varint(message: memoryview, at: int) -> tuple[int, int]:
     """Return a number of variable length, and the offset of its end."""
     value = 0
     for shift in range(0, 70, 7):

@@ -68,9 +68,11 @@ def weight_folders() -> list[Path]:
 
 
 def weights_file(
-    policy: str, name: str, facts: FileFacts | None, source: str, beside: Sequence[Path] = ()
+    user: str, name: str, facts: FileFacts | None, source: str, beside: Sequence[Path] = ()
 ) -> Path:
-    """Return the path of a policy's file in the folders `beside` or the folders of weights.
+    """Return the path of a file of weights in the folders `beside` or the folders of weights.
+
+    user: what needs it, such as "policy 'follow'".
 
     Raises UsageError with the file's origin if it is missing.
     """
@@ -82,8 +84,7 @@ def weights_file(
     wanted = f": from {source}" if source else ""
     looked = ", ".join(map(str, places))
     raise UsageError(
-        f"policy '{policy}': {name} is missing{size}{wanted}. Looked for in {looked} (set "
-        f"{WEIGHTS_VARIABLE})"
+        f"{user}: {name} is missing{size}{wanted}. Looked for in {looked} (set {WEIGHTS_VARIABLE})"
     )
 
 
@@ -126,7 +127,9 @@ def _found(folder: Path, manifest: BundleManifest, name: str) -> Path:
 
     Raises UsageError for a link that leads out of the bundle's folder.
     """
-    path = weights_file(manifest.name, name, manifest.files.get(name), manifest.source, [folder])
+    path = weights_file(
+        f"policy '{manifest.name}'", name, manifest.files.get(name), manifest.source, [folder]
+    )
     return _inside(path, folder) if path.parent == folder else path
 
 

@@ -29,11 +29,9 @@ class BodyDisks(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot) -> BodyDisks:
-        quarter_m, half_m = robot.length_m / 4, robot.width_m / 2
+        nose_m, half_m = _up(robot.length_m / 4), robot.width_m / 2
         return cls(
-            _up(quarter_m),
-            _up(math.hypot(quarter_m, half_m)),
-            _up(math.hypot(2.0 * quarter_m, half_m)),
+            nose_m, _up(math.hypot(nose_m, half_m)), _up(math.hypot(robot.length_m / 2, half_m))
         )
 
 

@@ -45,6 +45,7 @@ CAUSE_COLOURS: Final = dict(
             "#d99a3d",
             "#8a5aa8",
             "#4f86c6",
+            "#3f9c8f",
             "#8b97a3",
             "#c06aa0",
             "#333333",

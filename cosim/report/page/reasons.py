@@ -28,6 +28,7 @@ CAUSES: Final = (
     "obstacle",
     "off the sidewalk",
     "froze",
+    "fell",
     "out of time",
     "broke the rule",
     "policy crashed",
@@ -95,6 +96,8 @@ def cause_of(failure: Failure) -> str:
         return "off the sidewalk"
     if failure.kind == "freezing":
         return "froze"
+    if failure.kind == "fall":
+        return "fell"
     return {"pedestrian": "person", "vehicle": "vehicle"}.get(failure.other_kind, "obstacle")
 
 
@@ -117,6 +120,8 @@ def reason_of(
     if failure.kind == "freezing":
         near = _nearest(log, failure.tick)
         return f"stayed within {FREEZE_MOVE_M:g} m for {FREEZE_WINDOW_S:g} s{near}"
+    if failure.kind == "fall":
+        return f"fell at {failure.robot_speed_mps:.1f} m/s"
     if failure.kind == "out_of_lane":
         return _off_sidewalk(scenario, failure)
     if failure.other_kind == "pedestrian":

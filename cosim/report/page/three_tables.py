@@ -36,6 +36,7 @@ RATES: Final = {
     "collisions_per_100m": "C",
     "out_of_lane_per_100m": "OL",
     "freezings_per_100m": "F",
+    "falls_per_100m": "FL",
     "velocity_mean_mps": "V",
 }
 _FIRST: Final = {
@@ -234,7 +235,7 @@ def _long(runs: Sequence[ReportedRun]) -> ReportTable | None:
     ]
     note = (
         "Failures per 100 m travelled, pooled over all metres: FC all, C collisions, OL off the "
-        "sidewalk, F freezings; V mean speed, m/s."
+        "sidewalk, F freezings, FL falls of robots with legs; V mean speed, m/s."
     )
     return _table("Long ways", note, runs, "long", columns, LONG_OF_PAPER)
 

@@ -1,4 +1,4 @@
-"""Robot body from the shapes of its URDF: boxes, cylinders and mesh files in their colours."""
+"""Robot body from the shapes of its URDF: boxes, cylinders, spheres and mesh files in their colours."""
 
 from __future__ import annotations
 
@@ -10,55 +10,47 @@ import numpy as np
 
 from cosim.core.errors import EngineError, SpecError
 from cosim.core.geometry import Floats
-from physics.dynamics.bullet import p
 from physics.ground.mesh import Mesh, Part, box, frustum, join
+from physics.robots.kinematics import link_tree, origin_of
 
 _GREY = (0.6, 0.6, 0.6)
 
 
-@lru_cache(maxsize=8)
 def robot_parts(urdf: Path) -> tuple[Part, ...]:
-    """Return the visible parts of a robot in its base frame, with joints at zero.
+    """Return the visible parts of a robot in its base link's frame, with joints at zero.
+
+    Raises EngineError for an unknown shape.
+    """
+    places = link_tree(urdf).places({})
+    parts = []
+    for link, shapes in link_parts(urdf).items():
+        turn, shift = places[link]
+        for mesh, colour, *_ in shapes:
+            vertices = mesh.vertices @ turn.T + shift
+            parts.append(Part(Mesh(vertices, mesh.normals @ turn.T, mesh.triangles), colour))
+    return tuple(parts)
+
+
+@lru_cache(maxsize=8)
+def link_parts(urdf: Path) -> dict[str, tuple[Part, ...]]:
+    """Return the visible parts of each link in its own frame.
 
     Raises EngineError for an unknown shape.
     """
     root = xml.parse(urdf).getroot()
     colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
-    joints = {j.find("child").get("link", ""): j for j in root.findall("joint")}  # type: ignore[union-attr]
-    parts = []
+    found = {}
     for link in root.findall("link"):
-        turn, shift = _placed(link.get("name", ""), joints)
+        parts = []
         for visual in link.findall("visual"):
-            own_turn, own_shift = _origin(visual)
+            turn, shift = origin_of(visual)
             mesh = _shape(visual, urdf)
-            vertices = (mesh.vertices @ own_turn.T + own_shift) @ turn.T + shift
             material = visual.find("material")
             name = material.get("name", "") if material is not None else ""
-            turned = Mesh(vertices, mesh.normals @ own_turn.T @ turn.T, mesh.triangles)
+            turned = Mesh(mesh.vertices @ turn.T + shift, mesh.normals @ turn.T, mesh.triangles)
             parts.append(Part(turned, colours.get(name, _GREY)))
-    return tuple(parts)
-
-
-def _placed(link: str, joints: dict[str, xml.Element]) -> tuple[Floats, Floats]:
-    """Return rotation and position of a link in the base frame, every joint at zero."""
-    turn, shift = np.eye(3), np.zeros(3)
-    while link in joints:
-        own_turn, own_shift = _origin(joints[link])
-        turn = own_turn @ turn
-        shift = own_turn @ shift + own_shift
-        link = joints[link].find("parent").get("link", "")  # type: ignore[union-attr]
-    return turn, shift
-
-
-def _origin(element: xml.Element) -> tuple[Floats, Floats]:
-    origin = element.find("origin")
-    if origin is None:
-        return np.eye(3), np.zeros(3)
-    angles, shift = (
-        [float(v) for v in origin.get(name, "0 0 0").split()] for name in ("rpy", "xyz")
-    )
-    turn = p.getMatrixFromQuaternion(p.getQuaternionFromEuler(angles))
-    return np.array(turn).reshape(3, 3), np.array(shift)
+        found[link.get("name", "")] = tuple(parts)
+    return found
 
 
 def _shape(visual: xml.Element, urdf: Path) -> Mesh:
@@ -72,13 +64,31 @@ def _shape(visual: xml.Element, urdf: Path) -> Mesh:
         upper = frustum((radius, radius), (radius, radius), -half, half, sides=16)
         flip = np.array([1.0, -1.0, -1.0])
         return join([upper, Mesh(upper.vertices * flip, upper.normals * flip, upper.triangles)])
+    if shape is not None and shape.tag == "sphere":
+        return _ball(float(shape.get("radius", "")))
     if shape is not None and shape.tag == "mesh":
         scale = np.array([float(v) for v in shape.get("scale", "1 1 1").split()])
         return _mesh_of_file(urdf.parent / shape.get("filename", ""), scale)
     what = "nothing" if shape is None else f"a {shape.tag}"
     raise EngineError(
-        f"{urdf}: a visual shows {what}; the gl camera draws boxes, cylinders and meshes"
+        f"{urdf}: a visual shows {what}; the gl camera draws boxes, cylinders, spheres and meshes"
     )
+
+
+def _ball(radius_m: float, rings: int = 8, sides: int = 12) -> Mesh:
+    """Return a sphere around the origin."""
+    up = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings + 1)[:, None]
+    round_ = np.linspace(0.0, 2.0 * np.pi, sides + 1)[None]
+    normals = np.stack(
+        np.broadcast_arrays(np.cos(up) * np.cos(round_), np.cos(up) * np.sin(round_), np.sin(up)),
+        axis=-1,
+    ).reshape(-1, 3)
+    first = (np.arange(rings)[:, None] * (sides + 1) + np.arange(sides)[None]).ravel()
+    above = first + sides + 1
+    triangles = np.concatenate(
+        [np.column_stack([first, first + 1, above + 1]), np.column_stack([first, above + 1, above])]
+    ).astype(np.int32)
+    return Mesh(radius_m * normals, normals, triangles)
 
 
 def _mesh_of_file(path: Path, scale: Floats) -> Mesh:

@@ -4,7 +4,7 @@ picture.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -17,13 +17,15 @@ from cosim.core.state import LABELS, RobotState, Vehicles
 from cosim.spec.robot import Robot
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.instances import INSTANCE, Forms, Things, turned_instances
-from physics.cameras.gl.robot_body import robot_parts
+from physics.cameras.gl.robot_body import link_parts, robot_parts
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import SHADOW_REACH_M
 from physics.cameras.gl.shots import Shots
+from physics.cameras.posture import Posture, posture_of
 from physics.cameras.view import VEHICLE_MARGIN_M
 from physics.ground.mesh import Part
 from physics.robots import urdf_path
+from physics.robots.kinematics import angles_of, link_tree, turned
 from physics.street import vehicles
 from physics.street.surface import Surface
 
@@ -117,28 +119,19 @@ class TrafficDrawing:
         )
 
     def _robots(self, driven: Sequence[Driven], shots: Shots) -> list[_Placed]:
-        """Return the robots, each with its base frame at its pose, tilted with the ground."""
-        forms = []
-        rows = []
-        parts = []
+        """Return the robots in their postures."""
+        forms: list[int] = []
+        rows: list[tuple[float, ...]] = []
+        parts: list[int] = []
         for k, (one, anchor) in enumerate(zip(driven, shots.anchors, strict=True)):
             shown = [2 * k] * one.body + [2 * k + 1] * one.shadows
             if one.robot is None or not shown:
                 continue
-            pose = one.robot.pose
-            (_, roll, pitch) = one.surface.lean(one.robot.pose, one.model.drive.span_m)
-            row = (
-                pose.x_m - anchor[0],
-                pose.y_m - anchor[1],
-                one.robot.z_m,
-                roll,
-                pitch,
-                pose.heading_rad,
-            )
-            form = self._forms.id(("robot", one.model.name), partial(_robot_parts, one.model))
-            forms += len(shown) * [form]
-            rows += len(shown) * [row]
-            parts += shown
+            posture = posture_of(one.surface, one.model, one.robot)
+            for form, row in self._bodies(one.model, posture, anchor):
+                forms += len(shown) * [form]
+                rows += len(shown) * [row]
+                parts += shown
         if not rows:
             return []
         at = np.array(rows)
@@ -146,6 +139,27 @@ class TrafficDrawing:
             at[:, :3], at[:, 3], at[:, 4], at[:, 5], (1.0, 1.0, 1.0), LABELS["robot"]
         )
         return [(np.array(forms), placed, np.array(parts))]
+
+    def _bodies(
+        self, model: Robot, posture: Posture, anchor: Floats
+    ) -> Iterator[tuple[int, tuple[float, ...]]]:
+        """Yield forms with their positions from the anchor, roll, pitch and heading.
+
+        They are the whole robot on wheels, or each link of a robot with legs.
+        """
+        (x, y, z), roll, pitch, heading, angles = posture
+        x, y = x - float(anchor[0]), y - float(anchor[1])
+        if not angles:
+            form = self._forms.id(("robot", model.name), partial(_robot_parts, model))
+            yield form, (x, y, z, roll, pitch, heading)
+            return
+        urdf = urdf_path(model)
+        base = turned(roll, pitch, heading)
+        for link, (turn, shift) in link_tree(urdf).places(angles).items():
+            if parts := link_parts(urdf)[link]:
+                form = self._forms.id(("robot", model.name, link), partial(tuple, parts))
+                at = base @ shift + (x, y, z)
+                yield form, (*at.tolist(), *angles_of(base @ turn))
 
 
 def _robot_parts(model: Robot) -> Sequence[Part]:

@@ -33,6 +33,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import ROBOTS, Legs
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite
 from scenarios.tools.bench.figures import MORE, Figure, Spent, TimedEngine, taken
 
@@ -167,6 +168,23 @@ def driving_in_towns() -> list[Figure]:
     ]
 
 
+def driving_on_legs() -> list[Figure]:
+    """Compare the physics of each robot with legs with the courier's, in a city of 0.5 km."""
+    courier_ms = _drive(500.0, FourHertz()).ms["physics"]
+    return [
+        Figure(
+            f"physics of {robot.name}, ms per simulated s",
+            _drive(500.0, FourHertz(), robot.name).ms["physics"],
+            courier_ms,
+            "the courier's",
+            1.3,
+            reach_ratio=True,
+        )
+        for robot in ROBOTS.values()
+        if isinstance(robot.drive, Legs)
+    ]
+
+
 def _factor(name: str, drive: _Drive, reach: float) -> Figure:
     engines_ms = sum(drive.engine_ms[part] for part in _ENGINES)
     return Figure(
@@ -196,14 +214,17 @@ def _bare_query_ms() -> float:
     return 1000.0 * statistics.median(found)
 
 
-def _drive(size_m: float, policy: Route) -> _Drive:
-    """Drive for _MEASURED_S simulated seconds in a city of a size."""
+def _drive(size_m: float, policy: Route, robot: str = "") -> _Drive:
+    """Drive for _MEASURED_S simulated seconds in a city of a size.
+
+    robot: by default the courier
+    """
     import physics.dynamics.bullet
     import sumo_nets.engine
     from cosim.episode.loop import EpisodeEngines
     from scenarios.episodes.episode import Episode
 
-    scenario = scenario_in(size_m)
+    scenario = scenario_in(size_m).driven_by(robot)
     spent = Spent()
     engine = Spent()
     physics.dynamics.bullet.time_physics_calls(engine.timed)

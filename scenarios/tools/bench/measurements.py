@@ -33,6 +33,7 @@ ON_REQUEST: Final = (
     "serving",
     "two processes",
     "first episode",
+    "legs",
 )
 """Taken by `cosim bench` only when named: they need many cores or minutes."""
 
@@ -54,6 +55,7 @@ _TAKEN: Final[Mapping[str, _Take]] = {
     "street 150": partial(environment.walking, 150),
     "places": environment.places,
     "reactive": environment.reactive,
+    "legs": environment.driving_on_legs,
     "ten environments": environment.driving_together,
     "200 episodes": environment.growing,
     "serving": serving.asking_elsewhere,

@@ -33,7 +33,7 @@ from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records, read_spec
 from cosim.results.waypoint_replay import WaypointReplay
 from cosim.spec.camera import CameraSpec
-from cosim.spec.robot import robot_called
+from cosim.spec.robot import Legs, robot_called
 from cosim.spec.run_config import Appearance, CameraChoice
 from physics.cameras.view import robot_shot
 from scenarios.episodes.replay import (
@@ -222,6 +222,8 @@ class _Reel:
         self._last = last
         self._progress = progress
         self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
+        if isinstance(robot_called(told.scenario.robot).drive, Legs):
+            self._counts["fall"] = 0
         self._triggered: set[str] = set()
         self._caption = ("", hud.INK)
         self._caption_until = -1
@@ -272,7 +274,7 @@ class _Reel:
         done = step.route_s_after_m / self._scenario.route_line.length_m
         left = (
             f"{self._scenario.id}  {self._record.manifest.name}  {time_s:5.1f} s  "
-            f"{robot.v_mps:.1f} m/s"
+            f"{round(robot.v_mps, 1) + 0.0:.1f} m/s"
         )
         hud.bar(image, layout.bar, left, f"route {100.0 * done:.0f} %   {counts}", done)
         if step.tick < self._caption_until:

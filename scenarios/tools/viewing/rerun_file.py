@@ -32,7 +32,7 @@ from cosim.core.errors import unwritable
 from cosim.core.files import atomic_file
 from cosim.core.geometry import Floats, Pose
 from cosim.core.progress import Progress, ignore
-from cosim.core.state import LABELS, PERSON_RADIUS_M, Street
+from cosim.core.state import LABELS, PERSON_RADIUS_M, RobotState, Street
 from cosim.episode.interfaces import ViewCamera
 from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import calibration_of
@@ -46,6 +46,9 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario
+from physics.cameras.posture import posture_of
+from physics.robots import urdf_path
+from physics.robots.kinematics import link_tree, turned
 from physics.street.surface import Surface
 from scenarios.episodes.replay import (
     RecordedEpisode,
@@ -293,11 +296,14 @@ class _Tape:
         robot = step.motion.robot
         self._to.set_time("time", duration=Clock().time_s(step.tick + 1))
         self._to.set_time("tick", sequence=step.tick + 1)
-        turn = rr.RotationAxisAngle(axis=[0, 0, 1], angle=robot.pose.heading_rad)
-        here = rr.Transform3D(
-            translation=[robot.pose.x_m, robot.pose.y_m, robot.z_m], rotation=turn
-        )
-        self._log("world/robot", here)
+        if robot.legs is None:
+            turn = rr.RotationAxisAngle(axis=[0, 0, 1], angle=robot.pose.heading_rad)
+            here = rr.Transform3D(
+                translation=[robot.pose.x_m, robot.pose.y_m, robot.z_m], rotation=turn
+            )
+            self._log("world/robot", here)
+        else:
+            self._on_legs(robot)
         led = np.column_stack(
             [led_to(step.command, Pose(0.0, 0.0, 0.0), _LEADS_S), np.full(16, 0.1)]
         )
@@ -319,6 +325,19 @@ class _Tape:
                 self._log(f"{camera}/depth", rr.DepthImage(millimetres, meter=1000.0))
             if frame.labels is not None:
                 self._log(f"{camera}/labels", rr.SegmentationImage(frame.labels))
+
+    def _on_legs(self, robot: RobotState) -> None:
+        """Log the place of a trunk on legs, and a line for each part of the legs."""
+        posture = posture_of(self._surface, self._robot, robot)
+        above = np.array([0.0, 0.0, self._robot.drive.pivot_m])
+        turn = turned(posture.roll_rad, posture.pitch_rad, posture.heading_rad)
+        here = self._rr.Transform3D(translation=posture.at_m - turn @ above, mat3x3=turn)
+        self._log("world/robot", here)
+        tree = link_tree(urdf_path(self._robot))
+        places = tree.places(posture.angles_rad)
+        lines = [[places[link][1] + above for link in (j.parent, j.child)] for j in tree.joints]
+        strips = self._rr.LineStrips3D(lines, colors=[(30, 30, 30)], radii=[0.015])
+        self._log("world/robot/legs", strips)
 
     def _waypoints(self, plan: Floats | None) -> None:
         """Log the waypoints that are followed from now on, if they changed."""

@@ -1,0 +1,37 @@
+"""Choice of a robot's drive."""
+
+from __future__ import annotations
+
+from cosim.spec.robot import Legs, Robot
+from physics.dynamics.drive import SUBSTEP_S, Drive, SkidDrive
+from physics.dynamics.legs.gait_file import network_gait, robot_legs, user_gait
+from physics.dynamics.legs.leg_drive import LegDrive
+
+
+def drive_of(robot: Robot, dt_s: float) -> Drive:
+    """Return the drive of a robot. dt_s: duration of a substep."""
+    if isinstance(robot.drive, Legs):
+        return LegDrive(robot, robot.drive, dt_s)
+    return SkidDrive(robot, robot.drive, dt_s)
+
+
+def gait_drive(robot: Robot, gait: str, dt_s: float = SUBSTEP_S) -> Drive:
+    """Return the drive of a robot with a gait of the user, "onnx:FILE.onnx".
+
+    Raises UsageError or SpecError for a missing, invalid or unsuitable file.
+    """
+    legs = robot_legs(robot, gait)
+    return LegDrive(
+        robot, legs, dt_s, network_gait(robot, legs, dt_s, user_gait(gait, robot, dt_s))
+    )
+
+
+def gait_hash(gait: str, robot: Robot) -> str:
+    """Return the hash of the files of a user's gait; "" for the robot's own one.
+
+    Raises as `gait_drive` does, also if the weights of the robot's own gait are missing.
+    """
+    if gait:
+        return user_gait(gait, robot, SUBSTEP_S).digest
+    drive_of(robot, SUBSTEP_S)
+    return ""

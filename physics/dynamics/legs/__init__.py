@@ -1,0 +1,1 @@
+"""Robots with legs: gaits, joint torques, and detection of falls."""

@@ -1,0 +1,373 @@
+"""Networks of gaits: their values and bits, their graphs, and the files that are refused."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from onnx import helper
+
+from cosim.core.errors import CosimError, PolicyError, SpecError, UsageError
+from cosim.core.state import Command
+from cosim.policies.onnx.graph import Graph
+from cosim.policies.onnx.torch_file import read_torch_file
+from cosim.spec.robot import COURIER, DOG, WALKER, Legs
+from physics.dynamics.drive import SUBSTEP_S, BodyNow
+from physics.dynamics.drives import gait_drive
+from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
+from physics.dynamics.legs.gait_graph import network_of_graph
+from physics.dynamics.legs.kinematics import centre_of_mass, link_frames
+from physics.dynamics.legs.network import (
+    Dense,
+    Lstm,
+    Network,
+    elu,
+    exponential,
+    network_of,
+    tanh,
+)
+from physics.dynamics.legs.walker import WALKER_NETWORK, walker_network
+from physics.robots.walker import WALKER_MODEL
+from tests.support.gaits import JOINTS, OBSERVATION, layers_graph, written_gait
+from tests.support.graphs import graph_bytes, port
+
+assert isinstance(DOG.drive, Legs) and isinstance(WALKER.drive, Legs)
+
+
+def normal(seed: int, *shape: int) -> NDArray[np.float32]:
+    return (0.3 * np.random.default_rng(seed).normal(size=shape)).astype(np.float32)
+
+
+def walker_like() -> Network:
+    """A random network of the walker's sizes."""
+    lstm = Lstm(normal(1, 47 + 64, 256), normal(2, 256))
+    layers = (
+        Dense(normal(3, 64, 32), normal(4, 32), "elu"),
+        Dense(normal(5, 32, 12), normal(6, 12), "linear"),
+    )
+    return Network((lstm, *layers))
+
+
+def answers(network: Network, count: int = 50) -> NDArray[np.float32]:
+    memory, found = network.empty_memory(), []
+    for k in range(count):
+        answer, memory = network.answer(normal(100 + k, network.sizes[0]), memory)
+        found.append(answer)
+    return np.array(found)
+
+
+def test_a_network_is_what_its_layers_say() -> None:
+    """The answers of a recurrent network are those of the formulas in float64."""
+    network = walker_like()
+    lstm, hidden, last = network.layers
+    assert isinstance(hidden, Dense) and isinstance(last, Dense)
+    output, cell = np.zeros(64), np.zeros(64)
+    expected = []
+    for k in range(50):
+        given = np.concatenate([normal(100 + k, 47), output])
+        gates = given @ lstm.weight.astype(float) + lstm.bias
+        shares = 1.0 / (1.0 + np.exp(-gates))
+        cell = shares[64:128] * cell + shares[:64] * np.tanh(gates[128:192])
+        output = shares[192:] * np.tanh(cell)
+        units = output @ hidden.weight.astype(float) + hidden.bias
+        units = np.where(units > 0, units, np.expm1(units))
+        expected.append(units @ last.weight.astype(float) + last.bias)
+    assert np.abs(answers(network) - expected).max() < 1e-5
+
+
+def test_activations_are_exact() -> None:
+    """exp, tanh and ELU differ from those of numpy by less than a unit in the last place of
+    float32."""
+    x = np.linspace(-20.0, 20.0, 20001)
+    assert np.abs(exponential(x[x <= 0]) / np.exp(x[x <= 0]) - 1.0).max() < 1e-10
+    narrow = x.astype(np.float32)
+    assert np.abs(tanh(narrow) - np.tanh(x)).max() < 1.2e-7
+    assert np.abs(elu(narrow) - np.where(x > 0, x, np.expm1(x)))[x < 0].max() < 1.2e-7
+    assert exponential(np.array([-1e9, 0.0])).tolist() == [exponential(np.array([-40.0]))[0], 1.0]
+
+
+PROCESS = """
+import cosim
+from tests.physics.test_gait_networks import answers, hashed, walker_like
+print(hashed(answers(walker_like())))
+"""
+
+
+def hashed(numbers: NDArray[Any]) -> str:
+    return hashlib.blake2b(numbers.tobytes(), digest_size=8).hexdigest()
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {"OPENBLAS_CORETYPE": "Haswell"},
+        {"OPENBLAS_CORETYPE": "Nehalem"},
+        {"NPY_DISABLE_CPU_FEATURES": "X86_V3"},
+    ],
+    ids=["haswell", "nehalem", "no-fma"],
+)
+def test_a_network_has_the_same_bits_on_every_processor(variables: dict[str, str]) -> None:
+    """With other kernels of OpenBLAS, and where numpy uses neither AVX2 nor fused
+    multiply-adds."""
+    told = subprocess.run(
+        [sys.executable, "-c", PROCESS],
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert told.stdout.strip() == hashed(answers(walker_like()))
+
+
+def test_arrays_of_a_network_make_it_again() -> None:
+    """And arrays that are no network are refused with the reason."""
+    network = walker_like()
+    again = network_of(network.arrays())
+    assert hashed(answers(again)) == hashed(answers(network))
+    whole = network.arrays()
+    for change, why in (
+        ({"2.linear.bias": normal(1, 11)}, r"layer 2 has a weight \(32, 12\) and a bias \(11,\)"),
+        ({"1.elu.weight": normal(1, 63, 32)}, "layer 1 takes 63 numbers, and layer 0 has 64"),
+        ({"1.elu.bias": np.full(32, np.nan, np.float32)}, "layer 1 has weights that are NaN"),
+        ({"1.elu.bias": np.zeros(32)}, "layer 1 has float32 and float64; wanted is float32"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            network_of(whole | change)
+    with pytest.raises(ValueError, match="has no weight and bias of layer 1"):
+        network_of({name: one for name, one in whole.items() if not name.startswith("1.")})
+
+
+def normalised_graph() -> tuple[bytes, int]:
+    """Layers with a normalised input, one as a product and a sum, in several activations."""
+    weights = {
+        "mean": normal(1, 8),
+        "std": np.abs(normal(2, 8)) + np.float32(0.5),
+        "a": normal(3, 8, 6),
+        "b": normal(4, 6),
+        "c": normal(5, 4, 6),
+        "d": normal(6, 4),
+        "e": normal(7, 4, 3),
+    }
+    nodes = [
+        helper.make_node("Flatten", ["obs"], ["flat"]),
+        helper.make_node("Sub", ["flat", "mean"], ["m"]),
+        helper.make_node("Div", ["m", "std"], ["n"]),
+        helper.make_node("MatMul", ["n", "a"], ["p"]),
+        helper.make_node("Add", ["b", "p"], ["q"]),
+        helper.make_node("Tanh", ["q"], ["r"]),
+        helper.make_node("Gemm", ["r", "c", "d"], ["s"], transB=1),
+        helper.make_node("Relu", ["s"], ["t"]),
+        helper.make_node("MatMul", ["t", "e"], ["actions"]),
+    ]
+    return graph_bytes(nodes, [port("obs", 1, 8)], [port("actions", 1, 3)], weights), 8
+
+
+def test_a_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
+    """Layers of all kinds, a normalised input, products and sums."""
+    for data, inputs in ((layers_graph(scale=0.3), 45), normalised_graph()):
+        (tmp_path / "g.onnx").write_bytes(data)
+        graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
+        for k in range(5):
+            given = 3.0 * normal(k, inputs)
+            expected = graph.ask({"obs": given[None]}, ["actions"])["actions"][0]
+            assert network.answer(given, ())[0] == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
+    """With its memory as further inputs and outputs, over several steps."""
+    weights = {
+        "w": normal(1, 1, 32, 5),
+        "r": normal(2, 1, 32, 8),
+        "b": normal(3, 1, 64),
+        "c": normal(4, 3, 8),
+        "axes": np.array([0]),
+        "both": np.array([0, 1]),
+    }
+    nodes = [
+        helper.make_node("Unsqueeze", ["obs", "axes"], ["one"]),
+        helper.make_node(
+            "LSTM",
+            ["one", "w", "r", "b", "", "h_in", "c_in"],
+            ["y", "h_out", "c_out"],
+            hidden_size=8,
+        ),
+        helper.make_node("Squeeze", ["y", "both"], ["flat"]),
+        helper.make_node("Gemm", ["flat", "c"], ["actions"], transB=1),
+    ]
+    memory = [port("h_in", 1, 1, 8), port("c_in", 1, 1, 8)]
+    told = [port("actions", 1, 3), port("h_out", 1, 1, 8), port("c_out", 1, 1, 8)]
+    data = graph_bytes(nodes, [port("obs", 1, 5), *memory], told, weights)
+    (tmp_path / "g.onnx").write_bytes(data)
+    graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
+    state = network.empty_memory()
+    held = {"h_in": np.zeros((1, 1, 8), np.float32), "c_in": np.zeros((1, 1, 8), np.float32)}
+    for k in range(6):
+        given = 3.0 * normal(10 + k, 5)
+        found = graph.ask({"obs": given[None], **held}, ["actions", "h_out", "c_out"])
+        held = {"h_in": found["h_out"], "c_in": found["c_out"]}
+        answer, state = network.answer(given, state)
+        assert answer == pytest.approx(found["actions"][0], abs=1e-5)
+
+
+def test_graphs_of_another_form_are_refused() -> None:
+    """Each with its reason: operators, branches, ends, and what is no graph."""
+    ends = [port("obs", 1, 4)], [port("out", 1, 4)]
+    held = {"w": normal(1, 4, 4), "v": normal(2, 4)}
+    make = helper.make_node
+    for nodes, why in (
+        ([make("Softmax", ["obs"], ["out"])], "has an operator Softmax; possible are Gemm"),
+        ([make("Elu", ["obs"], ["out"])], "Elu does not follow a layer"),
+        ([make("MatMul", ["obs", "obs"], ["out"])], "its input 'obs' is no constant"),
+        ([make("Mul", ["obs", "v"], ["out"])], "ends with a factor or a sum"),
+        ([make("Identity", ["w"], ["out"])], "output 'out' does not follow from the input"),
+        (
+            [make("MatMul", ["obs", "w"], ["a"]), make("Gemm", ["obs", "w"], ["out"])],
+            "is no chain: 'obs' is used by another Gemm",
+        ),
+        (
+            [make("Gemm", ["obs", "w"], ["out"], alpha=0.5)],
+            "Gemm has transA, alpha or beta",
+        ),
+    ):
+        with pytest.raises(ValueError, match=why):
+            network_of_graph(graph_bytes(nodes, *ends, held))
+    for data in (b"", b"no graph", layers_graph()[:-40]):
+        with pytest.raises(ValueError, match=r"graph|early|message|hold|input"):
+            network_of_graph(data)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"joints": JOINTS | {"tail": JOINTS["rear_left_hip"]}}, "joints has 'tail'.*robot 'dog'"),
+        ({"joints": dict(list(JOINTS.items())[1:])}, "joints lacks front_left_hip of robot 'dog'"),
+        ({"rate_hz": 30}, "rate_hz is 30: an interval must be a multiple of the substep of 5 ms"),
+        ({"observation": OBSERVATION[1:]}, "takes 45 numbers, and the observation .* has 42"),
+        ({"observation": [{"what": "smell"}]}, "smell"),
+        ({"robot": "walker"}, "is a gait of robot 'walker', not of 'dog'"),
+        ({"model": "other.onnx"}, "other.onnx"),
+        (
+            {
+                "joints": JOINTS
+                | {"front_left_hip": {"rest_rad": 0, "kp": 9e9, "kd": 1, "scale": 1}}
+            },
+            r"kp must be in \[0, 2000\]",
+        ),
+        ({"files": {"tiny.onnx": {"bytes": 7, "blake2b": "0" * 64}}}, "wanted is tiny.onnx"),
+    ],
+    ids=["unknown", "missing", "rate", "sizes", "term", "robot", "model", "gain", "hash"],
+)
+def test_a_gait_that_does_not_fit_its_robot_is_refused(
+    changes: dict[str, Any], why: str, tmp_path: Path
+) -> None:
+    """The message names the file, the field and what is possible."""
+    path = written_gait(tmp_path, **changes)
+    with pytest.raises(CosimError, match=why) as caught:
+        user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_a_gait_is_named_by_its_graph(tmp_path: Path) -> None:
+    """Other names, missing files and robots on wheels are refused."""
+    path = written_gait(tmp_path)
+    assert user_gait(f"onnx:{path}", DOG, SUBSTEP_S).network.sizes == (45, 12)
+    for name, robot, why in (
+        (f"{path}", DOG, "use onnx:FILE.onnx"),
+        (f"onnx:{tmp_path}/none.onnx", DOG, "none.onnx does not exist"),
+        (f"onnx:{path}", COURIER, "robot 'courier' has wheels; with legs are dog, walker"),
+    ):
+        with pytest.raises(UsageError, match=why):
+            user_gait(name, robot, SUBSTEP_S)
+    path.with_suffix(".json").unlink()
+    with pytest.raises(SpecError, match=r"tiny\.json: cannot be read"):
+        user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
+
+
+def still_body(**changes: Any) -> BodyNow:
+    """A dog at rest."""
+    assert isinstance(DOG.drive, Legs)
+    rest = DOG.drive.rest_rad
+    level = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    zero = (0.0, 0.0, 0.0)
+    return BodyNow(zero, level, zero, zero, rest, (0.0,) * 12)._replace(**changes)
+
+
+def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy(
+    tmp_path: Path,
+) -> None:
+    """They name the gait or the joint, and the limit."""
+    path = written_gait(tmp_path, layers_graph(scale=1e30))
+    drive = gait_drive(DOG, f"onnx:{path}")
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(PolicyError, match=r"gait 'tiny' answered NaN for front_left_hip"),
+    ):
+        for _ in range(200):
+            drive.step(Command(1.0, 0.0), still_body())
+    strong = {name: row | {"kp": 2000, "scale": 1000} for name, row in JOINTS.items()}
+    drive = gait_drive(DOG, f"onnx:{written_gait(tmp_path, joints=strong)}")
+    with pytest.raises(PolicyError, match=r"joint front_left_hip is .* Nm; its limit is 23.7 Nm"):
+        drive.step(Command(1.0, 0.0), still_body())
+
+
+def test_the_posture_of_the_walker_at_rest_is_balanced() -> None:
+    """Its feet are level, on the ground, and the centre of mass is over the middle of the
+    soles."""
+    assert isinstance(WALKER.drive, Legs)
+    rest = dict(zip(WALKER.drive.joints, WALKER.drive.rest_rad, strict=True))
+    frames = link_frames(WALKER_MODEL, rest)
+    for side, left in (("left", 1.0), ("right", -1.0)):
+        (x, y, z), turn = frames[f"{side}_foot"]
+        assert z - 0.035 == pytest.approx(-WALKER.drive.stand_m, abs=1e-3)
+        assert y == pytest.approx(left * 0.1185, abs=1e-3)
+        assert turn[2][2] == pytest.approx(1.0)
+        assert centre_of_mass(WALKER_MODEL, frames)[0] - x == pytest.approx(0.035, abs=0.003)
+
+
+def test_a_walker_without_weights_says_where_they_are_to_be_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """File, size and hash, source with its own, and the command that makes the one of the
+    other."""
+    monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert isinstance(WALKER.drive, Legs)
+    with pytest.raises(UsageError) as caught:
+        published_gait(WALKER, WALKER.drive, SUBSTEP_S)
+    said = str(caught.value)
+    assert "robot 'walker': walker.npz is missing, 126154 bytes, BLAKE2b 085c4b6c" in said
+    assert f"145745 bytes, SHA-256 {WALKER.drive.weights}" in said
+    assert "`python -m physics.dynamics.legs.walker motion.pt`" in said and "\n" not in said
+    assert weights_in_words(WALKER) == ", weights missing (walker.npz)"
+    (tmp_path / "walker.npz").write_bytes(b"another")
+    with pytest.raises(UsageError, match=r"walker\.npz: 7 bytes, .*wanted is walker\.npz"):
+        published_gait(WALKER, WALKER.drive, SUBSTEP_S)
+
+
+def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> None:
+    """Byte for byte the file that the manifest names, from the published file."""
+    assert WALKER_NETWORK.weights.facts is not None and isinstance(WALKER.drive, Legs)
+    assert WALKER_NETWORK.weights.facts.sha256 == WALKER.drive.weights
+    facts = WALKER_NETWORK.graph().facts
+    assert facts is not None
+    assert (walker_folder / "walker.npz").stat().st_size == facts.bytes
+
+
+def test_another_file_makes_no_arrays(tmp_path: Path) -> None:
+    """Neither another file, nor arrays of another network."""
+    (tmp_path / "motion.pt").write_bytes(b"no weights")
+    with pytest.raises(
+        UsageError, match=r"motion\.pt: 10 bytes, .*wanted is motion\.pt of unitree"
+    ):
+        WALKER_NETWORK.write(tmp_path / "motion.pt", tmp_path)
+    with pytest.raises(ValueError, match=r"has no 'memory\.weight_ih_l0'"):
+        walker_network({})
+    with pytest.raises(ValueError, match="is no PyTorch file of weights"):
+        read_torch_file(b"PK\x03\x04 and no more")

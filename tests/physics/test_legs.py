@@ -1,0 +1,318 @@
+"""Robots with legs in the engine: how they walk, stand and fall, and what the cameras draw."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from cosim.core.errors import EngineError
+from cosim.core.geometry import Pose, wrap_angle
+from cosim.core.state import STILL, Command, LegState, Motion, RobotState
+from cosim.spec.camera import CameraSpec
+from cosim.spec.robot import ROBOTS, Legs, Robot
+from cosim.spec.scenario import Barrier
+from physics.cameras.gl.robot_body import link_parts
+from physics.cameras.posture import posture_of
+from physics.cameras.view import robot_shot
+from physics.dynamics.bullet import p
+from physics.dynamics.legs.trot import HIP_ASIDE_M, SEGMENT_M, leg_angles
+from physics.dynamics.legs.watch import LegWatch
+from physics.dynamics.world import BulletWorld
+from physics.robots import urdf_path
+from physics.robots.kinematics import link_tree, turned
+from physics.robots.make_urdf import MODELS
+from scenarios.tools.bench.legs import (
+    FLAT,
+    RAMPS,
+    STEPS,
+    Walk,
+    down_curb,
+    mean_speeds,
+    stand,
+    stop,
+    straight,
+    up_curb,
+    walking,
+    wander,
+)
+
+pytestmark = pytest.mark.engine
+
+LEGGED = {name: one for name, one in ROBOTS.items() if isinstance(one.drive, Legs)}
+MASSES_KG = {"dog": 15.0, "walker": 32.1}
+STRAIGHT_MPS = {"dog": 1.0, "walker": 0.8}
+WITHIN_S = {"dog": 12.0, "walker": 14.0}
+START = Pose(-40.0, 0.0, 0.0)
+
+
+def legs_of(robot: Robot) -> Legs:
+    assert isinstance(robot.drive, Legs)
+    return robot.drive
+
+
+@pytest.fixture(params=LEGGED.values(), ids=LEGGED)
+def robot(request: pytest.FixtureRequest) -> Robot:
+    if request.param.drive.gait == "network":
+        request.getfixturevalue("walker_weights")
+    return request.param  # type: ignore[no-any-return]
+
+
+@pytest.fixture
+def walk(robot: Robot) -> Iterator[Walk]:
+    with walking(robot, FLAT, START) as walk:
+        yield walk
+
+
+def engine_of(walk: Walk) -> tuple[int, int]:
+    """Body of the robot, and PyBullet client."""
+    bodies = walk.world._engine
+    return bodies._robot, bodies._client
+
+
+def test_a_urdf_is_as_its_table_says(robot: Robot) -> None:
+    """The file is what the table writes; Bullet has the table's masses and inertias, none of them
+    0, and the drawn body at rest fills the outline with its feet on the ground."""
+    model, legs = MODELS[robot.name], legs_of(robot)
+    assert urdf_path(robot).read_text() == model.urdf()
+    assert model.mass_kg == pytest.approx(MASSES_KG[robot.name], abs=0.05)
+    client = p.connect(p.DIRECT)
+    try:
+        body = p.loadURDF(
+            str(urdf_path(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
+        )
+        infos = [p.getJointInfo(body, j, client) for j in range(p.getNumJoints(body, client))]
+        names = ["base", *(info[12].decode() for info in infos)]
+        dynamics = [p.getDynamicsInfo(body, k - 1, client) for k in range(len(names))]
+        middle = p.getBasePositionAndOrientation(body, client)[0]
+    finally:
+        p.disconnect(client)
+    for link in model.links:
+        mass, _, inertia, at, turn = dynamics[names.index(link.name)][:5]
+        assert mass == pytest.approx(link.mass_kg)
+        assert inertia == pytest.approx(model.inertia_kgm2(link), rel=1e-5) and min(inertia) > 0.0
+        assert at == pytest.approx(link.middle_m) and turn == (0.0, 0.0, 0.0, 1.0)
+    parts, rest = link_parts(urdf_path(robot)), dict(zip(legs.joints, legs.rest_rad, strict=True))
+    drawn = [
+        part.mesh.vertices @ turn.T + shift
+        for link, (turn, shift) in link_tree(urdf_path(robot)).places(rest).items()
+        for part in parts[link]
+    ]
+    low, high = np.concatenate(drawn).min(axis=0), np.concatenate(drawn).max(axis=0)
+    assert middle == pytest.approx(dynamics[0][3])
+    half = (robot.length_m / 2, robot.width_m / 2)
+    assert high == pytest.approx([*half, robot.height_m - legs.stand_m], abs=0.015)
+    assert low == pytest.approx([-half[0], -half[1], -legs.stand_m], abs=0.015)
+
+
+def test_a_leg_reaches_its_foot() -> None:
+    """The angles of the inverse kinematics put the foot where it was wanted, on either side."""
+    for side in (1.0, -1.0):
+        for x, y, z in ((0.0, 0.0955, -0.25), (0.1, 0.12, -0.3), (-0.12, 0.02, -0.2)):
+            hip, thigh, calf = leg_angles(x, side * y, z, side)
+            ahead = -SEGMENT_M * (math.sin(thigh) + math.sin(thigh + calf))
+            down = -SEGMENT_M * (math.cos(thigh) + math.cos(thigh + calf))
+            left = side * HIP_ASIDE_M * math.cos(hip) - down * math.sin(hip)
+            up = side * HIP_ASIDE_M * math.sin(hip) + down * math.cos(hip)
+            assert (ahead, left, up) == pytest.approx((x, side * y, z))
+
+
+def test_it_walks_straight_turns_and_stops(robot: Robot) -> None:
+    """10 m in time and on the line; yaw rates within 15 % in walking and on the spot; a stop within
+    half a metre."""
+    v_mps = STRAIGHT_MPS[robot.name]
+    with walking(robot, FLAT, START) as walk:
+        found = straight(walk, v_mps)
+    assert found.time_s <= WITHIN_S[robot.name] and found.aside_m < 0.3 and not found.fallen
+    for v in (0.0, v_mps):
+        with walking(robot, FLAT, START) as walk:
+            walk.drive(Command(v, robot.w_max_radps), 2.0)
+            _, w_radps = mean_speeds(walk.drive(Command(v, robot.w_max_radps), 4.0))
+        assert w_radps == pytest.approx(robot.w_max_radps, rel=0.15)
+    with walking(robot, FLAT, START) as walk:
+        _, way_m = stop(walk, v_mps)
+    assert way_m < 0.5
+
+
+def test_it_stands_for_a_minute(walk: Walk) -> None:
+    """It drifts less than 5 cm and 3 degrees, and its mean speed counts as standing."""
+    drift_m, turned_deg = stand(walk, 60.0)
+    assert drift_m < 0.05 and turned_deg < 3.0
+    assert abs(walk.robot.v_mps) < 0.05 and abs(walk.robot.w_radps) < 0.05
+
+
+def test_it_follows_random_commands(robot: Robot) -> None:
+    """A minute each on level ground, ramps of 1:12 and steps of 3 cm: no fall; mean errors up to 0.1
+    m/s and 0.1 rad/s. `cosim bench legs` takes an hour of it."""
+    found = []
+    for seed, course in enumerate((FLAT, RAMPS, STEPS)):
+        with walking(robot, course, START) as walk:
+            found.append(wander(walk, robot, 1.0, seed))
+    assert sum(one.fallen for one in found) == 0
+    assert np.mean([one.error_mps for one in found]) < 0.1
+    assert np.mean([one.error_radps for one in found]) < 0.1
+
+
+def test_it_walks_down_curbs(robot: Robot) -> None:
+    """12 cm at 0.5 m/s: no fall in 20 phases of the gait."""
+    assert sum(down_curb(robot, 0.5, 0.6 + 0.011 * k) for k in range(20)) == 0
+
+
+@pytest.mark.parametrize(("v_mps", "height_m"), [(0.5, 0.12), (1.0, 0.12), (1.0, 0.06)])
+def test_a_walk_up_a_curb_ends_soundly(robot: Robot, v_mps: float, height_m: float) -> None:
+    """It climbs, falls or stands before it; its base is finite and not below the ground."""
+    state, _ = up_curb(robot, v_mps, height_m)
+    assert np.isfinite([*state.pose, state.z_m]).all()
+    assert -0.1 < state.z_m < height_m + 0.1
+
+
+def digest(motions: list[Motion]) -> str:
+    seen = hashlib.blake2b(digest_size=8)
+    for motion in motions:
+        assert motion.robot.legs is not None
+        seen.update(motion.trace.tobytes())
+        seen.update(np.array(motion.robot.legs.angles_rad).tobytes())
+    return seen.hexdigest()
+
+
+def wandered(walk: Walk, ticks: int = 100) -> str:
+    """Hash of a walk with changing commands."""
+    commands = [Command(0.8, 0.3), Command(0.3, -0.6), STILL, Command(1.2, 0.0)]
+    return digest([walk.tick(commands[4 * k // ticks]) for k in range(ticks)])
+
+
+def push(walk: Walk, impulse_ns: float) -> None:
+    """Push the trunk to the left within the next substep."""
+    body, client = engine_of(walk)
+    at, _ = p.getBasePositionAndOrientation(body, client)
+    force = (0.0, impulse_ns / 0.005, 0.0)
+    p.applyExternalForce(body, -1, force, at, p.WORLD_FRAME, physicsClientId=client)
+
+
+def test_a_push_falls_once_and_the_robot_walks_on_as_from_a_fresh_start(
+    robot: Robot, walk: Walk
+) -> None:
+    """After 60 N s it is down for 0.1 s once; put back, it walks within 2 s, and to the bit as a
+    robot that starts there."""
+    walk.drive(Command(0.5, 0.0), 2.0)
+    assert walk.fallen == 0
+    push(walk, 60.0)
+    for _ in range(60):
+        walk.tick(Command(0.5, 0.0))
+        if walk.fallen:
+            break
+    assert walk.fallen == 1 and walk.robot.tilt_rad < 0.02
+    pose = walk.robot.pose
+    walk.world.place(pose)
+    after = wandered(walk)
+    walk.world.place(pose)
+    assert walk.drive(Command(0.5, 0.0), 2.0)[-1].robot.v_mps > 0.3 and walk.fallen == 1
+    with walking(robot, FLAT, pose) as fresh:
+        assert wandered(fresh) == after
+
+
+PROCESS = """
+import cosim
+from cosim.spec.robot import robot_called
+from tests.physics.test_legs import START, FLAT, walking, wandered
+with walking(robot_called("{name}"), FLAT, START) as walk:
+    print(wandered(walk))
+"""
+
+
+def test_a_walk_has_one_hash(robot: Robot, walk: Walk) -> None:
+    """In this process and in another one, with other kernels of OpenBLAS."""
+    here = wandered(walk)
+    for kernel in ("Haswell", "Nehalem"):
+        told = subprocess.run(
+            [sys.executable, "-c", PROCESS.format(name=robot.name)],
+            env={**os.environ, "OPENBLAS_CORETYPE": kernel},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert told.stdout.split()[-1] == here
+
+
+def test_the_legs_of_both_cameras_meet_the_ground(robot: Robot, walk: Walk) -> None:
+    """The lowest point that is drawn is within 1 cm of the ground, standing and walking, and
+    Bullet's own links are where the recorded joint angles put them."""
+    tree, parts = link_tree(urdf_path(robot)), link_parts(urdf_path(robot))
+    body, client = engine_of(walk)
+    for command in (STILL, Command(0.8, 0.2), Command(0.8, 0.2)):
+        state = walk.drive(command, 1.0)[-1].robot
+        posture = posture_of(FLAT, robot, state)
+        base = turned(posture.roll_rad, posture.pitch_rad, posture.heading_rad)
+        lowest = []
+        for link, (turn, shift) in tree.places(posture.angles_rad).items():
+            rotation, at = base @ turn, base @ shift + posture.at_m
+            lowest += [float((m.mesh.vertices @ rotation.T + at)[:, 2].min()) for m in parts[link]]
+        assert min(lowest) == pytest.approx(0.0, abs=0.01)
+        for number in range(p.getNumJoints(body, client)):
+            link = p.getJointInfo(body, number, client)[12].decode()
+            spot = p.getLinkState(body, number, 0, 1, physicsClientId=client)[4]
+            _, shift = tree.places(posture.angles_rad)[link]
+            assert spot == pytest.approx((base @ shift + posture.at_m).tolist(), abs=1e-4)
+
+
+def test_a_camera_moves_with_the_trunk(robot: Robot) -> None:
+    """A trunk that leans forward by 0.2 rad lowers the camera and tilts its view by as much."""
+    legs = legs_of(robot)
+    level = RobotState(Pose(0.0, 0.0, 0.3), legs=LegState(0.0, 0.0, legs.rest_rad))
+    leant = dataclasses.replace(level, legs=LegState(0.0, 0.2, legs.rest_rad))
+    before, after = (robot_shot(FLAT, robot, CameraSpec(), one) for one in (level, leant))
+    x, _, z = robot.mounts["front"].at_m
+    assert before.eye_m[2] == pytest.approx(z)
+    moved = (z - legs.stand_m) * (math.cos(0.2) - 1.0) - x * math.sin(0.2)
+    assert after.eye_m[2] - before.eye_m[2] == pytest.approx(moved)
+    assert after.steep_rad - before.steep_rad == pytest.approx(0.2)
+
+
+def test_a_low_fence_is_a_collision_of_the_legs_and_the_ground_is_none(robot: Robot) -> None:
+    """Walking touches nothing; a fence of 10 cm, below the trunk, is touched."""
+    fence = Barrier(
+        x_m=-38.0, y_m=0.0, heading_rad=0.0, length_m=4.0, strip="s", end=0, height_m=0.1
+    )
+    with BulletWorld(FLAT, [fence], robot=robot) as world:
+        walk = Walk(world, START)
+        before = walk.drive(Command(0.5, 0.0), 2.0)
+        assert not any(motion.contacts for motion in before)
+        motions = walk.drive(Command(0.5, 0.0), 4.0)
+    assert {c.other for motion in motions for c in motion.contacts} == {"barrier:s:0"}
+
+
+def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
+    """The error has the engine's values; a robot that lies or stands is sound."""
+    legs = legs_of(robot)
+    watch = LegWatch(legs, 0.005)
+    for z_m, sound in ((0.0, True), (-legs.stand_m, True), (-2.0, False), (5.0, False)):
+        state = RobotState(Pose(1.0, 2.0, 0.0), z_m=z_m)
+        if sound:
+            assert watch.judged(state, 0.0, touches=False)[1] == (z_m < 0.0)
+        else:
+            with pytest.raises(EngineError, match=r"at \(1, 2, .*it sinks or flies"):
+                watch.judged(state, 0.0, touches=False)
+    with pytest.raises(EngineError, match="nan"):
+        watch.judged(RobotState(Pose(1.0, 2.0, 0.0), z_m=math.nan), 0.0, touches=False)
+
+
+def test_speeds_are_means_over_a_gait_cycle(walk: Walk) -> None:
+    """A steady walk's speed differs by less than 0.1 m/s from tick to tick, and its mean is the way
+    per time."""
+    walk.drive(Command(0.8, 0.0), 3.0)
+    motions = walk.drive(Command(0.8, 0.0), 2.0)
+    speeds = [motion.robot.v_mps for motion in motions]
+    assert max(abs(b - a) for a, b in pairwise(speeds)) < 0.1
+    way_m = sum(math.dist(a.robot.pose.xy, b.robot.pose.xy) for a, b in pairwise(motions)) / (
+        0.05 * (len(motions) - 1)
+    )
+    assert np.mean(speeds) == pytest.approx(way_m, abs=0.05)
+    assert abs(wrap_angle(motions[-1].robot.pose.heading_rad)) < 0.5

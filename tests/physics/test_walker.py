@@ -1,0 +1,87 @@
+"""The humanoid between walking and standing: it stops, balances on its ankles, and walks on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Pose
+from cosim.core.state import STILL, Command
+from cosim.spec.robot import WALKER
+from physics.dynamics.bullet import p
+from physics.dynamics.legs.leg_drive import LegDrive
+from physics.dynamics.legs.network_gait import NetworkGait
+from scenarios.tools.bench.legs import FLAT, STEPS, Course, Walk, stand, walking
+
+pytestmark = [pytest.mark.engine, pytest.mark.usefixtures("walker_weights")]
+
+START = Pose(-40.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def walk(walker_weights: object) -> Iterator[Walk]:
+    with walking(WALKER, FLAT, START) as walk:
+        yield walk
+
+
+def stands(walk: Walk) -> bool:
+    """Whether it balances on frozen joints."""
+    drive = walk.world._drive
+    assert isinstance(drive, LegDrive) and isinstance(drive._gait, NetworkGait)
+    return drive._gait._stands
+
+
+def test_it_stops_stands_and_walks_on_without_a_fall(walk: Walk) -> None:
+    """A dozen random walks and stops: within 3 s it stands, and then it hardly moves."""
+    rng = np.random.default_rng(1)
+    for _ in range(12):
+        v, w, seconds = rng.uniform((0.0, -0.65, 0.5), (1.2, 0.65, 2.5)).tolist()
+        walk.drive(Command(v, w), seconds)
+        ticks = next(k for k in range(60) if not walk.tick(STILL) or stands(walk))
+        assert ticks < 59
+        walk.drive(STILL, 2.0)
+        assert abs(walk.robot.v_mps) < 0.05 and stands(walk)
+    assert walk.fallen == 0
+
+
+def test_it_holds_its_place_after_a_walk(walk: Walk) -> None:
+    """Less than 5 cm and 3 degrees in half a minute."""
+    walk.drive(Command(0.8, 0.3), 3.0)
+    walk.drive(STILL, 2.0)
+    drift_m, turned_deg = stand(walk, 30.0)
+    assert drift_m < 0.05 and turned_deg < 3.0 and stands(walk)
+
+
+def test_a_push_while_it_stands_makes_it_step_and_stand_again(walk: Walk) -> None:
+    """15 N s from any side: no fall, and 4 s later it stands again."""
+    for heading in (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi):
+        walk.world.place(START)
+        walk.drive(STILL, 1.0)
+        engine = walk.world._engine
+        at, _ = p.getBasePositionAndOrientation(engine._robot, engine._client)
+        force = [15.0 / 0.005 * side for side in (math.cos(heading), math.sin(heading))]
+        p.applyExternalForce(
+            engine._robot, -1, [*force, 0.0], at, p.WORLD_FRAME, physicsClientId=engine._client
+        )
+        walk.tick(STILL)
+        walk.drive(STILL, 4.0)
+        assert walk.fallen == 0 and abs(walk.robot.v_mps) < 0.1
+
+
+@pytest.mark.parametrize(
+    "course",
+    [STEPS, Course([(-48.0, 0.0), (0.0, 4.0), (48.0, 0.0)])],
+    ids=["step", "slope"],
+)
+def test_it_holds_its_place_where_it_cannot_stand_flat(course: Course) -> None:
+    """On an edge of 3 cm, and across a slope of 1:12: it stands or marks time, and drifts less than
+    10 cm in 10 s."""
+    across = Pose(-40.0, 0.0, 0.5 * math.pi)
+    with walking(WALKER, course, across) as walk:
+        walk.drive(Command(0.5, 0.0), 1.5)
+        walk.drive(STILL, 2.0)
+        drift_m, _ = stand(walk, 10.0)
+        assert drift_m < 0.1 and walk.fallen == 0

@@ -1,0 +1,92 @@
+"""Falls of robots with legs: when they count, and what follows from a trajectory."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.episode.loop import Step
+from cosim.results.log import Log
+from cosim.results.metrics import compute_metrics
+from cosim.results.referee import Failure
+from cosim.results.rejudge import contradictions
+from tests.results.test_metrics import episode, log
+from tests.results.test_referee import judge_all, people, referee, step, stood, touch
+from tests.support.driven_runs import driven, episode_of, failure_at, short_way
+
+
+def down(one: Step) -> Step:
+    return dataclasses.replace(one, motion=dataclasses.replace(one.motion, down=True))
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_robot_that_is_down_for_a_tenth_of_a_second_has_fallen_once(ends: bool) -> None:
+    """Two ticks are a stumble; the third is a fall, which ends a short episode and resets the robot
+    on a long route."""
+    one = referee(ends_on_failure=ends)
+    ticks = [step(0, 20.0), *(down(step(t, 20.0)) for t in (1, 2)), step(3, 20.0)]
+    ticks += [down(step(t, 23.0)) for t in (4, 5, 6)]
+    verdicts = judge_all(one, ticks)
+    assert [failure.kind for v in verdicts for failure in v.failures] == ["fall"]
+    assert (verdicts[-1].ended == "failure", verdicts[-1].reset is None) == (ends, ends)
+    if not ends:
+        assert not judge_all(one, [down(step(t, 25.0)) for t in (7, 8)])[-1].failures
+
+
+def test_a_fall_that_follows_from_a_collision_is_not_counted() -> None:
+    """The collision resets the robot, so that it has to be down for 0.1 s again."""
+    one = referee(ends_on_failure=False)
+    hit = down(step(1, 20.0, contacts=[touch("bin", "object")]))
+    verdicts = judge_all(one, [down(step(0, 20.0)), hit, *(down(step(t, 20.0)) for t in (2, 3))])
+    assert [failure.kind for v in verdicts for failure in v.failures] == ["collision"]
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_robot_that_a_person_pushes_over_has_not_failed(ends: bool) -> None:
+    """The fall is recorded with the contact, the robot is reset, and the episode continues."""
+    who = people((20.5, 0.0), heading=math.pi, speed=1.3)
+    one = referee(ends_on_failure=ends)
+    stood(one, 19)
+    assert one.judge(step(19, 20.0, speed=0.0, contacts=[touch("c0")], who=who)).walked_into
+    verdict = judge_all(one, [down(step(t, 20.0, speed=0.0, who=who)) for t in (25, 26, 27)])[-1]
+    assert [(into.kind, into.other) for into in verdict.walked_into] == [("fall", "c0")]
+    assert (verdict.failures, verdict.ended) == ((), None) and verdict.reset is not None
+
+
+def with_legs(one: Log, ticks_down: range) -> Log:
+    rows = np.zeros((len(one), 16), np.float32)
+    rows[list(ticks_down), 0] = 1.0
+    return dataclasses.replace(one, legs=rows)
+
+
+def test_falls_follow_from_the_trajectory() -> None:
+    """A recorded fall is where the robot was down for 0.1 s; one that is left out or added
+    contradicts the trajectory."""
+    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    walked = with_legs(driven(way, [1.0] * 100, {30: 0.0}), range(28, 31))
+    fall = failure_at(walked, 30, "fall")
+    record = msgspec.structs.replace(
+        episode_of(way, "h")[0], status="done", ended="timeout", ticks=100, failures=(fall,)
+    )
+    assert [*contradictions(record, way, walked)] == []
+    early = with_legs(walked, range(20, 24))
+    assert [one.what for one in contradictions(record, way, early)] == ["falls at tick 22"]
+    never = with_legs(walked, range(0))
+    assert [one.what for one in contradictions(record, way, never)] == ["falls at tick 30"]
+
+
+def test_wheels_have_no_number_of_falls() -> None:
+    """With legs falls are counted, and 0 without one; with wheels there is no number."""
+    walked = log([0.1 * (i + 1) for i in range(1000)])
+    fall = Failure("fall", 5, 0.0, 0.0, 0.0, 0.0)
+    wheels = compute_metrics(episode(walked))
+    assert (wheels["falls"], wheels["falls_per_100m"]) == (None, None)
+    legs = compute_metrics(episode(with_legs(walked, range(0))))
+    assert (legs["falls"], legs["falls_per_100m"]) == (0.0, 0.0)
+    fallen = compute_metrics(episode(with_legs(walked, range(0)), fall))
+    assert (fallen["falls"], fallen["failures"]) == (1.0, 1.0)
+    assert fallen["falls_per_100m"] == fallen["failures_per_100m"] == pytest.approx(1.0)

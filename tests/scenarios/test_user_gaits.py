@@ -1,0 +1,92 @@
+"""Gaits of users in runs: recorded and replayed, or crashed with the reason; and a published one."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Pose
+from cosim.core.state import Command
+from cosim.policies.baselines import Straight
+from cosim.results.run_folder import read_records
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import DOG
+from cosim.spec.scenario import CrowdSpec, Scenario, Suite, write_suite
+from physics.dynamics.drives import gait_drive
+from scenarios.episodes.run_episode import run_episode
+from scenarios.tools.bench.legs import FLAT, mean_speeds, stand, straight, walking
+from scenarios.tools.verify.doctor import small_scenario
+from tests.conftest import ROOT, Cosim
+from tests.support.gaits import JOINTS, layers_graph, robot_lab_gait, written_gait
+
+pytestmark = pytest.mark.engine
+
+START = Pose(-40.0, 0.0, 0.0)
+PUBLISHED = (
+    Path(os.environ.get("COSIM_WEIGHTS") or ROOT.parent / "shared" / "weights")
+    / "rl_sar_go2_robot_lab"
+)
+
+
+def second(name: str) -> Scenario:
+    """A scenario of one second, without people."""
+    empty = CrowdSpec(persons=0, radius_m=40.0, vehicles=0)
+    return msgspec.structs.replace(
+        small_scenario(), id=name, time_limit_s=1.0, crowd=empty, robot="dog"
+    )
+
+
+def test_a_run_records_its_gait_and_replays_with_it(tmp_path: Path, cosim: Cosim) -> None:
+    """By name and hash; with changed files neither a replay nor the rest of the run is possible."""
+    write_suite(Suite(name="s", version="1", scenarios=(second("a"),)), tmp_path / "s.json")
+    gait = written_gait(tmp_path)
+    run = tmp_path / "run"
+    line = f"run {tmp_path}/s.json --policy straight --gait onnx:{gait} --out {run}".split()
+    told = cosim(*line)
+    assert told.returncode == 0, told.stderr
+    (record,) = read_records(run)
+    assert record.status == "done" and record.setup.gait == f"onnx:{gait}"
+    assert len(record.setup.gait_hash) == 32
+    own = run_episode(second("a"), Straight()).record
+    assert own.state_hash != record.state_hash and own.setup.gait == ""
+    assert "as recorded" in cosim("replay", str(run), "a").stdout
+    written_gait(tmp_path, layers_graph(seed=1))
+    told = cosim("replay", str(run), "a")
+    assert told.returncode == 2 and "the episode was recorded with" in told.stderr
+    told = cosim(*line, "--resume")
+    assert told.returncode == 2 and "gait_hash" in told.stderr
+
+
+@pytest.mark.parametrize(
+    ("scale", "kp", "why"),
+    [(1e30, 20, "gait 'tiny' answered NaN for"), (0.1, 2000, "Nm; its limit is 23.7 Nm")],
+    ids=["nan", "torque"],
+)
+def test_a_gait_that_fails_crashes_the_episode_with_the_reason(
+    scale: float, kp: float, why: str, tmp_path: Path
+) -> None:
+    """NaN, and torques far beyond the limits."""
+    joints = {name: row | {"kp": kp, "scale": 1000} for name, row in JOINTS.items()}
+    gait = written_gait(tmp_path, layers_graph(scale=scale), joints=joints)
+    with np.errstate(all="ignore"):
+        record = run_episode(second("a"), Straight(), EpisodeOptions(gait=f"onnx:{gait}")).record
+    assert record.status == "crashed" and why in record.reason
+
+
+def test_a_published_network_walks_as_a_gait_of_the_dog(tmp_path: Path) -> None:
+    """The Go2's network of rl_sar, as ONNX: 10 m at 1 m/s in 12 s, on the line; it turns, and
+    stands."""
+    if not (PUBLISHED / "policy.pt").is_file():
+        pytest.skip(f"the published network {PUBLISHED}/policy.pt is missing (COSIM_WEIGHTS)")
+    gait = robot_lab_gait(tmp_path, PUBLISHED)
+    with walking(DOG, FLAT, START, gait_drive(DOG, f"onnx:{gait}")) as walk:
+        found = straight(walk, 1.0)
+        assert found.time_s < 12.0 and found.aside_m < 0.3 and not found.fallen
+        drift_m, turned_deg = stand(walk, 10.0)
+        assert drift_m < 0.05 and turned_deg < 3.0
+        walk.drive(Command(0.0, 0.65), 2.0)
+        assert mean_speeds(walk.drive(Command(0.0, 0.65), 3.0))[1] == pytest.approx(0.65, rel=0.15)
