@@ -238,7 +238,7 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("film", "run", "t-0", "--view", "inside"), "unknown view"),
         (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
         (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
-        (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 2135, among them"),
+        (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 2250, among them"),
         (
             ("look", "t-0", "--suite", "tiny.json", "--scenario", "2"),
             "--scenario chooses from a file",

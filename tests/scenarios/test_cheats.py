@@ -72,8 +72,10 @@ def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("robot", [name for name in ROBOTS if isinstance(ROBOTS[name].drive, Legs)])
-def test_legs_gain_a_cheat_nothing(robot: str) -> None:
+def test_legs_gain_a_cheat_nothing(robot: str, request: pytest.FixtureRequest) -> None:
     """Walking straight ahead or standing solves no event with a robot on legs, either."""
+    if robot == "walker":
+        request.getfixturevalue("walker_weights")
     options = EpisodeOptions(seed=0, robot=robot)
     for policy, kinds in (("straight", ("obstructing", "gesturing")), ("stop", ("frontal",))):
         table = cosim.run("reactive", policy, scenarios=scenarios_of(kinds, 1), options=options)
