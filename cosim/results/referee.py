@@ -61,6 +61,8 @@ FALL_S = 0.1
 """Time, seconds, that a robot is down before it has fallen."""
 _PUSHED_S = 1.0
 """Time, seconds, after a person walked into the robot in which a fall is the person's fault."""
+_NOT_PUSHED: tuple[float, str] = (-math.inf, "")
+"""Tick and id of the last push, of a robot that no person has pushed."""
 FREEZE_WINDOW_S = 10.0
 FREEZE_MOVE_M = 0.5
 _ROUNDING_M = 1e-6
@@ -149,7 +151,7 @@ class Referee:
         self._walked_into: set[str] = set()
         self._still_ticks = self._spot_ticks = 0
         self._down_ticks = 0
-        self._pushed: tuple[float, str] = (-math.inf, "")
+        self._pushed = _NOT_PUSHED
         self._window = FreezeWindow(clock)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
@@ -188,7 +190,8 @@ class Referee:
         reset = self._reset(failure, step)
         self._window.clear()
         self._entered.clear()
-        self._down_ticks = 0
+        self._down_ticks = self._stopped_ticks = 0
+        self._pushed = _NOT_PUSHED
         return reset
 
     def _fall(self, step: Step, into: tuple[Failure, ...]) -> Failure | None:

@@ -12,7 +12,7 @@ import pytest
 from cosim.episode.loop import Step
 from cosim.results.log import Log
 from cosim.results.metrics import compute_metrics
-from cosim.results.referee import Failure
+from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.rejudge import contradictions
 from tests.results.test_metrics import episode, log
 from tests.results.test_referee import judge_all, people, referee, step, stood, touch
@@ -55,6 +55,23 @@ def test_a_robot_that_a_person_pushes_over_has_not_failed(ends: bool) -> None:
     verdict = judge_all(one, [down(step(t, 20.0, speed=0.0, who=who)) for t in (25, 26, 27)])[-1]
     assert [(into.kind, into.other) for into in verdict.walked_into] == [("fall", "c0")]
     assert (verdict.failures, verdict.ended) == ((), None) and verdict.reset is not None
+
+
+def pushed_over(one: Referee, from_tick: int, ticks: int = 3) -> Verdict:
+    """A person walks into the standing robot, which then lies; the verdict of the last tick."""
+    who = people((20.5, 0.0), heading=math.pi, speed=1.3)
+    stood(one, from_tick)
+    one.judge(step(from_tick, 20.0, speed=0.0, contacts=[touch("c0")], who=who))
+    lying = (down(step(from_tick + k, 20.0, speed=0.0, who=who)) for k in range(1, ticks + 1))
+    return judge_all(one, [*lying])[-1]
+
+
+def test_a_robot_that_was_put_back_was_not_pushed() -> None:
+    """A fall right after the reset that follows a push is the robot's own."""
+    one = referee(ends_on_failure=False)
+    assert pushed_over(one, 19).reset is not None
+    verdict = judge_all(one, [down(step(t, 15.0)) for t in (23, 24, 25)])[-1]
+    assert [failure.kind for failure in verdict.failures] == ["fall"]
 
 
 def with_legs(one: Log, ticks_down: range) -> Log:
