@@ -13,8 +13,9 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   has collided.
 - out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
 - fall: for 0.1 s a robot with legs was down (`Motion.down`): its trunk leaned by more than 60
-  degrees, touched the ground, or was below 0.45 of its height at rest. A fall within 1 s after a
-  person walked into the robot is no failure and is recorded with `walked_into`; the robot is reset.
+  degrees, touched the ground, or was below 0.45 of its height at rest. A fall within 1 s after the
+  last contact with a person who walked into the robot is no failure. It is recorded with
+  `walked_into`; the robot is reset.
   A collision or fall resets the robot, so that the one that follows from the other is not counted.
 - freezing, if the episode does not end on a failure: for 10 s the robot was never 0.5 m away from
   its position at their beginning. Waiting before a red crossing of the route does not count. In a
@@ -60,7 +61,8 @@ from cosim.spec.scenario import Scenario
 FALL_S = 0.1
 """Time, seconds, that a robot is down before it has fallen."""
 _PUSHED_S = 1.0
-"""Time, seconds, after a person walked into the robot in which a fall is the person's fault."""
+"""Time, seconds, after contact with a person who walked into the robot in which a fall is the
+person's fault."""
 _NOT_PUSHED: tuple[float, str] = (-math.inf, "")
 """Tick and id of the last push, of a robot that no person has pushed."""
 FREEZE_WINDOW_S = 10.0
@@ -165,7 +167,7 @@ class Referee:
         contacts = self._contacts(step)
         into = tuple(contact for contact in contacts if contact.fault == "pedestrian_at_fault")
         failures = tuple(contact for contact in contacts if contact.fault != "pedestrian_at_fault")
-        fallen = self._fall(step, into)
+        fallen = self._fall(step)
         failures = failures or self._out_of_lane(step)
         if fallen is not None and not failures:
             if fallen.fault is None:
@@ -194,10 +196,11 @@ class Referee:
         self._pushed = _NOT_PUSHED
         return reset
 
-    def _fall(self, step: Step, into: tuple[Failure, ...]) -> Failure | None:
-        """Return the fall of a robot with legs in a tick. into: people who walk into it now."""
-        if into:
-            self._pushed = step.tick, into[0].other
+    def _fall(self, step: Step) -> Failure | None:
+        """Return the fall of a robot with legs in a tick."""
+        for contact in step.motion.contacts:
+            if contact.other in self._walked_into:
+                self._pushed = step.tick, contact.other
         self._down_ticks = self._down_ticks + 1 if step.motion.down else 0
         if self._down_ticks <= self._clock.ticks(FALL_S):
             return None

@@ -74,6 +74,21 @@ def test_a_robot_that_was_put_back_was_not_pushed() -> None:
     assert [failure.kind for failure in verdict.failures] == ["fall"]
 
 
+@pytest.mark.parametrize(("contact_ends", "kind"), [(59, "pushed"), (30, "failed")])
+def test_a_push_lasts_as_long_as_the_person_touches_the_robot(contact_ends: int, kind: str) -> None:
+    """A fall more than 1 s after the contact began is the person's while the contact continues, and
+    the robot's own 1 s after its end."""
+    who = people((20.5, 0.0), heading=math.pi, speed=1.3)
+    one = referee(ends_on_failure=False)
+    stood(one, 19)
+    for tick in range(19, 60):
+        held = [touch("c0")] if tick <= contact_ends else []
+        one.judge(step(tick, 20.0, speed=0.0, contacts=held, who=who))
+    verdict = judge_all(one, [down(step(t, 20.0, speed=0.0, who=who)) for t in (60, 61, 62)])[-1]
+    assert bool(verdict.failures) == (kind == "failed")
+    assert bool(verdict.walked_into) == (kind == "pushed")
+
+
 def with_legs(one: Log, ticks_down: range) -> Log:
     rows = np.zeros((len(one), 16), np.float32)
     rows[list(ticks_down), 0] = 1.0
