@@ -26,6 +26,7 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
 - The goal is reached within its radius at the end of the route. It is also reached at any arc
   length if walkable ground leads straight to it: the robot skipped a part of the route. If the
   route passes its goal before its end (a loop), only its end counts.
+- A robot that is down reaches no goal and makes no stop.
 - If an episode ends at a stop (`gesturing`), stopping within 3 m in front of the pedestrian for 2 s
   succeeds. Passing the pedestrian fails.
 - After a failure the robot is reset to the nearest free waypoint of the route, heading along it.
@@ -210,6 +211,9 @@ class Referee:
         return self._failure("fall", step, person, "pedestrian", "pedestrian_at_fault")
 
     def _end(self, step: Step) -> Ended | None:
+        if step.motion.down:
+            self._stopped_ticks = 0
+            return "timeout" if step.tick + 1 >= self._limit_ticks else None
         if self._scenario.ends_at == "stop":
             return self._end_by_stop(step)
         pose = step.motion.robot.pose

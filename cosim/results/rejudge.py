@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Polyline
@@ -194,7 +195,7 @@ def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
     kinds: dict[int, str] = {failure.tick: failure.kind for failure in record.failures}
     kinds |= {one.tick: "fall" for one in record.walked_into if one.kind == "fall"}
     down_ticks = 0
-    for tick, down in enumerate((log.legs[:, 0] > 0.0).tolist()):
+    for tick, down in enumerate(_down(log).tolist()):
         down_ticks = down_ticks + 1 if down else 0
         kind = kinds.get(tick)
         fallen = down_ticks > Clock().ticks(FALL_S)
@@ -203,6 +204,12 @@ def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
             return
         if kind is not None:
             down_ticks = 0
+
+
+def _down(log: Log) -> NDArray[np.bool_]:
+    """Return (T,) whether the robot was down; never on wheels."""
+    down: NDArray[np.bool_] = log.legs[:, 0] > 0.0 if log.on_legs else np.zeros(len(log), bool)
+    return down
 
 
 def _passings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
@@ -246,12 +253,17 @@ def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
     late = last + 1 >= Clock().ticks(scenario.time_limit_s)
     if any(failure.tick == last for failure in record.failures):
         return ["failure"] if scenario.ends_on_failure else ["timeout"] if late else []
+    down = _down(log)
+    if down[last]:
+        return ["timeout"] if late else []
     if scenario.ends_at == "stop":
-        stands = np.abs(log.speed[-Clock().ticks(STOP_S) :, 0]).max() < ROBOT_STANDS_MPS
+        stopped = np.abs(log.speed[:, 0]) < ROBOT_STANDS_MPS
+        stands = (stopped & ~down)[-Clock().ticks(STOP_S) :].all()
         passed = all(log.route_s_m[last] > event.route_s_m for event in scenario.events)
         return _allowed(("stop", bool(stands)), ("failure", passed), ("timeout", late))
     goals = at_goal(scenario, log.pose, log.route_s_m)
     goals[[failure.tick for failure in record.failures]] = False
+    goals &= ~down
     if goals.any():
         return ["goal"] if int(np.argmax(goals)) == last else []
     near = bool(near_goal(scenario, log.pose[-1:]).any()) and not is_loop(scenario)

@@ -15,7 +15,15 @@ from cosim.results.metrics import compute_metrics
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.rejudge import contradictions
 from tests.results.test_metrics import episode, log
-from tests.results.test_referee import judge_all, people, referee, step, stood, touch
+from tests.results.test_referee import (
+    judge_all,
+    people,
+    referee,
+    step,
+    stood,
+    stopping_hand,
+    touch,
+)
 from tests.support.driven_runs import driven, episode_of, failure_at, short_way
 
 
@@ -89,6 +97,25 @@ def test_a_push_lasts_as_long_as_the_person_touches_the_robot(contact_ends: int,
     assert bool(verdict.walked_into) == (kind == "pushed")
 
 
+def test_a_robot_that_is_down_reaches_no_goal() -> None:
+    """It slides into the goal while it falls: the fall is counted, and no goal is reached."""
+    one = referee(ends_on_failure=True)
+    verdicts = judge_all(one, [down(step(t, 99.8 + 0.1 * t)) for t in range(3)])
+    assert [verdict.ended for verdict in verdicts] == [None, None, "failure"]
+
+
+def test_a_robot_that_is_down_makes_no_stop() -> None:
+    """The time stopped before a person counts from when it is up again."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    before = [step(t, 9.2, speed=0.0, events=reply) for t in range(39)]
+    assert judge_all(one, before)[-1].ended is None
+    assert one.judge(down(step(39, 9.2, speed=0.0, events=reply))).ended is None
+    later = [step(40 + t, 9.2, speed=0.0, events=reply) for t in range(40)]
+    ended = [verdict.ended for verdict in judge_all(one, later)]
+    assert ended == [None] * 39 + ["stop"]
+
+
 def with_legs(one: Log, ticks_down: range) -> Log:
     rows = np.zeros((len(one), 16), np.float32)
     rows[list(ticks_down), 0] = 1.0
@@ -122,3 +149,13 @@ def test_wheels_have_no_number_of_falls() -> None:
     fallen = compute_metrics(episode(with_legs(walked, range(0)), fall))
     assert (fallen["falls"], fallen["failures"]) == (1.0, 1.0)
     assert fallen["falls_per_100m"] == fallen["failures_per_100m"] == pytest.approx(1.0)
+
+
+def test_the_goal_of_a_robot_that_is_down_contradicts_the_trajectory() -> None:
+    """The goal is reached in the last tick, and not if the robot is down in it."""
+    way = short_way("s")
+    record, reached = episode_of(way, "h")
+    assert reached is not None
+    assert [*contradictions(record, way, with_legs(reached, range(0)))] == []
+    lying = with_legs(reached, range(len(reached) - 1, len(reached)))
+    assert [one.what for one in contradictions(record, way, lying)] == ["ended"]
