@@ -33,6 +33,8 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   Waypoints are every 5 m, never on a crossing, at an obstacle or at the goal. After 3 failures
   within 10 m of the route, it is reset to the first free waypoint at least 1 m beyond them, or
   between waypoints if none is free.
+- After a fall at a person's fault it is reset to the nearest free place of the route that is not
+  beyond the fall. Such a fall does not count towards the 3 failures.
 - The jump counts neither as travel nor as progress.
 """
 
@@ -79,7 +81,8 @@ _SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
 _BEYOND_M = 1.0
 _BETWEEN_M = 0.1
-"""Spacing, metres, of reset positions that are tried if no waypoint beyond the failures is free."""
+"""Spacing, metres, of reset positions between waypoints: after a fall at a person's fault, and if
+no waypoint beyond the failures is free."""
 _GOAL_MARGIN_M = 0.2
 """Least distance, metres, between a reset position and the goal's circle."""
 RED_WAIT_M = 4.0
@@ -189,8 +192,9 @@ class Referee:
         return Verdict(failures, into, reset, None, red, waits)
 
     def _put_back(self, failure: Failure, step: Step) -> Reset:
-        """Return the reset after a failure, and forget what happened before it."""
-        reset = self._reset(failure, step)
+        """Return the reset after a failure or fall, and forget what happened before it."""
+        pushed = failure.fault == "pedestrian_at_fault"
+        reset = self._back_at(failure, step) if pushed else self._reset(failure, step)
         self._window.clear()
         self._entered.clear()
         self._down_ticks = self._stopped_ticks = 0
@@ -357,14 +361,29 @@ class Referee:
             fault,
         )
 
+    @property
+    def _last_m(self) -> float:
+        """Return the largest arc length, metres, of a reset before the goal."""
+        return max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
+
+    def _back_at(self, fall: Failure, step: Step) -> Reset:
+        """Return the reset after a fall at a person's fault: the nearest free place of the route,
+        not beyond the fall."""
+        begin_m = min(fall.route_s_m, self._last_m)
+        places = np.append(np.arange(begin_m, 0.0, -_BETWEEN_M), 0.0)
+        clear = self._clear(places)
+        if (found := self._first_free(clear, step)) is not None:
+            return found
+        s_m = float(clear[0] if len(clear) else places[0])
+        return Reset(self._route.at(s_m), s_m)
+
     def _reset(self, failure: Failure, step: Step) -> Reset:
         self._failed_at_s.append(failure.route_s_m)
         recent = self._failed_at_s[-SAME_PLACE_FAILURES:]
         stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= _SAME_PLACE_M
         count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
-        last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
         waypoints = np.arange(count, dtype=np.float64) * WAYPOINT_STEP_M
-        waypoints = waypoints[waypoints <= last_m]
+        waypoints = waypoints[waypoints <= self._last_m]
         clear = self._clear(waypoints)
         waypoints = clear if len(clear) else waypoints
         if stuck:

@@ -26,6 +26,7 @@ from cosim.results.referee import (
     FALL_S,
     STOP_S,
     Ended,
+    Failure,
     FreezeWindow,
     at_goal,
     is_loop,
@@ -90,12 +91,17 @@ def _failures_as_driven(record: Record, log: Log) -> Iterator[Contradiction]:
 
 def _resets(record: Record, log: Log) -> Iterator[Contradiction]:
     """Check that the robot is reset after each tick with failures or falls, except the last."""
-    put_back = (*record.failures, *(one for one in record.walked_into if one.kind == "fall"))
+    put_back = (*record.failures, *_pushed_falls(record))
     failed = sorted({failure.tick for failure in put_back} - {len(log) - 1})
     resets = np.flatnonzero(np.isfinite(log.reset_s_m)).tolist()
     if failed != resets:
         tick = min({*failed} ^ {*resets})
         yield Contradiction(f"failures at tick {tick}", int(tick in failed), int(tick in resets))
+        return
+    for fall in _pushed_falls(record):
+        if (to_m := float(log.reset_s_m[fall.tick])) > fall.route_s_m:
+            what = f"reset after the fall at tick {fall.tick}"
+            yield Contradiction(what, to_m, f"{fall.route_s_m} m or less")
 
 
 def _red_light_entries(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
@@ -171,8 +177,7 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
     if scenario.ends_on_failure:
         return
     window = FreezeWindow(Clock())
-    pushed = [one for one in record.walked_into if one.kind == "fall"]
-    kinds = {failure.tick: failure.kind for failure in (*record.failures, *pushed)}
+    kinds = {one.tick: one.kind for one in (*record.failures, *_pushed_falls(record))}
     for tick, (x_m, y_m, waits) in enumerate(
         zip(
             log.pose[:, 0].tolist(), log.pose[:, 1].tolist(), log.waits_at_red.tolist(), strict=True
@@ -193,7 +198,7 @@ def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
     if not log.on_legs:
         return
     kinds: dict[int, str] = {failure.tick: failure.kind for failure in record.failures}
-    kinds |= {one.tick: "fall" for one in record.walked_into if one.kind == "fall"}
+    kinds |= {one.tick: one.kind for one in _pushed_falls(record)}
     down_ticks = 0
     for tick, down in enumerate(_down(log).tolist()):
         down_ticks = down_ticks + 1 if down else 0
@@ -204,6 +209,11 @@ def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
             return
         if kind is not None:
             down_ticks = 0
+
+
+def _pushed_falls(record: Record) -> list[Failure]:
+    """Return the falls at a person's fault."""
+    return [one for one in record.walked_into if one.kind == "fall"]
 
 
 def _down(log: Log) -> NDArray[np.bool_]:

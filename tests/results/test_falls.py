@@ -12,8 +12,10 @@ import pytest
 from cosim.episode.loop import Step
 from cosim.results.log import Log
 from cosim.results.metrics import compute_metrics
+from cosim.results.record import Record
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.rejudge import contradictions
+from cosim.spec.scenario import Scenario
 from tests.results.test_metrics import episode, log
 from tests.results.test_referee import (
     judge_all,
@@ -116,6 +118,29 @@ def test_a_robot_that_is_down_makes_no_stop() -> None:
     assert ended == [None] * 39 + ["stop"]
 
 
+@pytest.mark.parametrize("x_m", [18.0, 23.0])
+def test_a_push_gains_no_way(x_m: float) -> None:
+    """The robot that a person pushed over continues where it fell, or behind it where the person
+    stands, also if the nearest waypoint is ahead and however often it is pushed."""
+    one = referee(ends_on_failure=False)
+    for again in range(4):
+        begin = again * 40
+        who = people((x_m + 0.5, 0.0), heading=math.pi, speed=1.3)
+        for tick in range(begin, begin + 25):
+            one.judge(step(tick, x_m, speed=0.0, who=people((50.0, 0.0))))
+        hit = [touch("c0")]
+        one.judge(step(begin + 25, x_m, speed=0.0, contacts=hit, who=who))
+        ticks = [down(step(begin + k, x_m, speed=0.0, who=who)) for k in (26, 27, 28)]
+        verdict = judge_all(one, ticks)[-1]
+        assert not verdict.failures and verdict.reset is not None
+        assert x_m - 0.7 < verdict.reset.route_s_m <= x_m - 0.5
+        gone = people((60.0, 0.0))
+        for tick in range(begin + 29, begin + 40):
+            one.judge(step(tick, x_m, speed=0.0, who=gone))
+    own = judge_all(one, [down(step(160 + t, x_m)) for t in range(3)])[-1]
+    assert own.failures and own.reset is not None and abs(own.reset.route_s_m - x_m) < 2.6
+
+
 def with_legs(one: Log, ticks_down: range) -> Log:
     rows = np.zeros((len(one), 16), np.float32)
     rows[list(ticks_down), 0] = 1.0
@@ -159,3 +184,27 @@ def test_the_goal_of_a_robot_that_is_down_contradicts_the_trajectory() -> None:
     assert [*contradictions(record, way, with_legs(reached, range(0)))] == []
     lying = with_legs(reached, range(len(reached) - 1, len(reached)))
     assert [one.what for one in contradictions(record, way, lying)] == ["ended"]
+
+
+def test_a_reset_beyond_a_pushed_fall_contradicts_the_trajectory() -> None:
+    """A push gains no way, in a record neither."""
+    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    for to_m, contradicted in ((1.0, 0), (4.0, 1)):
+        walked = with_legs(driven(way, [1.0] * 30 + [0.0] * 70, {45: to_m}), range(43, 46))
+        assert len([*contradictions(pushed(way, walked, 35, 45), way, walked)]) == contradicted
+
+
+def pushed(way: Scenario, log: Log, contact: int, fall: int) -> Record:
+    """The record of a robot that a person walks into and pushes over, at these ticks."""
+    into = {"other": "c0", "other_kind": "pedestrian", "fault": "pedestrian_at_fault"}
+    found = [
+        dataclasses.replace(failure_at(log, tick, kind), **into)  # type: ignore[arg-type]
+        for tick, kind in ((contact, "collision"), (fall, "fall"))
+    ]
+    return msgspec.structs.replace(
+        episode_of(way, "h")[0],
+        status="done",
+        ended="timeout",
+        ticks=len(log),
+        walked_into=tuple(found),
+    )
