@@ -63,7 +63,7 @@ from cosim.spec.scenario import Scenario
 
 FALL_S = 0.1
 """Time, seconds, that a robot is down before it has fallen."""
-_PUSHED_S = 1.0
+PUSHED_S = 1.0
 """Time, seconds, after contact with a person who walked into the robot in which a fall is the
 person's fault."""
 _NOT_PUSHED: tuple[float, str] = (-math.inf, "")
@@ -72,7 +72,7 @@ FREEZE_WINDOW_S = 10.0
 FREEZE_MOVE_M = 0.5
 _ROUNDING_M = 1e-6
 _APART_M = 0.1
-_APART_S = 1.0
+APART_S = 1.0
 WAYPOINT_STEP_M = 5.0
 FREE_OF_PEOPLE_M = 1.0
 FREE_OF_VEHICLES_M = 4.0
@@ -210,7 +210,7 @@ class Referee:
         if self._down_ticks <= self._clock.ticks(FALL_S):
             return None
         since, person = self._pushed
-        if step.tick - since > self._clock.ticks(_PUSHED_S):
+        if step.tick - since > self._clock.ticks(PUSHED_S):
             return self._failure("fall", step)
         return self._failure("fall", step, person, "pedestrian", "pedestrian_at_fault")
 
@@ -301,7 +301,7 @@ class Referee:
         for other, last_tick in list(self._touching.items()):
             if gaps.get(other, np.inf) <= _APART_M or other in near_vehicles:
                 self._touching[other] = step.tick
-            elif (step.tick - last_tick) * self._clock.tick_s > _APART_S:
+            elif (step.tick - last_tick) * self._clock.tick_s > APART_S:
                 del self._touching[other]
                 self._walked_into.discard(other)
 

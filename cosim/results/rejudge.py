@@ -23,7 +23,9 @@ from cosim.results.go_on import Passing, is_measured, passing_of, rule_met
 from cosim.results.log import Log
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import (
+    APART_S,
     FALL_S,
+    PUSHED_S,
     STOP_S,
     Ended,
     Failure,
@@ -35,6 +37,10 @@ from cosim.results.referee import (
 from cosim.spec.scenario import Scenario
 
 _ROUNDING_M = 1e-9
+_NEAR_M = 0.3
+"""Clearance, metres, within which a person may touch the robot: legs reach beyond its outline."""
+_PUSH_TICKS = Clock().ticks(max(PUSHED_S, APART_S))
+"""Longest time in ticks between two contacts of a push, and from the last one to the fall."""
 _BLOCK_TICKS = 2000
 """Number of ticks per block; limits memory to a few MiB."""
 
@@ -62,6 +68,7 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
     yield from _progress(scenario, log)
     yield from _freezings(record, scenario, log)
     yield from _falls(record, log)
+    yield from _pushes(record, log)
     yield from _passings(record, scenario, log)
     if record.ended not in (ends := _ends(record, scenario, log)):
         yield Contradiction("ended", record.ended, " or ".join(ends) or "not yet over")
@@ -195,8 +202,6 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
 
 def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
     """Check falls by the referee's rule, in ticks without another failure."""
-    if not log.on_legs:
-        return
     kinds: dict[int, str] = {failure.tick: failure.kind for failure in record.failures}
     kinds |= {one.tick: one.kind for one in _pushed_falls(record)}
     down_ticks = 0
@@ -209,6 +214,30 @@ def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
             return
         if kind is not None:
             down_ticks = 0
+
+
+def _pushes(record: Record, log: Log) -> Iterator[Contradiction]:
+    """Check that people could have pushed the robot over.
+
+    Before each such fall, the same person walked into the robot after its last reset. From then on
+    a person was near, with gaps of at most the times in the referee's rules.
+    """
+    began = {(one.tick, one.other) for one in record.walked_into if one.kind == "collision"}
+    resets = np.flatnonzero(np.isfinite(log.reset_s_m))
+    near = log.clearance_m <= _NEAR_M
+    for fall in _pushed_falls(record):
+        since = max((tick for tick in resets.tolist() if tick < fall.tick), default=-1)
+        ticks = [t for t, who in began if who == fall.other and since < t <= fall.tick]
+        if not ticks or _longest_gap(near, max(ticks), fall.tick) > _PUSH_TICKS:
+            yield Contradiction(
+                f"walked_into: fall at tick {fall.tick}", fall.other, "not pushed by this person"
+            )
+
+
+def _longest_gap(near: NDArray[np.bool_], first: int, last: int) -> int:
+    """Return the longest time in ticks without a person near, between two ticks."""
+    marks = first + np.flatnonzero(near[first : last + 1])
+    return int(np.diff([first, *marks.tolist(), last]).max())
 
 
 def _pushed_falls(record: Record) -> list[Failure]:
@@ -264,7 +293,7 @@ def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
     if any(failure.tick == last for failure in record.failures):
         return ["failure"] if scenario.ends_on_failure else ["timeout"] if late else []
     down = _down(log)
-    if down[last]:
+    if down[last]:  # also in a fall at a person's fault
         return ["timeout"] if late else []
     if scenario.ends_at == "stop":
         stopped = np.abs(log.speed[:, 0]) < ROBOT_STANDS_MPS

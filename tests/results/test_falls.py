@@ -208,3 +208,48 @@ def pushed(way: Scenario, log: Log, contact: int, fall: int) -> Record:
         ticks=len(log),
         walked_into=tuple(found),
     )
+
+
+def test_a_push_follows_from_the_trajectory() -> None:
+    """Only a person who walked into the robot less than 1 s before, or stayed near until then, may
+    have pushed it over."""
+    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    speeds = [1.0] * 10 + [0.0] * 90
+
+    def found(contact: int, near_until: int, fall: int = 60) -> list[str]:
+        walked = with_legs(driven(way, speeds, {fall: 0.0}), range(fall - 2, fall + 1))
+        clearance_m = np.where(np.arange(100) <= near_until, 0.05, 3.0)
+        walked = dataclasses.replace(walked, clearance_m=clearance_m)
+        record = pushed(way, walked, contact, fall)
+        return [one.what for one in contradictions(record, way, walked)]
+
+    assert found(40, 40) == found(15, 40) == []
+    contradicted = ["walked_into: fall at tick 60"]
+    assert found(39, 39) == found(15, 39) == found(61, 100) == contradicted
+
+
+def test_a_fall_of_the_robot_is_not_a_push() -> None:
+    """A failure that is moved to `walked_into` contradicts the trajectory, in the last tick by the
+    end that it had."""
+    way = short_way("s", ends_on_failure=True)
+    walked = with_legs(driven(way, [0.0] * 50), range(47, 50))
+    fall = failure_at(walked, 49, "fall")
+    record = msgspec.structs.replace(
+        episode_of(way, "h")[0], status="done", ended="failure", ticks=50, failures=(fall,)
+    )
+    assert [*contradictions(record, way, walked)] == []
+    forged = msgspec.structs.replace(pushed(way, walked, 40, 49), ended="failure")
+    assert [one.what for one in contradictions(forged, way, walked)] == ["ended"]
+    moved = msgspec.structs.replace(forged, walked_into=(forged.walked_into[1],), ended="timeout")
+    assert {one.what for one in contradictions(moved, way, walked)} == {
+        "walked_into: fall at tick 49",
+        "ended",
+    }
+
+
+def test_a_fall_on_wheels_contradicts_the_trajectory() -> None:
+    """A robot on wheels has none, at whoever's fault."""
+    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    rolled = driven(way, [0.0] * 100, {60: 0.0})
+    found = [one.what for one in contradictions(pushed(way, rolled, 50, 60), way, rolled)]
+    assert found == ["falls at tick 60"]
