@@ -20,6 +20,7 @@ from cosim.core.state import PERSON_RADIUS_M, People, RobotState
 from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
 from cosim.results.traffic import RoadState
+from cosim.spec.robot import Legs, robot_called
 
 _PLAN_ARRAYS = {"plan_sizes", "plan_points", "plan_index"}
 _OPTIONAL = {"answers", "legs"} | _PLAN_ARRAYS
@@ -27,6 +28,8 @@ _OPTIONAL = {"answers", "legs"} | _PLAN_ARRAYS
 _PEOPLE_WIDTHS = {"people_tick": 0, "people_xy": 2, "people_kind": 0, "people_age": 0}
 """Number of columns of each array with one row per person; 0 for a one-dimensional array."""
 _SLOWEST_MPS: Final = 1e-9
+_TRUNK_COLUMNS: Final = 4
+"""Number of columns of `Log.legs` before the joint angles."""
 VARIES: Final = -1
 """Width of a column whose number of values differs between robots."""
 
@@ -149,6 +152,12 @@ def _legs_of(tick: Tick) -> Sequence[float]:
     legs = robot.legs
     down = float(tick.step.motion.down)
     return (down, robot.z_m, legs.roll_rad, legs.pitch_rad, *legs.angles_rad)
+
+
+def legs_width(robot: str) -> int:
+    """Return the number of columns of `Log.legs` of the robot with a name; 0 on wheels."""
+    drive = robot_called(robot).drive
+    return _TRUNK_COLUMNS + len(drive.joints) if isinstance(drive, Legs) else 0
 
 
 def holds_waypoints(path: Path) -> bool:
@@ -314,7 +323,7 @@ def _check_shapes(arrays: Mapping[str, Any]) -> None:
             array = arrays[name]
             shape: tuple[int, ...] = (rows, width) if width else (rows,)
             if width == VARIES:
-                shape = (rows, *array.shape[1:2])
+                shape = (rows, array.shape[1] if array.ndim > 1 else 0)
             if array.dtype.kind not in "biuf" or array.shape != shape:
                 raise ValueError(
                     f"'{name}' is {array.dtype.name} {array.shape}; wanted are numbers {shape}"

@@ -20,7 +20,7 @@ from cosim.episode.command_delay import median_ms
 from cosim.episode.loop import ROUTE_WINDOW_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.results.go_on import Passing, is_measured, passing_of, rule_met
-from cosim.results.log import Log
+from cosim.results.log import Log, legs_width
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import (
     APART_S,
@@ -62,6 +62,9 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
         latency_ms := median_ms(log.answers, Clock().tick_ms)
     ):
         yield Contradiction("latency_ms", record.setup.latency_ms, latency_ms)
+    if len(log) and log.legs.shape[1] != (width := legs_width(scenario.robot)):
+        yield Contradiction("columns of legs", width, log.legs.shape[1])
+        return
     yield from _failures_as_driven(record, log)
     yield from _resets(record, log)
     yield from _red_light_entries(record, scenario, log)
@@ -219,15 +222,13 @@ def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
 def _pushes(record: Record, log: Log) -> Iterator[Contradiction]:
     """Check that people could have pushed the robot over.
 
-    Before each such fall, the same person walked into the robot after its last reset. From then on
-    a person was near, with gaps of at most the times in the referee's rules.
+    Before each such fall, the same person walked into the robot. From then on a person was near,
+    with gaps of at most the times in the referee's rules.
     """
     began = {(one.tick, one.other) for one in record.walked_into if one.kind == "collision"}
-    resets = np.flatnonzero(np.isfinite(log.reset_s_m))
     near = log.clearance_m <= _NEAR_M
     for fall in _pushed_falls(record):
-        since = max((tick for tick in resets.tolist() if tick < fall.tick), default=-1)
-        ticks = [t for t, who in began if who == fall.other and since < t <= fall.tick]
+        ticks = [t for t, person in began if person == fall.other and t <= fall.tick]
         if not ticks or _longest_gap(near, max(ticks), fall.tick) > _PUSH_TICKS:
             yield Contradiction(
                 f"walked_into: fall at tick {fall.tick}", fall.other, "not pushed by this person"

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
+from cosim.core.errors import RunError
 from cosim.episode.loop import Step
 from cosim.results.log import Log
 from cosim.results.metrics import compute_metrics
@@ -150,7 +152,7 @@ def with_legs(one: Log, ticks_down: range) -> Log:
 def test_falls_follow_from_the_trajectory() -> None:
     """A recorded fall is where the robot was down for 0.1 s; one that is left out or added
     contradicts the trajectory."""
-    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     walked = with_legs(driven(way, [1.0] * 100, {30: 0.0}), range(28, 31))
     fall = failure_at(walked, 30, "fall")
     record = msgspec.structs.replace(
@@ -178,7 +180,7 @@ def test_wheels_have_no_number_of_falls() -> None:
 
 def test_the_goal_of_a_robot_that_is_down_contradicts_the_trajectory() -> None:
     """The goal is reached in the last tick, and not if the robot is down in it."""
-    way = short_way("s")
+    way = short_way("s", robot="dog")
     record, reached = episode_of(way, "h")
     assert reached is not None
     assert [*contradictions(record, way, with_legs(reached, range(0)))] == []
@@ -188,7 +190,7 @@ def test_the_goal_of_a_robot_that_is_down_contradicts_the_trajectory() -> None:
 
 def test_a_reset_beyond_a_pushed_fall_contradicts_the_trajectory() -> None:
     """A push gains no way, in a record neither."""
-    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     for to_m, contradicted in ((1.0, 0), (4.0, 1)):
         walked = with_legs(driven(way, [1.0] * 30 + [0.0] * 70, {45: to_m}), range(43, 46))
         assert len([*contradictions(pushed(way, walked, 35, 45), way, walked)]) == contradicted
@@ -213,7 +215,7 @@ def pushed(way: Scenario, log: Log, contact: int, fall: int) -> Record:
 def test_a_push_follows_from_the_trajectory() -> None:
     """Only a person who walked into the robot less than 1 s before, or stayed near until then, may
     have pushed it over."""
-    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     speeds = [1.0] * 10 + [0.0] * 90
 
     def found(contact: int, near_until: int, fall: int = 60) -> list[str]:
@@ -231,7 +233,7 @@ def test_a_push_follows_from_the_trajectory() -> None:
 def test_a_fall_of_the_robot_is_not_a_push() -> None:
     """A failure that is moved to `walked_into` contradicts the trajectory, in the last tick by the
     end that it had."""
-    way = short_way("s", ends_on_failure=True)
+    way = short_way("s", robot="dog", ends_on_failure=True)
     walked = with_legs(driven(way, [0.0] * 50), range(47, 50))
     fall = failure_at(walked, 49, "fall")
     record = msgspec.structs.replace(
@@ -253,3 +255,25 @@ def test_a_fall_on_wheels_contradicts_the_trajectory() -> None:
     rolled = driven(way, [0.0] * 100, {60: 0.0})
     found = [one.what for one in contradictions(pushed(way, rolled, 50, 60), way, rolled)]
     assert found == ["falls at tick 60"]
+
+
+def test_a_trajectory_without_the_columns_of_the_legs_is_not_of_the_robot(tmp_path: Path) -> None:
+    """A robot with legs has four columns and one per joint, a robot on wheels none; an array of
+    one dimension is no trajectory."""
+    for robot, columns, contradicted in (
+        ("dog", 16, []),
+        ("dog", 0, ["columns of legs"]),
+        ("dog", 15, ["columns of legs"]),
+        ("courier", 16, ["columns of legs"]),
+        ("courier", 0, []),
+    ):
+        way = short_way("s", robot=robot)
+        record, reached = episode_of(way, "h")
+        assert reached is not None
+        walked = dataclasses.replace(reached, legs=np.zeros((len(reached), columns), np.float32))
+        assert [one.what for one in contradictions(record, way, walked)] == contradicted
+    path = tmp_path / "trajectory.npz"
+    flat = dataclasses.replace(reached, legs=np.zeros(len(reached), np.float32))
+    path.write_bytes(flat.encoded())
+    with pytest.raises(RunError, match="'legs' is float32"):
+        Log.load(path)
