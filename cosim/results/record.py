@@ -18,6 +18,7 @@ import numpy as np
 from cosim.core.errors import RunError, SpecError
 from cosim.core.files import read_limited, write_atomic
 from cosim.core.geometry import Floats
+from cosim.core.state import Motion
 from cosim.episode.command_delay import CommandDelay
 from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import nonstandard
@@ -237,9 +238,17 @@ RECORD_FILE = FlatFile(
 """Layout of record.json: flat, for compatibility with files written before `Record` had parts."""
 
 
+def _legs_of(motion: Motion) -> tuple[float, ...]:
+    """Return what the state hash holds of a robot with legs; nothing on wheels."""
+    legs = motion.robot.legs
+    if legs is None:
+        return ()
+    return (*legs.angles_rad, legs.roll_rad, legs.pitch_rad, float(motion.down))
+
+
 class StateHash:
     """Running hash of the simulated state: robot, people, vehicles, signals and contacts at each
-    tick."""
+    tick. With legs the robot's part includes joint angles, roll, pitch and `Motion.down`."""
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=16)
@@ -250,7 +259,7 @@ class StateHash:
         street = step.street_after
         for array in (
             np.array([*robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad]),
-            np.array(() if robot.legs is None else robot.legs.angles_rad),
+            np.array(_legs_of(step.motion)),
             step.motion.trace,
             street.people.xy,
             street.people.heading,

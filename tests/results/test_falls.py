@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import RunError
+from cosim.core.state import LegState
 from cosim.episode.loop import Step
 from cosim.results.log import Log
 from cosim.results.metrics import compute_metrics
-from cosim.results.record import Record
+from cosim.results.record import Record, StateHash
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.rejudge import contradictions
 from cosim.spec.scenario import Scenario
@@ -141,6 +142,26 @@ def test_a_push_gains_no_way(x_m: float) -> None:
             one.judge(step(tick, x_m, speed=0.0, who=gone))
     own = judge_all(one, [down(step(160 + t, x_m)) for t in range(3)])[-1]
     assert own.failures and own.reset is not None and abs(own.reset.route_s_m - x_m) < 2.6
+
+
+def test_a_state_hash_holds_the_attitude_of_the_trunk() -> None:
+    """Roll, pitch and lying change the hash with legs; on wheels it is as it always was."""
+
+    def hash_of(one: Step) -> str:
+        found = StateHash()
+        found.add(one)
+        return found.hexdigest()
+
+    def walking(roll_rad: float, pitch_rad: float, knee_rad: float) -> Step:
+        one = step(0, 20.0)
+        legs = LegState(roll_rad, pitch_rad, (0.0, knee_rad))
+        robot = dataclasses.replace(one.motion.robot, legs=legs)
+        return dataclasses.replace(one, motion=dataclasses.replace(one.motion, robot=robot))
+
+    upright = walking(0.0, 0.0, 0.0)
+    others = [walking(*row) for row in np.eye(3).tolist()]
+    assert len({hash_of(one) for one in (upright, down(upright), *others)}) == 5
+    assert hash_of(step(0, 20.0)) == "d1c778b35eb57669455504ff5ec1cef4"
 
 
 def with_legs(one: Log, ticks_down: range) -> Log:
