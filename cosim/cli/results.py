@@ -317,7 +317,7 @@ def print_episode(out: Console, record: Record) -> None:
     for contact in record.walked_into:
         where = f"at {contact.route_s_m:.1f} m, {contact.fault}"
         out.print(
-            f"  {Clock().time_s(contact.tick):7.2f} s  walked into by {contact.other} {where}"
+            f"  {Clock().time_s(contact.tick):7.2f} s  {contact.suffered} by {contact.other} {where}"
         )
     for event in record.events:
         at = (

@@ -141,7 +141,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     reason: why the episode crashed or is invalid
     ended: None if the episode did not end; then there is neither trajectory nor measure, and ticks,
         state hash, failures and events are those before the crash
-    walked_into: contacts with people who walked into the resting robot; not failures
+    walked_into: contacts with people who walked into the resting robot, and the falls that
+        followed (`Failure.kind`); not failures
     injections: pedestrians injected from outside; needed for a replay
     clock: wall times, not reproducible, and answer times of a policy in another process
 

@@ -119,6 +119,11 @@ class Failure:
     other_kind: str = ""
     fault: Fault | None = None
 
+    @property
+    def suffered(self) -> str:
+        """What a person at fault did to the robot, in words before "by"."""
+        return "pushed over" if self.kind == "fall" else "walked into"
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:

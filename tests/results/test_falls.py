@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
+from cosim.cli.results import print_episode
 from cosim.core.errors import RunError
 from cosim.core.state import LegState
 from cosim.episode.loop import Step
 from cosim.results.log import Log
-from cosim.results.metrics import compute_metrics
+from cosim.results.metrics import EpisodeFacts, compute_metrics
 from cosim.results.record import Record, StateHash
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.rejudge import contradictions
@@ -298,3 +301,14 @@ def test_a_trajectory_without_the_columns_of_the_legs_is_not_of_the_robot(tmp_pa
     path.write_bytes(flat.encoded())
     with pytest.raises(RunError, match="'legs' is float32"):
         Log.load(path)
+
+
+def test_a_push_over_is_one_contact_and_is_shown_as_a_push() -> None:
+    """`walked_into` counts the contact alone; the episode is printed with both."""
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
+    walked = with_legs(driven(way, [0.0] * 100, {60: 0.0}), range(58, 61))
+    record = pushed(way, walked, 45, 60)
+    assert compute_metrics(EpisodeFacts.of(record, way, walked))["walked_into"] == 1.0
+    text = io.StringIO()
+    print_episode(Console(file=text, width=120), record)
+    assert "walked into by c0" in text.getvalue() and "pushed over by c0" in text.getvalue()
