@@ -110,7 +110,7 @@ def success(episode: EpisodeFacts) -> float:
 
 
 def travelled_m(episode: EpisodeFacts) -> float:
-    """Return the driven length: sum of displacements at the physics rate, without reset jumps."""
+    """Return the travelled length without reset jumps: sum of `Log.travelled_m`."""
     return float(episode.log.travelled_m.sum())
 
 

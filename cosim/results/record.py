@@ -27,6 +27,7 @@ from cosim.results.log import COLUMNS, Log, Tick
 from cosim.results.referee import Ended, Failure, Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.results.traffic import RoadState
+from cosim.results.walked import walked_m
 from cosim.spec.episode_id import episode_id_of
 from cosim.spec.injection import Injected
 from cosim.spec.manifest import Manifest
@@ -280,6 +281,7 @@ class Recorder:
     """Collects the steps of an episode into a Log.
 
     columns: columns that are recorded; the arrays of all others are empty.
+    cycle_s: duration of a gait cycle, 0 on wheels. With legs poses are always recorded.
     """
 
     PEOPLE_EVERY_TICKS = 20
@@ -290,10 +292,13 @@ class Recorder:
         tick_s: float,
         footprint_m: tuple[float, float],
         columns: Iterable[str] = tuple(COLUMNS),
+        cycle_s: float = 0.0,
     ) -> None:
         self._tick_s = tick_s
+        self._cycle_s = cycle_s
+        names = dict.fromkeys([*columns, *(("pose", "reset_s_m") if cycle_s else ())])
         self._footprint_m = footprint_m
-        self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in columns}
+        self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in names}
         self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
         self.ticks = 0
@@ -324,9 +329,16 @@ class Recorder:
         """
         people = np.array(self._people, dtype=float).reshape(-1, 5)
         plan_sizes, plan_points, plan_index = commands.plans
+        columns = {
+            name: column.array(self._values.get(name, ())) for name, column in COLUMNS.items()
+        }
+        if self._cycle_s:
+            columns["travelled_m"] = walked_m(
+                columns["pose"][:, :2], columns["reset_s_m"], self._cycle_s / self._tick_s
+            )
         return Log(
             tick_s=self._tick_s,
-            **{name: column.array(self._values.get(name, ())) for name, column in COLUMNS.items()},
+            **columns,
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_kind=people[:, 3].astype(np.int8),

@@ -34,6 +34,8 @@ from cosim.results.referee import (
     is_loop,
     near_goal,
 )
+from cosim.results.walked import walked_m
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 
 _ROUNDING_M = 1e-9
@@ -129,7 +131,11 @@ def _red_light_entries(record: Record, scenario: Scenario, log: Log) -> Iterator
 
 
 def _progress(scenario: Scenario, log: Log) -> Iterator[Contradiction]:
-    """Check that arc lengths match the poses, and that no tick moved farther than it travelled."""
+    """Check that arc lengths match the poses.
+
+    With legs, distances travelled follow from the poses. On wheels no tick moved farther than it
+    travelled.
+    """
     reset_to_m = _previous(log.reset_s_m, 0.0)
     last_m = np.where(np.isnan(reset_to_m), _previous(log.route_s_m, 0.0), reset_to_m)
     shown_m = places_on_route(scenario.route_line, log.pose, last_m)
@@ -138,6 +144,14 @@ def _progress(scenario: Scenario, log: Log) -> Iterator[Contradiction]:
         yield Contradiction(
             f"route_s_m at tick {tick}", float(log.route_s_m[tick]), float(shown_m[tick])
         )
+        return
+    if cycle_s := robot_called(scenario.robot).drive.cycle_s:
+        way_m = walked_m(log.pose[:, :2], log.reset_s_m, cycle_s / log.tick_s)
+        differing = np.flatnonzero(~(np.abs(way_m - log.travelled_m) <= _ROUNDING_M))
+        for tick in differing[:1].tolist():
+            yield Contradiction(
+                f"travelled_m at tick {tick}", float(log.travelled_m[tick]), float(way_m[tick])
+            )
         return
     went_m = np.hypot(*np.diff(log.pose[:, :2], axis=0).T)
     short = (

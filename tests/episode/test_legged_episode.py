@@ -90,8 +90,11 @@ def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_walks_on(
 
 
 def test_a_walk_replays_to_the_same_state_hash(scenario: Scenario, robot: str) -> None:
-    """Without a push it does not fall, and run again it has the same hash."""
+    """Without a push it does not fall, it travels the way between its first and last pose, and run
+    again it has the same hash."""
     episode = walked(scenario, robot, 0.0)
+    straight_m = math.dist(episode.log.pose[0, :2], episode.log.pose[-1, :2])
+    assert episode.record.measures["path_length_m"] == pytest.approx(straight_m, rel=0.02)
     assert episode.record.measures["falls"] == 0.0
     assert replay_state_hash(episode) == episode.record.state_hash
 
