@@ -8,13 +8,19 @@ import numpy as np
 import pytest
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Pose
+from cosim.core.geometry import Floats, Pose
 from cosim.core.state import STILL, Motion
+from cosim.episode.command_delay import CommandDelay
+from cosim.results.log import COLUMNS
+from cosim.results.metrics import BRIEF_COLUMNS
+from cosim.results.record import Recorder
+from cosim.results.referee import Verdict
 from cosim.results.rejudge import contradictions
 from cosim.results.walked import walked_m
 from cosim.spec.robot import ROBOTS, WALKER, Legs, Robot
 from scenarios.tools.bench.legs import FLAT, walking
 from tests.results.test_falls import with_legs
+from tests.results.test_referee import step
 from tests.support.driven_runs import episode_of, short_way
 
 TICK_S = Clock().tick_s
@@ -59,6 +65,20 @@ def test_another_way_than_that_of_the_poses_contradicts_the_trajectory() -> None
         forged = dataclasses.replace(log, travelled_m=travelled_m)
         found = [one.what for one in contradictions(record, way, forged)]
         assert found == ["travelled_m at tick 20"]
+
+
+@pytest.mark.parametrize("columns", [tuple(COLUMNS), BRIEF_COLUMNS])
+def test_the_recorder_records_the_way_of_the_poses(columns: tuple[str, ...]) -> None:
+    """Also where only the columns of a search are recorded; without a gait it is as driven."""
+
+    def travelled_m(cycle_s: float) -> Floats:
+        recorder = Recorder(TICK_S, (0.7, 0.3), columns, cycle_s)
+        for tick in range(100):
+            recorder.add(step(tick, 20.0 + 0.05 * tick, 0.02 * (-1) ** tick), Verdict())
+        return recorder.log(np.zeros((0, 5)), CommandDelay()).travelled_m
+
+    assert travelled_m(0.2).sum() == pytest.approx(99 * 0.05, abs=0.05)
+    assert not travelled_m(0.0).any()
 
 
 def way_of(robot: Robot, motions: list[Motion]) -> float:
