@@ -18,7 +18,7 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Polyline
 from cosim.episode.command_delay import median_ms
 from cosim.episode.loop import ROUTE_WINDOW_M
-from cosim.people.yielding import ROBOT_STANDS_MPS
+from cosim.people.yielding import ROBOT_STANDS_MPS, STOOD_S
 from cosim.results.go_on import Passing, is_measured, passing_of, rule_met
 from cosim.results.log import Log, legs_width
 from cosim.results.record import Record, TriggeredEvent
@@ -80,11 +80,7 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
 
 
 def _failures_as_driven(record: Record, log: Log) -> Iterator[Contradiction]:
-    start_mps = np.abs(
-        np.where(
-            np.isfinite(_previous(log.reset_s_m, np.nan)), 0.0, _previous(log.speed[:, 0], 0.0)
-        )
-    )
+    start_mps = _start_mps(log)
     for failure in (*record.failures, *record.walked_into):
         recorded = (failure.x_m, failure.y_m, failure.route_s_m, failure.robot_speed_mps)
         tick = failure.tick
@@ -236,13 +232,24 @@ def _falls(record: Record, log: Log) -> Iterator[Contradiction]:
 def _pushes(record: Record, log: Log) -> Iterator[Contradiction]:
     """Check that people could have pushed the robot over.
 
-    Before each such fall, the same person walked into the robot. From then on a person was near,
-    with gaps of at most the times in the referee's rules.
+    Before each such fall, the same person walked into the robot, which had not driven for a second.
+    From then on a person was near, with gaps of at most the times in the referee's rules.
     """
+    if not (falls := _pushed_falls(record)):
+        return
     began = {(one.tick, one.other) for one in record.walked_into if one.kind == "collision"}
     near = log.clearance_m <= _NEAR_M
-    for fall in _pushed_falls(record):
-        ticks = [t for t, person in began if person == fall.other and t <= fall.tick]
+    stands = _start_mps(log) < ROBOT_STANDS_MPS
+    stood = Clock().ticks(STOOD_S)
+    touched = {
+        (tick, other)
+        for tick, other in began
+        if stood <= tick + 1 <= len(log)
+        and near[tick]
+        and stands[tick + 1 - stood : tick + 1].all()
+    }
+    for fall in falls:
+        ticks = [tick for tick, other in touched if other == fall.other and tick <= fall.tick]
         if not ticks or _longest_gap(near, max(ticks), fall.tick) > _PUSH_TICKS:
             yield Contradiction(
                 f"walked_into: fall at tick {fall.tick}", fall.other, "not pushed by this person"
@@ -326,6 +333,13 @@ def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
 
 def _allowed(*ends: tuple[Ended, bool]) -> list[Ended]:
     return [ended for ended, allowed in ends if allowed]
+
+
+def _start_mps(log: Log) -> Floats:
+    """Return (T,) the magnitude of the speed at the beginning of each tick."""
+    speed = _previous(log.speed[:, 0], 0.0)
+    start: Floats = np.abs(np.where(np.isfinite(_previous(log.reset_s_m, np.nan)), 0.0, speed))
+    return start
 
 
 def _previous(values: Floats, first: float) -> Floats:

@@ -216,8 +216,16 @@ def test_a_reset_beyond_a_pushed_fall_contradicts_the_trajectory() -> None:
     """A push gains no way, in a record neither."""
     way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     for to_m, contradicted in ((1.0, 0), (4.0, 1)):
-        walked = with_legs(driven(way, [1.0] * 30 + [0.0] * 70, {45: to_m}), range(43, 46))
-        assert len([*contradictions(pushed(way, walked, 35, 45), way, walked)]) == contradicted
+        walked = with_legs(driven(way, [1.0] * 30 + [0.0] * 70, {65: to_m}), range(63, 66))
+        walked = with_person(walked, range(100))
+        assert len([*contradictions(pushed(way, walked, 55, 65), way, walked)]) == contradicted
+
+
+def with_person(one: Log, near: range) -> Log:
+    """The log with a person at the robot in some ticks, and far away in the others."""
+    clearance_m = np.full(len(one), 3.0)
+    clearance_m[list(near)] = 0.05
+    return dataclasses.replace(one, clearance_m=clearance_m)
 
 
 def pushed(way: Scenario, log: Log, contact: int, fall: int) -> Record:
@@ -237,28 +245,28 @@ def pushed(way: Scenario, log: Log, contact: int, fall: int) -> Record:
 
 
 def test_a_push_follows_from_the_trajectory() -> None:
-    """Only a person who walked into the robot less than 1 s before, or stayed near until then, may
-    have pushed it over."""
+    """Only a person near who walked into the standing robot less than 1 s before, or stayed near
+    until then, may have pushed it over."""
     way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     speeds = [1.0] * 10 + [0.0] * 90
 
     def found(contact: int, near_until: int, fall: int = 60) -> list[str]:
         walked = with_legs(driven(way, speeds, {fall: 0.0}), range(fall - 2, fall + 1))
-        clearance_m = np.where(np.arange(100) <= near_until, 0.05, 3.0)
-        walked = dataclasses.replace(walked, clearance_m=clearance_m)
+        walked = with_person(walked, range(min(contact, 60), near_until + 1))
         record = pushed(way, walked, contact, fall)
         return [one.what for one in contradictions(record, way, walked)]
 
-    assert found(40, 40) == found(15, 40) == []
+    assert found(40, 40) == found(30, 40) == []
     contradicted = ["walked_into: fall at tick 60"]
-    assert found(39, 39) == found(15, 39) == found(61, 100) == contradicted
+    assert found(39, 39) == found(30, 39) == found(61, 99) == contradicted
+    assert found(29, 99) == found(50, 49) == contradicted
 
 
 def test_a_fall_of_the_robot_is_not_a_push() -> None:
     """A failure that is moved to `walked_into` contradicts the trajectory, in the last tick by the
     end that it had."""
     way = short_way("s", robot="dog", ends_on_failure=True)
-    walked = with_legs(driven(way, [0.0] * 50), range(47, 50))
+    walked = with_person(with_legs(driven(way, [0.0] * 50), range(47, 50)), range(50))
     fall = failure_at(walked, 49, "fall")
     record = msgspec.structs.replace(
         episode_of(way, "h")[0], status="done", ended="failure", ticks=50, failures=(fall,)
@@ -276,7 +284,7 @@ def test_a_fall_of_the_robot_is_not_a_push() -> None:
 def test_a_fall_on_wheels_contradicts_the_trajectory() -> None:
     """A robot on wheels has none, at whoever's fault."""
     way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
-    rolled = driven(way, [0.0] * 100, {60: 0.0})
+    rolled = with_person(driven(way, [0.0] * 100, {60: 0.0}), range(100))
     found = [one.what for one in contradictions(pushed(way, rolled, 50, 60), way, rolled)]
     assert found == ["falls at tick 60"]
 
