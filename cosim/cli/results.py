@@ -315,10 +315,9 @@ def print_episode(out: Console, record: Record) -> None:
             f"{failure.route_s_m:.1f} m{fault}"
         )
     for contact in record.walked_into:
+        what = f"{contact.suffered} by {contact.other}"
         where = f"at {contact.route_s_m:.1f} m, {contact.fault}"
-        out.print(
-            f"  {Clock().time_s(contact.tick):7.2f} s  walked into by {contact.other} {where}"
-        )
+        out.print(f"  {Clock().time_s(contact.tick):7.2f} s  {what} {where}")
     for event in record.events:
         at = (
             "never triggered"

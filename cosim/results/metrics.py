@@ -39,7 +39,7 @@ class EpisodeFacts:
 
     route_length_m: geodesic walkable length of the reference route
     rules_broken: number of events whose rule was broken
-    walked_into: contacts at a person's fault
+    walked_into: contacts and falls at a person's fault
     period_ticks: ticks between two commands of the policy
     """
 
@@ -110,7 +110,7 @@ def success(episode: EpisodeFacts) -> float:
 
 
 def travelled_m(episode: EpisodeFacts) -> float:
-    """Return the driven length: sum of displacements at the physics rate, without reset jumps."""
+    """Return the travelled length without reset jumps: sum of `Log.travelled_m`."""
     return float(episode.log.travelled_m.sum())
 
 
@@ -293,6 +293,11 @@ def collisions_with(other_kind: str) -> Callable[[EpisodeFacts], float]:
     )
 
 
+def walked_into(episode: EpisodeFacts) -> float:
+    """Return the number of contacts at a person's fault, without the falls that follow."""
+    return float(sum(one.kind == "collision" for one in episode.walked_into))
+
+
 def any_of(count_of: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float]:
     """Return a metric that is 1 if the count is above 0; its mean is a rate of episodes."""
     return lambda episode: float(count_of(episode) > 0.0)
@@ -360,7 +365,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions_vehicle": Metric("", False, collisions_with("vehicle")),
         "collisions_wall": Metric("", False, collisions_with("wall")),
         "collisions_object": Metric("", False, collisions_with("object")),
-        "walked_into": Metric("", None, lambda episode: float(len(episode.walked_into))),
+        "walked_into": Metric("", None, walked_into),
         "pedestrian_collision": Metric(
             "", False, any_of(collisions_with("pedestrian")), share=True
         ),

@@ -18,6 +18,7 @@ import numpy as np
 from cosim.core.errors import RunError, SpecError
 from cosim.core.files import read_limited, write_atomic
 from cosim.core.geometry import Floats
+from cosim.core.state import Motion
 from cosim.episode.command_delay import CommandDelay
 from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import nonstandard
@@ -26,6 +27,7 @@ from cosim.results.log import COLUMNS, Log, Tick
 from cosim.results.referee import Ended, Failure, Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.results.traffic import RoadState
+from cosim.results.walked import walked_m
 from cosim.spec.episode_id import episode_id_of
 from cosim.spec.injection import Injected
 from cosim.spec.manifest import Manifest
@@ -140,7 +142,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     reason: why the episode crashed or is invalid
     ended: None if the episode did not end; then there is neither trajectory nor measure, and ticks,
         state hash, failures and events are those before the crash
-    walked_into: contacts with people who walked into the resting robot; not failures
+    walked_into: contacts with people who walked into the resting robot, and the falls that
+        followed (`Failure.kind`); not failures
     injections: pedestrians injected from outside; needed for a replay
     clock: wall times, not reproducible, and answer times of a policy in another process
 
@@ -237,9 +240,17 @@ RECORD_FILE = FlatFile(
 """Layout of record.json: flat, for compatibility with files written before `Record` had parts."""
 
 
+def _legs_of(motion: Motion) -> tuple[float, ...]:
+    """Return what the state hash holds of a robot with legs; nothing on wheels."""
+    legs = motion.robot.legs
+    if legs is None:
+        return ()
+    return (*legs.angles_rad, legs.roll_rad, legs.pitch_rad, float(motion.down))
+
+
 class StateHash:
     """Running hash of the simulated state: robot, people, vehicles, signals and contacts at each
-    tick."""
+    tick. With legs the robot's part includes joint angles, roll, pitch and `Motion.down`."""
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=16)
@@ -250,7 +261,7 @@ class StateHash:
         street = step.street_after
         for array in (
             np.array([*robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad]),
-            np.array(() if robot.legs is None else robot.legs.angles_rad),
+            np.array(_legs_of(step.motion)),
             step.motion.trace,
             street.people.xy,
             street.people.heading,
@@ -270,6 +281,7 @@ class Recorder:
     """Collects the steps of an episode into a Log.
 
     columns: columns that are recorded; the arrays of all others are empty.
+    cycle_s: duration of a gait cycle, 0 on wheels. With legs poses are always recorded.
     """
 
     PEOPLE_EVERY_TICKS = 20
@@ -280,10 +292,13 @@ class Recorder:
         tick_s: float,
         footprint_m: tuple[float, float],
         columns: Iterable[str] = tuple(COLUMNS),
+        cycle_s: float = 0.0,
     ) -> None:
         self._tick_s = tick_s
+        self._cycle_s = cycle_s
+        names = dict.fromkeys([*columns, *(("pose", "reset_s_m") if cycle_s else ())])
         self._footprint_m = footprint_m
-        self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in columns}
+        self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in names}
         self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
         self.ticks = 0
@@ -314,9 +329,16 @@ class Recorder:
         """
         people = np.array(self._people, dtype=float).reshape(-1, 5)
         plan_sizes, plan_points, plan_index = commands.plans
+        columns = {
+            name: column.array(self._values.get(name, ())) for name, column in COLUMNS.items()
+        }
+        if self._cycle_s:
+            columns["travelled_m"] = walked_m(
+                columns["pose"][:, :2], columns["reset_s_m"], self._cycle_s / self._tick_s
+            )
         return Log(
             tick_s=self._tick_s,
-            **{name: column.array(self._values.get(name, ())) for name, column in COLUMNS.items()},
+            **columns,
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_kind=people[:, 3].astype(np.int8),

@@ -13,8 +13,9 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   has collided.
 - out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
 - fall: for 0.1 s a robot with legs was down (`Motion.down`): its trunk leaned by more than 60
-  degrees, touched the ground, or was below 0.45 of its height at rest. A fall within 1 s after a
-  person walked into the robot is no failure and is recorded with `walked_into`; the robot is reset.
+  degrees, touched the ground, or was below 0.45 of its height at rest. A fall within 1 s after the
+  last contact with a person who walked into the robot is no failure. It is recorded with
+  `walked_into`; the robot is reset.
   A collision or fall resets the robot, so that the one that follows from the other is not counted.
 - freezing, if the episode does not end on a failure: for 10 s the robot was never 0.5 m away from
   its position at their beginning. Waiting before a red crossing of the route does not count. In a
@@ -25,12 +26,15 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
 - The goal is reached within its radius at the end of the route. It is also reached at any arc
   length if walkable ground leads straight to it: the robot skipped a part of the route. If the
   route passes its goal before its end (a loop), only its end counts.
+- A robot that is down reaches no goal and makes no stop.
 - If an episode ends at a stop (`gesturing`), stopping within 3 m in front of the pedestrian for 2 s
   succeeds. Passing the pedestrian fails.
 - After a failure the robot is reset to the nearest free waypoint of the route, heading along it.
   Waypoints are every 5 m, never on a crossing, at an obstacle or at the goal. After 3 failures
   within 10 m of the route, it is reset to the first free waypoint at least 1 m beyond them, or
   between waypoints if none is free.
+- After a fall at a person's fault it is reset to the nearest free place of the route that is not
+  beyond the fall. Such a fall does not count towards the 3 failures.
 - The jump counts neither as travel nor as progress.
 """
 
@@ -59,13 +63,16 @@ from cosim.spec.scenario import Scenario
 
 FALL_S = 0.1
 """Time, seconds, that a robot is down before it has fallen."""
-_PUSHED_S = 1.0
-"""Time, seconds, after a person walked into the robot in which a fall is the person's fault."""
+PUSHED_S = 1.0
+"""Time, seconds, after contact with a person who walked into the robot in which a fall is the
+person's fault."""
+_NOT_PUSHED: tuple[float, str] = (-math.inf, "")
+"""Tick and id of the last push, of a robot that no person has pushed."""
 FREEZE_WINDOW_S = 10.0
 FREEZE_MOVE_M = 0.5
 _ROUNDING_M = 1e-6
 _APART_M = 0.1
-_APART_S = 1.0
+APART_S = 1.0
 WAYPOINT_STEP_M = 5.0
 FREE_OF_PEOPLE_M = 1.0
 FREE_OF_VEHICLES_M = 4.0
@@ -74,7 +81,8 @@ _SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
 _BEYOND_M = 1.0
 _BETWEEN_M = 0.1
-"""Spacing, metres, of reset positions that are tried if no waypoint beyond the failures is free."""
+"""Spacing, metres, of reset positions between waypoints: after a fall at a person's fault, and if
+no waypoint beyond the failures is free."""
 _GOAL_MARGIN_M = 0.2
 """Least distance, metres, between a reset position and the goal's circle."""
 RED_WAIT_M = 4.0
@@ -110,6 +118,11 @@ class Failure:
     other: str = ""
     other_kind: str = ""
     fault: Fault | None = None
+
+    @property
+    def suffered(self) -> str:
+        """What a person at fault did to the robot, in words before "by"."""
+        return "pushed over" if self.kind == "fall" else "walked into"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +162,7 @@ class Referee:
         self._walked_into: set[str] = set()
         self._still_ticks = self._spot_ticks = 0
         self._down_ticks = 0
-        self._pushed: tuple[float, str] = (-math.inf, "")
+        self._pushed = _NOT_PUSHED
         self._window = FreezeWindow(clock)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
@@ -163,7 +176,7 @@ class Referee:
         contacts = self._contacts(step)
         into = tuple(contact for contact in contacts if contact.fault == "pedestrian_at_fault")
         failures = tuple(contact for contact in contacts if contact.fault != "pedestrian_at_fault")
-        fallen = self._fall(step, into)
+        fallen = self._fall(step)
         failures = failures or self._out_of_lane(step)
         if fallen is not None and not failures:
             if fallen.fault is None:
@@ -184,26 +197,32 @@ class Referee:
         return Verdict(failures, into, reset, None, red, waits)
 
     def _put_back(self, failure: Failure, step: Step) -> Reset:
-        """Return the reset after a failure, and forget what happened before it."""
-        reset = self._reset(failure, step)
+        """Return the reset after a failure or fall, and forget what happened before it."""
+        pushed = failure.fault == "pedestrian_at_fault"
+        reset = self._back_at(failure, step) if pushed else self._reset(failure, step)
         self._window.clear()
         self._entered.clear()
-        self._down_ticks = 0
+        self._down_ticks = self._stopped_ticks = 0
+        self._pushed = _NOT_PUSHED
         return reset
 
-    def _fall(self, step: Step, into: tuple[Failure, ...]) -> Failure | None:
-        """Return the fall of a robot with legs in a tick. into: people who walk into it now."""
-        if into:
-            self._pushed = step.tick, into[0].other
+    def _fall(self, step: Step) -> Failure | None:
+        """Return the fall of a robot with legs in a tick."""
+        for contact in step.motion.contacts:
+            if contact.other in self._walked_into:
+                self._pushed = step.tick, contact.other
         self._down_ticks = self._down_ticks + 1 if step.motion.down else 0
         if self._down_ticks <= self._clock.ticks(FALL_S):
             return None
         since, person = self._pushed
-        if step.tick - since > self._clock.ticks(_PUSHED_S):
+        if step.tick - since > self._clock.ticks(PUSHED_S):
             return self._failure("fall", step)
         return self._failure("fall", step, person, "pedestrian", "pedestrian_at_fault")
 
     def _end(self, step: Step) -> Ended | None:
+        if step.motion.down:
+            self._stopped_ticks = 0
+            return "timeout" if step.tick + 1 >= self._limit_ticks else None
         if self._scenario.ends_at == "stop":
             return self._end_by_stop(step)
         pose = step.motion.robot.pose
@@ -287,7 +306,7 @@ class Referee:
         for other, last_tick in list(self._touching.items()):
             if gaps.get(other, np.inf) <= _APART_M or other in near_vehicles:
                 self._touching[other] = step.tick
-            elif (step.tick - last_tick) * self._clock.tick_s > _APART_S:
+            elif (step.tick - last_tick) * self._clock.tick_s > APART_S:
                 del self._touching[other]
                 self._walked_into.discard(other)
 
@@ -347,14 +366,29 @@ class Referee:
             fault,
         )
 
+    @property
+    def _last_m(self) -> float:
+        """Return the largest arc length, metres, of a reset before the goal."""
+        return max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
+
+    def _back_at(self, fall: Failure, step: Step) -> Reset:
+        """Return the reset after a fall at a person's fault: the nearest free place of the route,
+        not beyond the fall."""
+        begin_m = min(fall.route_s_m, self._last_m)
+        places = np.append(np.arange(begin_m, 0.0, -_BETWEEN_M), 0.0)
+        clear = self._clear(places)
+        if (found := self._first_free(clear, step)) is not None:
+            return found
+        s_m = float(clear[0] if len(clear) else places[0])
+        return Reset(self._route.at(s_m), s_m)
+
     def _reset(self, failure: Failure, step: Step) -> Reset:
         self._failed_at_s.append(failure.route_s_m)
         recent = self._failed_at_s[-SAME_PLACE_FAILURES:]
         stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= _SAME_PLACE_M
         count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
-        last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
         waypoints = np.arange(count, dtype=np.float64) * WAYPOINT_STEP_M
-        waypoints = waypoints[waypoints <= last_m]
+        waypoints = waypoints[waypoints <= self._last_m]
         clear = self._clear(waypoints)
         waypoints = clear if len(clear) else waypoints
         if stuck:

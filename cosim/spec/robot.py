@@ -44,6 +44,11 @@ class Skid:
         """Height in metres of the point about which the robot leans: the ground."""
         return 0.0
 
+    @property
+    def cycle_s(self) -> float:
+        """Duration of a gait cycle: 0, without a gait."""
+        return 0.0
+
 
 @dataclass(frozen=True, slots=True)
 class Legs:
@@ -59,7 +64,7 @@ class Legs:
     trunk: links that touch the ground only in a fall; "base" is the base link.
     stand_m: height of the base link's frame above the ground at rest.
     span_m: length and width of the rectangle of the feet at rest.
-    cycle_s: duration of a gait cycle, over which speeds are averaged.
+    cycle_s: duration of a gait cycle, over which speeds and positions are averaged.
     gait: row of `physics.dynamics.legs.GAITS`.
     weights: SHA-256 of the gait's published network, "" without one.
     """

@@ -68,7 +68,7 @@ class LiveEpisode:
         street = step.street_after
         robot = step.motion.robot
         news = [f"{failure.kind} {failure.other}".strip() for failure in verdict.failures]
-        news += [f"walked into by {contact.other}" for contact in verdict.walked_into]
+        news += [f"{contact.suffered} by {contact.other}" for contact in verdict.walked_into]
         for event, state in zip(self._scenario.events, step.events.states, strict=True):
             if state.phase == "acting" and event.id not in self._acting:
                 self._acting.add(event.id)

@@ -44,7 +44,8 @@ class Scorer:
         self._clock = clock
         footprint_m = self._footprint_m = robot.footprint_m
         self._referee = Referee(scenario, area, footprint_m, clock)
-        self._recorder = Recorder(clock.tick_s, footprint_m)
+        self._cycle_s = robot.drive.cycle_s
+        self._recorder = Recorder(clock.tick_s, footprint_m, cycle_s=self._cycle_s)
         self._monitor = EventMonitor(scenario, kinds, robot, hidden, clock.tick_ms)
         self._traffic = TrafficMonitor(street_map, clock.tick_s)
         self._failures: list[Failure] = []
@@ -60,7 +61,9 @@ class Scorer:
     def measure_briefly(self) -> None:
         """Record only what the measures of a search need. Call it before the first Step."""
         self._measures = BRIEF
-        self._recorder = Recorder(self._clock.tick_s, self._footprint_m, BRIEF_COLUMNS)
+        self._recorder = Recorder(
+            self._clock.tick_s, self._footprint_m, BRIEF_COLUMNS, self._cycle_s
+        )
 
     @property
     def is_lost(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -20,7 +21,7 @@ from cosim.spec.robot import ROBOTS, Legs, robot_called
 from cosim.spec.scenario import Scenario, Suite
 from physics.dynamics.bullet import p
 from scenarios.episodes.episode import Episode
-from scenarios.episodes.replay import RecordedEpisode, replay_state_hash
+from scenarios.episodes.replay import RecordedEpisode, ReplayChecker, replay_state_hash
 from scenarios.episodes.wiring import StagedScenario
 from scenarios.tools.verify.doctor import small_scenario
 
@@ -90,10 +91,14 @@ def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_walks_on(
 
 
 def test_a_walk_replays_to_the_same_state_hash(scenario: Scenario, robot: str) -> None:
-    """Without a push it does not fall, and run again it has the same hash."""
+    """Without a push it does not fall, it travels the way between its first and last pose, and run
+    again it has the same hash."""
     episode = walked(scenario, robot, 0.0)
+    straight_m = math.dist(episode.log.pose[0, :2], episode.log.pose[-1, :2])
+    assert episode.record.measures["path_length_m"] == pytest.approx(straight_m, rel=0.02)
     assert episode.record.measures["falls"] == 0.0
-    assert replay_state_hash(episode) == episode.record.state_hash
+    check = ReplayChecker(Path("run"), episode).watch
+    assert replay_state_hash(episode, check) == episode.record.state_hash
 
 
 def test_a_body_that_flies_makes_the_episode_invalid_with_the_engines_values(

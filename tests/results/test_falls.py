@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
+from cosim.cli.results import print_episode
+from cosim.core.errors import RunError
+from cosim.core.state import LegState
 from cosim.episode.loop import Step
 from cosim.results.log import Log
-from cosim.results.metrics import compute_metrics
-from cosim.results.referee import Failure
+from cosim.results.metrics import EpisodeFacts, compute_metrics
+from cosim.results.record import Record, StateHash
+from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.rejudge import contradictions
+from cosim.spec.scenario import Scenario
 from tests.results.test_metrics import episode, log
-from tests.results.test_referee import judge_all, people, referee, step, stood, touch
+from tests.results.test_referee import (
+    judge_all,
+    people,
+    referee,
+    step,
+    stood,
+    stopping_hand,
+    touch,
+)
 from tests.support.driven_runs import driven, episode_of, failure_at, short_way
 
 
@@ -57,6 +73,100 @@ def test_a_robot_that_a_person_pushes_over_has_not_failed(ends: bool) -> None:
     assert (verdict.failures, verdict.ended) == ((), None) and verdict.reset is not None
 
 
+def pushed_over(one: Referee, from_tick: int, ticks: int = 3) -> Verdict:
+    """A person walks into the standing robot, which then lies; the verdict of the last tick."""
+    who = people((20.5, 0.0), heading=math.pi, speed=1.3)
+    stood(one, from_tick)
+    one.judge(step(from_tick, 20.0, speed=0.0, contacts=[touch("c0")], who=who))
+    lying = (down(step(from_tick + k, 20.0, speed=0.0, who=who)) for k in range(1, ticks + 1))
+    return judge_all(one, [*lying])[-1]
+
+
+def test_a_robot_that_was_put_back_was_not_pushed() -> None:
+    """A fall right after the reset that follows a push is the robot's own."""
+    one = referee(ends_on_failure=False)
+    assert pushed_over(one, 19).reset is not None
+    verdict = judge_all(one, [down(step(t, 15.0)) for t in (23, 24, 25)])[-1]
+    assert [failure.kind for failure in verdict.failures] == ["fall"]
+
+
+@pytest.mark.parametrize(("contact_ends", "kind"), [(59, "pushed"), (30, "failed")])
+def test_a_push_lasts_as_long_as_the_person_touches_the_robot(contact_ends: int, kind: str) -> None:
+    """A fall more than 1 s after the contact began is the person's while the contact continues, and
+    the robot's own 1 s after its end."""
+    who = people((20.5, 0.0), heading=math.pi, speed=1.3)
+    one = referee(ends_on_failure=False)
+    stood(one, 19)
+    for tick in range(19, 60):
+        held = [touch("c0")] if tick <= contact_ends else []
+        one.judge(step(tick, 20.0, speed=0.0, contacts=held, who=who))
+    verdict = judge_all(one, [down(step(t, 20.0, speed=0.0, who=who)) for t in (60, 61, 62)])[-1]
+    assert bool(verdict.failures) == (kind == "failed")
+    assert bool(verdict.walked_into) == (kind == "pushed")
+
+
+def test_a_robot_that_is_down_reaches_no_goal() -> None:
+    """It slides into the goal while it falls: the fall is counted, and no goal is reached."""
+    one = referee(ends_on_failure=True)
+    verdicts = judge_all(one, [down(step(t, 99.8 + 0.1 * t)) for t in range(3)])
+    assert [verdict.ended for verdict in verdicts] == [None, None, "failure"]
+
+
+def test_a_robot_that_is_down_makes_no_stop() -> None:
+    """The time stopped before a person counts from when it is up again."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    before = [step(t, 9.2, speed=0.0, events=reply) for t in range(39)]
+    assert judge_all(one, before)[-1].ended is None
+    assert one.judge(down(step(39, 9.2, speed=0.0, events=reply))).ended is None
+    later = [step(40 + t, 9.2, speed=0.0, events=reply) for t in range(40)]
+    ended = [verdict.ended for verdict in judge_all(one, later)]
+    assert ended == [None] * 39 + ["stop"]
+
+
+@pytest.mark.parametrize("x_m", [18.0, 23.0])
+def test_a_push_gains_no_way(x_m: float) -> None:
+    """The robot that a person pushed over continues where it fell, or behind it where the person
+    stands, also if the nearest waypoint is ahead and however often it is pushed."""
+    one = referee(ends_on_failure=False)
+    for again in range(4):
+        begin = again * 40
+        who = people((x_m + 0.5, 0.0), heading=math.pi, speed=1.3)
+        for tick in range(begin, begin + 25):
+            one.judge(step(tick, x_m, speed=0.0, who=people((50.0, 0.0))))
+        hit = [touch("c0")]
+        one.judge(step(begin + 25, x_m, speed=0.0, contacts=hit, who=who))
+        ticks = [down(step(begin + k, x_m, speed=0.0, who=who)) for k in (26, 27, 28)]
+        verdict = judge_all(one, ticks)[-1]
+        assert not verdict.failures and verdict.reset is not None
+        assert x_m - 0.7 < verdict.reset.route_s_m <= x_m - 0.5
+        gone = people((60.0, 0.0))
+        for tick in range(begin + 29, begin + 40):
+            one.judge(step(tick, x_m, speed=0.0, who=gone))
+    own = judge_all(one, [down(step(160 + t, x_m)) for t in range(3)])[-1]
+    assert own.failures and own.reset is not None and abs(own.reset.route_s_m - x_m) < 2.6
+
+
+def test_a_state_hash_holds_the_attitude_of_the_trunk() -> None:
+    """Roll, pitch and lying change the hash with legs; on wheels it is as it always was."""
+
+    def hash_of(one: Step) -> str:
+        found = StateHash()
+        found.add(one)
+        return found.hexdigest()
+
+    def walking(roll_rad: float, pitch_rad: float, knee_rad: float) -> Step:
+        one = step(0, 20.0)
+        legs = LegState(roll_rad, pitch_rad, (0.0, knee_rad))
+        robot = dataclasses.replace(one.motion.robot, legs=legs)
+        return dataclasses.replace(one, motion=dataclasses.replace(one.motion, robot=robot))
+
+    upright = walking(0.0, 0.0, 0.0)
+    others = [walking(*row) for row in np.eye(3).tolist()]
+    assert len({hash_of(one) for one in (upright, down(upright), *others)}) == 5
+    assert hash_of(step(0, 20.0)) == "d1c778b35eb57669455504ff5ec1cef4"
+
+
 def with_legs(one: Log, ticks_down: range) -> Log:
     rows = np.zeros((len(one), 16), np.float32)
     rows[list(ticks_down), 0] = 1.0
@@ -66,7 +176,7 @@ def with_legs(one: Log, ticks_down: range) -> Log:
 def test_falls_follow_from_the_trajectory() -> None:
     """A recorded fall is where the robot was down for 0.1 s; one that is left out or added
     contradicts the trajectory."""
-    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     walked = with_legs(driven(way, [1.0] * 100, {30: 0.0}), range(28, 31))
     fall = failure_at(walked, 30, "fall")
     record = msgspec.structs.replace(
@@ -90,3 +200,123 @@ def test_wheels_have_no_number_of_falls() -> None:
     fallen = compute_metrics(episode(with_legs(walked, range(0)), fall))
     assert (fallen["falls"], fallen["failures"]) == (1.0, 1.0)
     assert fallen["falls_per_100m"] == fallen["failures_per_100m"] == pytest.approx(1.0)
+
+
+def test_the_goal_of_a_robot_that_is_down_contradicts_the_trajectory() -> None:
+    """The goal is reached in the last tick, and not if the robot is down in it."""
+    way = short_way("s", robot="dog")
+    record, reached = episode_of(way, "h")
+    assert reached is not None
+    assert [*contradictions(record, way, with_legs(reached, range(0)))] == []
+    lying = with_legs(reached, range(len(reached) - 1, len(reached)))
+    assert [one.what for one in contradictions(record, way, lying)] == ["ended"]
+
+
+def test_a_reset_beyond_a_pushed_fall_contradicts_the_trajectory() -> None:
+    """A push gains no way, in a record neither."""
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
+    for to_m, contradicted in ((1.0, 0), (4.0, 1)):
+        walked = with_legs(driven(way, [1.0] * 30 + [0.0] * 70, {65: to_m}), range(63, 66))
+        walked = with_person(walked, range(100))
+        assert len([*contradictions(pushed(way, walked, 55, 65), way, walked)]) == contradicted
+
+
+def with_person(one: Log, near: range) -> Log:
+    """The log with a person at the robot in some ticks, and far away in the others."""
+    clearance_m = np.full(len(one), 3.0)
+    clearance_m[list(near)] = 0.05
+    return dataclasses.replace(one, clearance_m=clearance_m)
+
+
+def pushed(way: Scenario, log: Log, contact: int, fall: int) -> Record:
+    """The record of a robot that a person walks into and pushes over, at these ticks."""
+    into = {"other": "c0", "other_kind": "pedestrian", "fault": "pedestrian_at_fault"}
+    found = [
+        dataclasses.replace(failure_at(log, tick, kind), **into)  # type: ignore[arg-type]
+        for tick, kind in ((contact, "collision"), (fall, "fall"))
+    ]
+    return msgspec.structs.replace(
+        episode_of(way, "h")[0],
+        status="done",
+        ended="timeout",
+        ticks=len(log),
+        walked_into=tuple(found),
+    )
+
+
+def test_a_push_follows_from_the_trajectory() -> None:
+    """Only a person near who walked into the standing robot less than 1 s before, or stayed near
+    until then, may have pushed it over."""
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
+    speeds = [1.0] * 10 + [0.0] * 90
+
+    def found(contact: int, near_until: int, fall: int = 60) -> list[str]:
+        walked = with_legs(driven(way, speeds, {fall: 0.0}), range(fall - 2, fall + 1))
+        walked = with_person(walked, range(min(contact, 60), near_until + 1))
+        record = pushed(way, walked, contact, fall)
+        return [one.what for one in contradictions(record, way, walked)]
+
+    assert found(40, 40) == found(30, 40) == []
+    contradicted = ["walked_into: fall at tick 60"]
+    assert found(39, 39) == found(30, 39) == found(61, 99) == contradicted
+    assert found(29, 99) == found(50, 49) == contradicted
+
+
+def test_a_fall_of_the_robot_is_not_a_push() -> None:
+    """A failure that is moved to `walked_into` contradicts the trajectory, in the last tick by the
+    end that it had."""
+    way = short_way("s", robot="dog", ends_on_failure=True)
+    walked = with_person(with_legs(driven(way, [0.0] * 50), range(47, 50)), range(50))
+    fall = failure_at(walked, 49, "fall")
+    record = msgspec.structs.replace(
+        episode_of(way, "h")[0], status="done", ended="failure", ticks=50, failures=(fall,)
+    )
+    assert [*contradictions(record, way, walked)] == []
+    forged = msgspec.structs.replace(pushed(way, walked, 40, 49), ended="failure")
+    assert [one.what for one in contradictions(forged, way, walked)] == ["ended"]
+    moved = msgspec.structs.replace(forged, walked_into=(forged.walked_into[1],), ended="timeout")
+    assert {one.what for one in contradictions(moved, way, walked)} == {
+        "walked_into: fall at tick 49",
+        "ended",
+    }
+
+
+def test_a_fall_on_wheels_contradicts_the_trajectory() -> None:
+    """A robot on wheels has none, at whoever's fault."""
+    way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
+    rolled = with_person(driven(way, [0.0] * 100, {60: 0.0}), range(100))
+    found = [one.what for one in contradictions(pushed(way, rolled, 50, 60), way, rolled)]
+    assert found == ["falls at tick 60"]
+
+
+def test_a_trajectory_without_the_columns_of_the_legs_is_not_of_the_robot(tmp_path: Path) -> None:
+    """A robot with legs has four columns and one per joint, a robot on wheels none; an array of
+    one dimension is no trajectory."""
+    for robot, columns, contradicted in (
+        ("dog", 16, []),
+        ("dog", 0, ["columns of legs"]),
+        ("dog", 15, ["columns of legs"]),
+        ("courier", 16, ["columns of legs"]),
+        ("courier", 0, []),
+    ):
+        way = short_way("s", robot=robot)
+        record, reached = episode_of(way, "h")
+        assert reached is not None
+        walked = dataclasses.replace(reached, legs=np.zeros((len(reached), columns), np.float32))
+        assert [one.what for one in contradictions(record, way, walked)] == contradicted
+    path = tmp_path / "trajectory.npz"
+    flat = dataclasses.replace(reached, legs=np.zeros(len(reached), np.float32))
+    path.write_bytes(flat.encoded())
+    with pytest.raises(RunError, match="'legs' is float32"):
+        Log.load(path)
+
+
+def test_a_push_over_is_one_contact_and_is_shown_as_a_push() -> None:
+    """`walked_into` counts the contact alone; the episode is printed with both."""
+    way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
+    walked = with_legs(driven(way, [0.0] * 100, {60: 0.0}), range(58, 61))
+    record = pushed(way, walked, 45, 60)
+    assert compute_metrics(EpisodeFacts.of(record, way, walked))["walked_into"] == 1.0
+    text = io.StringIO()
+    print_episode(Console(file=text, width=120), record)
+    assert "walked into by c0" in text.getvalue() and "pushed over by c0" in text.getvalue()

@@ -17,7 +17,9 @@ from cosim.results.metrics import EpisodeFacts, compute_metrics
 from cosim.results.record import Record
 from cosim.results.referee import Failure
 from cosim.results.run_folder import RunFolder
+from cosim.results.walked import walked_m
 from cosim.spec.manifest import Manifest
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.logs import log_with
 from tests.run_specs import record_of, spec_of
@@ -63,13 +65,16 @@ def driven(
             x_m = before_m = reset_s_m[k] = resets[k]
     away_m = np.hypot(pose[:, 0] - 4.0, 1.5)
     speeds = np.column_stack([speeds_mps, np.zeros(count)])
+    travelled_m = np.abs(speeds_mps) * tick_s
+    if cycle_s := robot_called(scenario.robot).drive.cycle_s:
+        travelled_m = walked_m(pose[:, :2], reset_s_m, cycle_s / tick_s)
     return log_with(
         count,
         pose=pose,
         speed=speeds,
         command=speeds,
         route_s_m=route_s_m,
-        travelled_m=np.abs(speeds_mps) * tick_s,
+        travelled_m=travelled_m,
         person_m=away_m,
         clearance_m=away_m - 0.6,
         collision_in_s=np.full(count, np.inf),

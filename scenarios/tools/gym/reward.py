@@ -32,7 +32,7 @@ class Transition:
     nearest_person_m: least distance between the centres of robot and a person, infinite without
     people.
     failures: failures that the referee counts.
-    walked_into: contacts that are the fault of people.
+    walked_into: contacts and falls that are the fault of people (`Failure.kind`).
     red_light_entries: crossings entered at red.
     ended: reason for the end of the episode, if it ended.
     """

@@ -327,8 +327,8 @@ class _Reel:
             self._counts[failure.kind] += 1
             other = f" with {failure.other_kind}" if failure.other_kind else ""
             self._say(step.tick, failure.kind.replace("_", " ") + other, hud.BAD)
-        if verdict.walked_into:
-            self._say(step.tick, "walked into by pedestrian", hud.INK)
+        for contact in verdict.walked_into:
+            self._say(step.tick, f"{contact.suffered} by pedestrian", hud.INK)
         if verdict.ended == "goal":
             self._say(step.tick, "goal", hud.GOOD)
 

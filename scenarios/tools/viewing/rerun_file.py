@@ -395,7 +395,7 @@ class _Tape:
         for failure in verdict.failures:
             other = f" with {failure.other_kind} {failure.other}" if failure.other else ""
             said.append((f"{failure.kind}{other}", "ERROR"))
-        said += [(f"walked into by {contact.other}", "WARN") for contact in verdict.walked_into]
+        said += [(f"{one.suffered} by {one.other}", "WARN") for one in verdict.walked_into]
         if verdict.ended is not None:
             said.append((f"ended: {verdict.ended}", "INFO"))
         for words, level in said:
