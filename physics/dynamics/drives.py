@@ -21,9 +21,8 @@ def gait_drive(robot: Robot, gait: str, dt_s: float = SUBSTEP_S) -> Drive:
     Raises UsageError or SpecError for a missing, invalid or unsuitable file.
     """
     legs = robot_legs(robot, gait)
-    return LegDrive(
-        robot, legs, dt_s, network_gait(robot, legs, dt_s, user_gait(gait, robot, dt_s))
-    )
+    walk = network_gait(robot, legs, dt_s, user_gait(gait, robot, dt_s))
+    return LegDrive(robot, legs, dt_s, walk, of_user=True)
 
 
 def gait_hash(gait: str, robot: Robot) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import subprocess
 import sys
@@ -14,16 +15,17 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
-from cosim.core.errors import CosimError, PolicyError, SpecError, UsageError
+from cosim.core.errors import CosimError, EngineError, PolicyError, SpecError, UsageError
 from cosim.core.state import Command
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.spec.robot import COURIER, DOG, WALKER, Legs
 from physics.dynamics.drive import SUBSTEP_S, BodyNow
-from physics.dynamics.drives import gait_drive
+from physics.dynamics.drives import drive_of, gait_drive
 from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
 from physics.dynamics.legs.gait_graph import network_of_graph
 from physics.dynamics.legs.kinematics import centre_of_mass, link_frames
+from physics.dynamics.legs.leg_drive import LegDrive
 from physics.dynamics.legs.network import (
     Dense,
     Lstm,
@@ -315,6 +317,37 @@ def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy
     drive = gait_drive(DOG, f"onnx:{written_gait(tmp_path, joints=strong)}")
     with pytest.raises(PolicyError, match=r"joint front_left_hip is .* Nm; its limit is 23.7 Nm"):
         drive.step(Command(1.0, 0.0), still_body())
+
+
+class Fixed:
+    """A gait of constant torques."""
+
+    cycle_s = 0.2
+
+    def __init__(self, torque_nm: float) -> None:
+        self._torques_nm = [torque_nm] * 12
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, command: Command, body: BodyNow) -> list[float]:
+        return self._torques_nm
+
+
+def test_a_shipped_gait_is_clamped_and_its_failures_are_errors_of_the_engine() -> None:
+    """A tumbling robot demands far more than the limits; NaN is no fault of a policy."""
+    assert isinstance(DOG.drive, Legs)
+    tumbles = still_body(speeds_radps=(1e4,) * 12)
+    torques = drive_of(DOG, SUBSTEP_S).step(Command(1.0, 0.0), tumbles).values
+    assert torques == [-most for most in DOG.drive.torque_nm]
+    for torque_nm in (math.inf, -math.inf):
+        strong = LegDrive(DOG, DOG.drive, SUBSTEP_S, Fixed(torque_nm))
+        assert strong.step(Command(1.0, 0.0), still_body()).values[0] == math.copysign(
+            23.7, torque_nm
+        )
+    broken = LegDrive(DOG, DOG.drive, SUBSTEP_S, Fixed(math.nan))
+    with pytest.raises(EngineError, match="torque of joint front_left_hip is nan Nm"):
+        broken.step(Command(1.0, 0.0), still_body())
 
 
 def test_the_posture_of_the_walker_at_rest_is_balanced() -> None:
