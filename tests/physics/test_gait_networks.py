@@ -18,6 +18,7 @@ from onnx import helper
 from cosim.core.errors import CosimError, EngineError, PolicyError, SpecError, UsageError
 from cosim.core.state import Command
 from cosim.policies.onnx.graph import Graph
+from cosim.policies.onnx.manifest import file_facts
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.spec.robot import COURIER, DOG, WALKER, Legs
 from physics.dynamics.drive import SUBSTEP_S, BodyNow
@@ -138,7 +139,7 @@ def test_arrays_of_a_network_make_it_again() -> None:
         ({"2.linear.bias": normal(1, 11)}, r"layer 2 has a weight \(32, 12\) and a bias \(11,\)"),
         ({"1.elu.weight": normal(1, 63, 32)}, "layer 1 takes 63 numbers, and layer 0 has 64"),
         ({"1.elu.bias": np.full(32, np.nan, np.float32)}, "layer 1 has weights that are NaN"),
-        ({"1.elu.bias": np.zeros(32)}, "layer 1 has float32 and float64; wanted is float32"),
+        ({"1.elu.bias": np.zeros(32)}, "layer 1 has float32 and float64; expected float32"),
     ):
         with pytest.raises(ValueError, match=why):
             network_of(whole | change)
@@ -262,7 +263,7 @@ def test_graphs_of_another_form_are_refused() -> None:
             },
             r"kp must be in \[0, 2000\]",
         ),
-        ({"files": {"tiny.onnx": {"bytes": 7, "blake2b": "0" * 64}}}, "wanted is tiny.onnx"),
+        ({"files": {"tiny.onnx": {"bytes": 7, "blake2b": "0" * 64}}}, "expected tiny.onnx"),
     ],
     ids=["unknown", "missing", "rate", "sizes", "term", "robot", "model", "gain", "hash"],
 )
@@ -290,6 +291,23 @@ def test_a_gait_is_named_by_its_graph(tmp_path: Path) -> None:
     path.with_suffix(".json").unlink()
     with pytest.raises(SpecError, match=r"tiny\.json: cannot be read"):
         user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
+
+
+@pytest.mark.parametrize("wrong", ["bytes", "blake2b", "sha256"])
+@pytest.mark.parametrize("names", [("blake2b",), ("sha256",), ("blake2b", "sha256")])
+def test_each_hash_that_a_manifest_gives_is_checked(
+    tmp_path: Path, names: tuple[str, ...], wrong: str
+) -> None:
+    """The right file loads by either hash; another size or hash is refused."""
+    facts = file_facts(layers_graph())
+    given: dict[str, Any] = {"bytes": facts.bytes, **{name: facts.hashes[name] for name in names}}
+    path = written_gait(tmp_path, files={"tiny.onnx": given})
+    assert user_gait(f"onnx:{path}", DOG, SUBSTEP_S).network.sizes == (45, 12)
+    if wrong in given:
+        given[wrong] = 1 if wrong == "bytes" else "0" * 64
+        path = written_gait(tmp_path, files={"tiny.onnx": given})
+        with pytest.raises(UsageError, match=r"tiny\.onnx: .* bytes, .*; expected tiny\.onnx: "):
+            user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
 
 
 def still_body(**changes: Any) -> BodyNow:
@@ -380,7 +398,7 @@ def test_a_walker_without_weights_says_where_they_are_to_be_had(
     assert "`python -m physics.dynamics.legs.walker motion.pt`" in said and "\n" not in said
     assert weights_in_words(WALKER) == ", weights missing (walker.npz)"
     (tmp_path / "walker.npz").write_bytes(b"another")
-    with pytest.raises(UsageError, match=r"walker\.npz: 7 bytes, .*wanted is walker\.npz"):
+    with pytest.raises(UsageError, match=r"walker\.npz: 7 bytes, .*expected walker\.npz"):
         published_gait(WALKER, WALKER.drive, SUBSTEP_S)
 
 
@@ -396,9 +414,7 @@ def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> Non
 def test_another_file_makes_no_arrays(tmp_path: Path) -> None:
     """Neither another file, nor arrays of another network."""
     (tmp_path / "motion.pt").write_bytes(b"no weights")
-    with pytest.raises(
-        UsageError, match=r"motion\.pt: 10 bytes, .*wanted is motion\.pt of unitree"
-    ):
+    with pytest.raises(UsageError, match=r"motion\.pt: 10 bytes, .*expected motion\.pt of unitree"):
         WALKER_NETWORK.write(tmp_path / "motion.pt", tmp_path)
     with pytest.raises(ValueError, match=r"has no 'memory\.weight_ih_l0'"):
         walker_network({})
