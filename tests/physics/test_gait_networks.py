@@ -324,7 +324,7 @@ def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy
 ) -> None:
     """They name the gait or the joint, and the limit."""
     path = written_gait(tmp_path, layers_graph(scale=1e30))
-    drive = gait_drive(DOG, f"onnx:{path}")
+    drive = gait_drive(DOG, user_gait(f"onnx:{path}", DOG, SUBSTEP_S))
     with (
         np.errstate(all="ignore"),
         pytest.raises(PolicyError, match=r"gait 'tiny' answered NaN for front_left_hip"),
@@ -332,7 +332,8 @@ def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy
         for _ in range(200):
             drive.step(Command(1.0, 0.0), still_body())
     strong = {name: row | {"kp": 2000, "scale": 1000} for name, row in JOINTS.items()}
-    drive = gait_drive(DOG, f"onnx:{written_gait(tmp_path, joints=strong)}")
+    gait = user_gait(f"onnx:{written_gait(tmp_path, joints=strong)}", DOG, SUBSTEP_S)
+    drive = gait_drive(DOG, gait)
     with pytest.raises(PolicyError, match=r"joint front_left_hip is .* Nm; its limit is 23.7 Nm"):
         drive.step(Command(1.0, 0.0), still_body())
 
