@@ -10,6 +10,7 @@ from typing import Final
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.npz import read_open_npz
 from cosim.policies.onnx.weights import NetworkFile, read_file, weights_file
+from cosim.spec.options import ONNX_GAIT
 from cosim.spec.robot import ROBOTS, Legs, Robot
 from physics.dynamics.legs.gait_graph import network_of_graph
 from physics.dynamics.legs.gait_manifest import GaitManifest, read_gait_manifest
@@ -18,7 +19,6 @@ from physics.dynamics.legs.network_gait import NetworkGait, NetworkSetup
 from physics.robots import gait_path
 from physics.robots.make_urdf import MODELS
 
-_ONNX: Final = "onnx:"
 _MOST_BYTES: Final = 64 << 20
 """Largest size of a gait's network in bytes."""
 
@@ -29,8 +29,8 @@ def user_gait(name: str, robot: Robot, substep_s: float) -> NetworkSetup:
     Raises UsageError or SpecError for a missing, invalid or unsuitable file.
     """
     robot_legs(robot, name)
-    path = Path(name.removeprefix(_ONNX))
-    if not name.startswith(_ONNX) or path.suffix != ".onnx":
+    path = Path(name.removeprefix(ONNX_GAIT))
+    if not name.startswith(ONNX_GAIT) or path.suffix != ".onnx":
         raise UsageError(f"gait '{name}': use onnx:FILE.onnx, with its manifest FILE.json beside")
     if not path.is_file():
         raise UsageError(f"gait '{name}': {path} does not exist")
