@@ -37,8 +37,12 @@ from physics.robots.model import Model
 
 _HOLD_HZ: Final = 2.0
 """Speed per distance from the place that is held."""
-_HOLD_MOST: Final = 0.6
-"""Largest speed in m/s, and yaw rate in rad/s, of a robot that holds its place."""
+_HOLD_MPS: Final = 0.2
+"""Largest speed of a robot that holds its place."""
+_HOLD_RADPS: Final = 0.6
+"""Largest yaw rate of a robot that holds its place."""
+_ANCHOR_M: Final = 0.1
+"""Distance from the held place above which a displaced robot holds its present place."""
 _SLOW_MPS: Final = 0.08
 """Mean speed over a gait cycle below which a robot may stand."""
 _SLOW_RADPS: Final = 0.1
@@ -169,6 +173,8 @@ class NetworkGait:
             if self._stands:
                 return
             self._idle_s += self._decision_s
+            if self._place is not None and math.dist(self._place[:2], (x, y)) > _ANCHOR_M:
+                self._place = x, y, heading
             if self._place is None and (slow or self._idle_s > _HOLD_AFTER_S):
                 self._place = x, y, heading
             command = self._holding(x, y, heading)
@@ -225,7 +231,10 @@ class NetworkGait:
         dx, dy = self._place[0] - x_m, self._place[1] - y_m
         cos, sin = math.cos(heading_rad), math.sin(heading_rad)
         wanted = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
-        v, u, w = (min(max(_HOLD_HZ * one, -_HOLD_MOST), _HOLD_MOST) for one in wanted)
+        v, u, w = (
+            min(max(_HOLD_HZ * one, -most), most)
+            for one, most in zip(wanted, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
+        )
         return v, u, w
 
     def _ask(self, command: tuple[float, float, float], body: BodyNow) -> None:
