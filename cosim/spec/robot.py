@@ -59,7 +59,7 @@ class Legs:
     trunk: links that touch the ground only in a fall; "base" is the base link.
     stand_m: height of the base link's frame above the ground at rest.
     span_m: length and width of the rectangle of the feet at rest.
-    cycle_s: duration of a gait cycle, over which speeds are averaged.
+    cycle_s: duration of a cycle of its own gait, over which speeds are averaged.
     gait: row of `physics.dynamics.legs.GAITS`.
     weights: SHA-256 of the gait's published network, "" without one.
     """

@@ -89,8 +89,6 @@ class BulletWorld:
         self.obstacles = tuple(obstacles)
         self._drive = drive
         self._watch: LegWatch | None = None
-        if isinstance(robot.drive, Legs):
-            self._watch = LegWatch(robot.drive, SUBSTEP_S)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
         self._loaded_at_m = (0.0, 0.0)
@@ -257,6 +255,8 @@ class BulletWorld:
         """Return the drive; cameras of a world need none, nor the weights of its gait."""
         if self._drive is None:
             self._drive = drive_of(self.robot, SUBSTEP_S)
+        if self._watch is None and isinstance(self.robot.drive, Legs):
+            self._watch = LegWatch(self.robot.drive, self._drive.cycle_s, SUBSTEP_S)
         return self._drive
 
     @property

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from onnx import helper
 
 from cosim.core.errors import CosimError, EngineError, PolicyError, SpecError, UsageError
+from cosim.core.geometry import Pose
 from cosim.core.state import Command
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.manifest import file_facts
@@ -37,7 +38,9 @@ from physics.dynamics.legs.network import (
     tanh,
 )
 from physics.dynamics.legs.walker import WALKER_NETWORK, walker_network
+from physics.dynamics.world import BulletWorld
 from physics.robots.walker import WALKER_MODEL
+from scenarios.tools.bench.legs import FLAT
 from tests.support.gaits import JOINTS, OBSERVATION, layers_graph, written_gait
 from tests.support.graphs import graph_bytes, port
 
@@ -308,6 +311,24 @@ def test_each_hash_that_a_manifest_gives_is_checked(
         path = written_gait(tmp_path, files={"tiny.onnx": given})
         with pytest.raises(UsageError, match=r"tiny\.onnx: .* bytes, .*; expected tiny\.onnx: "):
             user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
+
+
+def test_speeds_of_a_gait_are_averaged_over_its_own_cycle(tmp_path: Path) -> None:
+    """That of its manifest, or the longest period of a phase, or the robot's."""
+    assert isinstance(DOG.drive, Legs)
+    phases = [{"what": "phase", "period_s": period_s} for period_s in (0.4, 0.7)]
+    for terms, changes, cycle_s in (
+        ([], {}, DOG.drive.cycle_s),
+        (phases, {}, 0.7),
+        (phases, {"cycle_s": 0.5}, 0.5),
+    ):
+        graph = layers_graph(sizes=(45 + 2 * len(terms), 12))
+        path = written_gait(tmp_path, graph, observation=[*OBSERVATION, *terms], **changes)
+        drive = gait_drive(DOG, user_gait(f"onnx:{path}", DOG, SUBSTEP_S))
+        assert drive.cycle_s == cycle_s
+        with BulletWorld(FLAT, robot=DOG, drive=drive) as world:
+            world.place(Pose(0.0, 0.0, 0.0))
+            assert world._watch is not None and world._watch._count == round(cycle_s / SUBSTEP_S)
 
 
 def still_body(**changes: Any) -> BodyNow:

@@ -297,7 +297,7 @@ def test_a_low_fence_is_a_collision_of_the_legs_and_the_ground_is_none(robot: Ro
 def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
     """The error has the engine's values; a robot that lies or stands is sound."""
     legs = legs_of(robot)
-    watch = LegWatch(legs, 0.005)
+    watch = LegWatch(legs, legs.cycle_s, 0.005)
     for z_m, sound in ((0.0, True), (-legs.stand_m, True), (-2.0, False), (5.0, False)):
         state = RobotState(Pose(1.0, 2.0, 0.0), z_m=z_m)
         if sound:
@@ -313,6 +313,7 @@ class Broken:
     """A drive whose torques are NaN."""
 
     reads_joints = True
+    cycle_s = 0.2
 
     def reset(self) -> None:
         pass

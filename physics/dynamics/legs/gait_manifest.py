@@ -144,6 +144,8 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     files: size and hashes of the model.
     joints: all joints of the robot, in the order of the network.
     observation: parts of the network's input, in its order.
+    cycle_s: duration of a gait cycle, over which speeds are averaged; by default the longest period
+        of a `phase`, or else the robot's `Legs.cycle_s`.
     most_observed, most_answered: limits of the magnitudes of inputs and outputs.
     most_memory: magnitude of the memory of an LSTM above which the memory is emptied.
     speed, turn: corrections of the commands.
@@ -160,6 +162,7 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Within(5, 200)]
     joints: dict[str, GaitJoint]
     observation: Annotated[list[Term], ItemCount(1, 32)]
+    cycle_s: Annotated[float, Within(0.05, 10)] | None = None
     most_observed: Annotated[float, Within(0, 1e6, above=True)] = 100.0
     most_answered: Annotated[float, Within(0, 1e6, above=True)] = 100.0
     most_memory: Annotated[float, Within(0, 1e6, above=True)] = 1e6
@@ -175,6 +178,11 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     def sizes(self) -> tuple[int, int]:
         """Numbers of inputs and outputs of the network."""
         return sum(term.count(len(self.joints)) for term in self.observation), len(self.joints)
+
+    def cycle_of(self, legs: Legs) -> float:
+        """Return the duration of a gait cycle in seconds."""
+        periods_s = [term.period_s for term in self.observation if isinstance(term, Phase)]
+        return self.cycle_s or max(periods_s, default=legs.cycle_s)
 
     def contradictions(self) -> Iterator[str]:
         if not self.model.endswith((".onnx", ".npz")):

@@ -52,6 +52,7 @@ class LegDrive:
         self._of_user = of_user
         self._legs = legs
         self._gait = GAITS[legs.gait](robot, legs, dt_s) if gait is None else gait
+        self.cycle_s = self._gait.cycle_s
         self._settle = round(SETTLE_S / dt_s)
         self.reset()
 

@@ -98,7 +98,8 @@ class NetworkGait:
             )
             self._balance = Balance(model, legs, stance)
         self._steady = round(_STEADY_S / dt_s)
-        self._cycle = max(round(legs.cycle_s / self._decision_s), 1)
+        self.cycle_s = manifest.cycle_of(legs)
+        self._cycle = max(round(self.cycle_s / self._decision_s), 1)
         self.reset()
 
     def reset(self) -> None:

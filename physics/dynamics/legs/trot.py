@@ -103,6 +103,7 @@ class Trot:
 
     def __init__(self, robot: Robot, legs: Legs, dt_s: float, gains: TrotGains = GAINS) -> None:
         self._ramps = robot.acceleration_mps2 * dt_s, robot.acceleration_radps2 * dt_s
+        self.cycle_s = legs.cycle_s
         self._legs = legs
         self._dt_s = dt_s
         self._gains = gains
