@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 import os
@@ -186,8 +187,8 @@ def test_a_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
             assert network.answer(given, ())[0] == pytest.approx(expected, abs=1e-5)
 
 
-def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
-    """With its memory as further inputs and outputs, over several steps."""
+def recurrent_graph() -> bytes:
+    """An LSTM and a layer, with the memory as further inputs and outputs."""
     weights = {
         "w": normal(1, 1, 32, 5),
         "r": normal(2, 1, 32, 8),
@@ -209,7 +210,12 @@ def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
     ]
     memory = [port("h_in", 1, 1, 8), port("c_in", 1, 1, 8)]
     told = [port("actions", 1, 3), port("h_out", 1, 1, 8), port("c_out", 1, 1, 8)]
-    data = graph_bytes(nodes, [port("obs", 1, 5), *memory], told, weights)
+    return graph_bytes(nodes, [port("obs", 1, 5), *memory], told, weights)
+
+
+def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
+    """With its memory as further inputs and outputs, over several steps."""
+    data = recurrent_graph()
     (tmp_path / "g.onnx").write_bytes(data)
     graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
     state = network.empty_memory()
@@ -247,6 +253,33 @@ def test_graphs_of_another_form_are_refused() -> None:
     for data in (b"", b"no graph", layers_graph()[:-40]):
         with pytest.raises(ValueError, match=r"graph|early|message|hold|input"):
             network_of_graph(data)
+
+
+def test_malformed_graphs_are_refused() -> None:
+    """Operators without inputs, constants of too few dimensions, and random changes of a file."""
+    ends = [port("obs", 1, 4)], [port("out", 1, 4)]
+    held = {"w": normal(1, 4, 4), "v": normal(2, 4), "s": np.float32(1.0)}
+    make = helper.make_node
+    for nodes in (
+        [make("LSTM", [], ["out"])],
+        [make("LSTM", ["obs", "s", "s", "s"], ["out"])],
+        [make("LSTM", ["obs", "v", "v", "v"], ["out"])],
+        [make("LSTM", ["obs", "w", "w", "w"], ["out"])],
+        [make("Gemm", ["obs", "s", "s"], ["out"])],
+        [make("Gemm", ["obs", "w", "w"], ["out"])],
+    ):
+        with pytest.raises(ValueError, match=r"LSTM|Gemm|output|layer"):
+            network_of_graph(graph_bytes(nodes, *ends, held))
+    constant = make("Constant", [], [], value=helper.make_tensor("c", 1, [1], [0.0]))
+    with pytest.raises(ValueError, match="Constant has no output"):
+        network_of_graph(graph_bytes([constant], *ends, held))
+    draws, sound = np.random.default_rng(0), recurrent_graph()
+    for _ in range(500):
+        data = bytearray(sound)
+        for at in draws.integers(0, len(data), 3).tolist():
+            data[at] = int(draws.integers(256))
+        with contextlib.suppress(ValueError, RecursionError), np.errstate(all="ignore"):
+            network_of_graph(bytes(data))
 
 
 @pytest.mark.parametrize(
