@@ -84,7 +84,7 @@ def test_a_single_episode_records_the_gait_that_moved_it(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("scale", "kp", "why"),
-    [(1e30, 20, "gait 'tiny' answered NaN for"), (0.1, 2000, "Nm; its limit is 23.7 Nm")],
+    [(1e30, 20, "gait 'tiny' answered "), (0.1, 2000, "Nm; its limit is 23.7 Nm")],
     ids=["nan", "torque"],
 )
 def test_a_gait_that_fails_crashes_the_episode_with_the_reason(

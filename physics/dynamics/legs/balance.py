@@ -75,10 +75,16 @@ class Balance:
         self._arm_m = x - half[0], y - half[1], z - half[2]
         mx, my, mz = self._model.links[0].middle_m
         self._behind_m = x - mx, y - my, z - mz
-        self._omega_hz = math.sqrt(_GRAVITY_MPS2 / self._arm_m[2])
+        upright = self._arm_m[2] > 0.0
+        self._omega_hz = math.sqrt(_GRAVITY_MPS2 / self._arm_m[2]) if upright else 0.0
 
     def holds(self, body: BodyNow) -> bool:
-        """Return whether ankle torques can keep the balance."""
+        """Return whether ankle torques can keep the balance.
+
+        They cannot if the centre of mass was not above the ankles when the joints were frozen.
+        """
+        if not self._omega_hz:
+            return False
         ahead, left = self._capture_m(body)
         return _HOLDS_M[0] < ahead < _HOLDS_M[1] and abs(left) < _ASIDE_M
 

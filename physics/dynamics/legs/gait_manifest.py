@@ -149,7 +149,8 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     most_observed, most_answered: limits of the magnitudes of inputs and outputs.
     most_memory: magnitude of the memory of an LSTM above which the memory is emptied.
     speed, turn: corrections of the commands.
-    balance: standing of a biped; without it, the network holds the place by small commands.
+    balance: standing of a robot with two feet; without it, the network holds the place by small
+        commands.
     """
 
     format: Literal[1]
@@ -193,7 +194,7 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
                     yield f"balance.ankles names {name!r}, which is not in joints"
 
     def check_robot(self, robot: Robot, substep_s: float) -> None:
-        """Raise SpecError unless the gait fits the robot: joints, rate and torques."""
+        """Raise SpecError unless the gait fits the robot: joints, rate and balance."""
         legs = robot.drive
         if robot.name != self.robot or not isinstance(legs, Legs):
             raise SpecError(f"is a gait of robot '{self.robot}', not of '{robot.name}'")
@@ -204,6 +205,11 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
             )
         if missing := [name for name in legs.joints if name not in self.joints]:
             raise SpecError(f"joints lacks {', '.join(missing)} of robot '{robot.name}'")
+        if self.balance is not None and len(legs.feet) != 2:
+            raise SpecError(
+                f"balance is for robots with two feet, and robot '{robot.name}' has "
+                f"{len(legs.feet)}: leave it out"
+            )
         every = 1.0 / (self.rate_hz * substep_s)
         if abs(every - round(every)) > 1e-9:
             raise SpecError(

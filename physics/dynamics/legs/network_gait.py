@@ -239,7 +239,7 @@ class NetworkGait:
         return v, u, w
 
     def _ask(self, command: tuple[float, float, float], body: BodyNow) -> None:
-        """Let the network set the target angles. Raises PolicyError for NaN."""
+        """Let the network set the target angles. Raises PolicyError for NaN and infinity."""
         manifest = self._manifest
         seen = [
             term.scale * value
@@ -251,15 +251,16 @@ class NetworkGait:
         answer, self._memory = self._network.answer(given, self._memory)
         if any(np.abs(one).max() > manifest.most_memory for one in self._memory):
             self._memory = self._network.empty_memory()  # after a stumble it would walk askew
-        most = manifest.most_answered
-        self._actions = [min(max(value, -most), most) for value in answer.tolist()]
-        if not all(map(math.isfinite, self._actions)):
+        values = answer.tolist()
+        if not all(map(math.isfinite, values)):
             bad = [
-                name
-                for name, value in zip(manifest.joints, self._actions, strict=True)
+                f"{value} for {name}"
+                for name, value in zip(manifest.joints, values, strict=True)
                 if not math.isfinite(value)
             ]
-            raise PolicyError(f"gait '{manifest.name}' answered NaN for {', '.join(bad)}")
+            raise PolicyError(f"gait '{manifest.name}' answered {', '.join(bad)}")
+        most = manifest.most_answered
+        self._actions = [min(max(value, -most), most) for value in values]
         targets = [0.0] * len(self._order)
         for k, rest, scale, action in zip(
             self._order, self._rest, self._scales, self._actions, strict=True
