@@ -61,7 +61,6 @@ class Legs:
     span_m: length and width of the rectangle of the feet at rest.
     cycle_s: duration of a cycle of its own gait, over which speeds are averaged.
     gait: row of `physics.dynamics.legs.GAITS`.
-    weights: SHA-256 of the gait's published network, "" without one.
     """
 
     joints: tuple[str, ...]
@@ -75,7 +74,6 @@ class Legs:
     span_m: tuple[float, float]
     cycle_s: float
     gait: Literal["trot", "network"]
-    weights: str = ""
 
     @property
     def pivot_m(self) -> float:
@@ -266,7 +264,6 @@ WALKER = Robot(
         span_m=(0.17, 0.237),
         cycle_s=0.8,
         gait="network",
-        weights="cf668f75b90d1abf73d2b87612a6e76bccc61ff7e083b63582d3f6aaa3c1759d",
     ),
     mounts={
         "front": Mount((0.09, 0.0, 1.20), 10.0),

@@ -27,10 +27,11 @@ from physics.cameras.posture import posture_of
 from physics.cameras.view import robot_shot
 from physics.dynamics.bullet import p
 from physics.dynamics.drive import BodyNow, Motors
-from physics.dynamics.legs.trot import HIP_ASIDE_M, SEGMENT_M, leg_angles
+from physics.dynamics.legs.trot import leg_angles
 from physics.dynamics.legs.watch import LegWatch
 from physics.dynamics.world import BulletWorld
 from physics.robots import urdf_path
+from physics.robots.dog import SEGMENT_M, THIGH_ASIDE_M
 from physics.robots.kinematics import link_tree, turned
 from physics.robots.make_urdf import MODELS
 from physics.street.street_surface import StreetSurface
@@ -125,8 +126,8 @@ def test_a_leg_reaches_its_foot() -> None:
             hip, thigh, calf = leg_angles(x, side * y, z, side)
             ahead = -SEGMENT_M * (math.sin(thigh) + math.sin(thigh + calf))
             down = -SEGMENT_M * (math.cos(thigh) + math.cos(thigh + calf))
-            left = side * HIP_ASIDE_M * math.cos(hip) - down * math.sin(hip)
-            up = side * HIP_ASIDE_M * math.sin(hip) + down * math.cos(hip)
+            left = side * THIGH_ASIDE_M * math.cos(hip) - down * math.sin(hip)
+            up = side * THIGH_ASIDE_M * math.sin(hip) + down * math.cos(hip)
             assert (ahead, left, up) == pytest.approx((x, side * y, z))
 
 
