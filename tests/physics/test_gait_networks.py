@@ -28,7 +28,6 @@ from physics.dynamics.drives import drive_of, gait_drive
 from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
 from physics.dynamics.legs.gait_graph import network_of_graph
-from physics.dynamics.legs.kinematics import centre_of_mass, link_frames
 from physics.dynamics.legs.leg_drive import LegDrive
 from physics.dynamics.legs.network import (
     Dense,
@@ -41,6 +40,8 @@ from physics.dynamics.legs.network import (
 )
 from physics.dynamics.legs.walker import WALKER_NETWORK, walker_network
 from physics.dynamics.world import BulletWorld
+from physics.robots import urdf_path
+from physics.robots.kinematics import centre_of_mass, link_tree
 from physics.robots.walker import WALKER_MODEL
 from scenarios.tools.bench.legs import FLAT
 from tests.support.gaits import JOINTS, OBSERVATION, layers_graph, written_gait
@@ -443,9 +444,9 @@ def test_the_posture_of_the_walker_at_rest_is_balanced() -> None:
     soles."""
     assert isinstance(WALKER.drive, Legs)
     rest = dict(zip(WALKER.drive.joints, WALKER.drive.rest_rad, strict=True))
-    frames = link_frames(WALKER_MODEL, rest)
+    frames = link_tree(urdf_path(WALKER)).frames(rest)
     for side, left in (("left", 1.0), ("right", -1.0)):
-        (x, y, z), turn = frames[f"{side}_foot"]
+        turn, (x, y, z) = frames[f"{side}_foot"]
         assert z - 0.035 == pytest.approx(-WALKER.drive.stand_m, abs=1e-3)
         assert y == pytest.approx(left * 0.1185, abs=1e-3)
         assert turn[2][2] == pytest.approx(1.0)
@@ -456,7 +457,7 @@ def test_a_robot_that_is_upside_down_does_not_balance() -> None:
     """With its centre of mass below the ankles, or level with them."""
     assert isinstance(WALKER.drive, Legs)
     stance = Stance(("left_ankle_pitch", "right_ankle_pitch"), 0.035, (0.0,) * 12, (0.0,) * 12)
-    balance = Balance(WALKER_MODEL, WALKER.drive, stance)
+    balance = Balance(WALKER_MODEL, link_tree(urdf_path(WALKER)), WALKER.drive, stance)
     body = still_body(angles_rad=WALKER.drive.rest_rad)
     balance.begin(body)
     assert balance.holds(body)

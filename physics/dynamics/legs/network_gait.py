@@ -33,6 +33,8 @@ from physics.dynamics.legs.gait_manifest import (
 )
 from physics.dynamics.legs.network import Network
 from physics.dynamics.legs.pd import torques_nm
+from physics.robots import urdf_path
+from physics.robots.kinematics import inverse, link_tree, rotate, rows_of
 from physics.robots.model import Model
 
 _HOLD_HZ: Final = 2.0
@@ -96,7 +98,7 @@ class NetworkGait:
                 tuple(row.stand_kp for row in of),
                 tuple(row.stand_kd for row in of),
             )
-            self._balance = Balance(model, legs, stance)
+            self._balance = Balance(model, link_tree(urdf_path(robot)), legs, stance)
         self._steady = round(_STEADY_S / dt_s)
         self.cycle_s = manifest.cycle_of(legs)
         self._cycle = max(round(self.cycle_s / self._decision_s), 1)
@@ -274,9 +276,9 @@ class NetworkGait:
         """Return the numbers of a part of the observation, before its scale."""
         m = body.rotation
         if isinstance(term, AngularVelocity):
-            return _in_trunk(m, body.spin_radps)
+            return rotate(inverse(rows_of(m)), body.spin_radps)
         if isinstance(term, LinearVelocity):
-            return _in_trunk(m, body.velocity_mps)
+            return rotate(inverse(rows_of(m)), body.velocity_mps)
         if isinstance(term, Gravity):
             return -m[6], -m[7], -m[8]
         if isinstance(term, CommandTerm):
@@ -295,16 +297,6 @@ class NetworkGait:
             * math.fmod(self._count // self._every * self._decision_s / term.period_s, 1.0)
         )
         return math.sin(turns), math.cos(turns)
-
-
-def _in_trunk(m: Sequence[float], v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a vector of the world in the frame with a rotation matrix of nine entries."""
-    x, y, z = v
-    return (
-        m[0] * x + m[3] * y + m[6] * z,
-        m[1] * x + m[4] * y + m[7] * z,
-        m[2] * x + m[5] * y + m[8] * z,
-    )
 
 
 def _wrapped(angle_rad: float) -> float:
