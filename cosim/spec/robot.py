@@ -1,13 +1,14 @@
 """Table of robots; everything that depends on the robot is derived from it.
 
 A new robot is a row of `ROBOTS` and a URDF. The base frame is on the ground in the middle of the
-robot, x ahead, y left, z up. Mounts and boxes are given in it.
+robot, x ahead, y left, z up. Mounts and boxes are given in it. The frame of the URDF's base link
+depends on the drive:
 
-- Wheels: the base link's frame is the base frame. Its centre of mass is `com_height_m` above it.
-  Wheels turn forward for positive joint speeds.
-- Legs: the base link's frame is in the middle of the trunk, `Legs.stand_m` above the base frame.
-  Its axes are the principal axes of its inertia. Joint angles are those of `Legs.rest_rad` when the
-  robot is put on the ground.
+- Wheels: it is the base frame. The link's centre of mass is `com_height_m` above it. Wheels turn
+  forward for positive joint speeds.
+- Legs: it is in the middle of the trunk, `Legs.stand_m` above the base frame at rest. Its axes are
+  the principal axes of the link's inertia. Joint angles are those of `Legs.rest_rad` when the robot
+  is put on the ground.
 """
 
 from __future__ import annotations

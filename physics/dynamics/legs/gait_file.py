@@ -1,4 +1,4 @@
-"""Load a gait: its manifest, and the network beside it or in a folder of weights."""
+"""Load a gait: its manifest, and the network in the same folder or in a folder of weights."""
 
 from __future__ import annotations
 
@@ -24,14 +24,16 @@ _MOST_BYTES: Final = 64 << 20
 
 
 def user_gait(name: str, robot: Robot, substep_s: float) -> NetworkSetup:
-    """Load the gait `onnx:FILE.onnx` with the manifest FILE.json beside it.
+    """Load the gait `onnx:FILE.onnx` with the manifest FILE.json in the same folder.
 
     Raises UsageError or SpecError for a missing, invalid or unsuitable file.
     """
     robot_legs(robot, name)
     path = Path(name.removeprefix(ONNX_GAIT))
     if not name.startswith(ONNX_GAIT) or path.suffix != ".onnx":
-        raise UsageError(f"gait '{name}': use onnx:FILE.onnx, with its manifest FILE.json beside")
+        raise UsageError(
+            f"gait '{name}': use onnx:FILE.onnx, with its manifest FILE.json in the same folder"
+        )
     if not path.is_file():
         raise UsageError(f"gait '{name}': {path} does not exist")
     manifest_path = path.with_suffix(".json")
@@ -97,8 +99,8 @@ def _model_path(manifest_path: Path, manifest: GaitManifest) -> Path:
     """Return the path of a gait's network. Raises UsageError if it is missing."""
     facts = manifest.files.get(manifest.model)
     user = f"gait '{manifest.name}' of robot '{manifest.robot}'"
-    beside = [manifest_path.parent] if manifest.model.endswith(".onnx") else []
-    return weights_file(user, manifest.model, facts, manifest.source, beside)
+    folders = [manifest_path.parent] if manifest.model.endswith(".onnx") else []
+    return weights_file(user, manifest.model, facts, manifest.source, folders)
 
 
 def _network(path: Path, data: bytes) -> Network:

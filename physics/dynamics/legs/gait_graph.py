@@ -73,9 +73,9 @@ class _Chain:
             self._dense(node)
         else:
             self._shift(node)
-        self._go_on(node.outputs[:1])
+        self._continue_with(node.outputs[:1])
 
-    def _go_on(self, names: Sequence[str]) -> None:
+    def _continue_with(self, names: Sequence[str]) -> None:
         self._past |= self._names
         self._names = {name for name in names if name}
 
@@ -133,7 +133,7 @@ class _Chain:
         weight, more = self._folded(given[order].T)
         total = (bias[: 4 * size] + bias[4 * size :])[order] + more
         self._layers.append(Lstm(_narrow(np.concatenate([weight, own[order].T])), _narrow(total)))
-        self._go_on(node.outputs[:2])
+        self._continue_with(node.outputs[:2])
 
     def _shift(self, node: Node) -> None:
         """Add a constant to the last layer, or note a constant for the next one."""

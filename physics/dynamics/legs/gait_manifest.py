@@ -140,7 +140,7 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     """Manifest of a gait.
 
     robot: robot that it moves.
-    model: file of the network beside the manifest, .onnx or .npz.
+    model: file of the network in the folder of the manifest, .onnx or .npz.
     files: size and hashes of the model.
     joints: all joints of the robot, in the order of the network.
     observation: parts of the network's input, in its order.

@@ -1,5 +1,8 @@
 """Gait of a neural network: observations, target angles, corrections of speed, and standing.
 
+Commands reach the network at once, without the ramps of the robot's row: the network changes its
+speed about as fast as these ramps, and stops later with ramps in front of it (docs/robots.md).
+
 The network decides at its own rate; torques follow its targets in every substep. Without a command
 a biped balances on frozen joints (`balance.py`). Other robots, and a biped whose feet are not
 level, hold their place by small commands to the network.
@@ -127,41 +130,41 @@ class NetworkGait:
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
         self._v_mps, self._w_radps = command.v_mps, command.w_radps
-        asked = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
+        commanded = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
         if self._balance is not None and self._stands:
             if not self._frozen:
                 self._balance.begin(body)
                 self._frozen = True
-            if not asked and self._balance.holds(body):
+            if not commanded and self._balance.holds(body):
                 self._stood += 1
                 return self._balance.torques_nm(body)
-            self._leave_stance(asked)
+            self._leave_stance(commanded)
         if self._count % self._every == 0:
-            self._decide(asked, body)
+            self._decide(commanded, body)
             if self._stands and self._balance is not None:
                 return self._balance.torques_nm(body)
         self._count += 1
         return torques_nm(*self._gains, self._targets, body)
 
-    def _leave_stance(self, asked: bool) -> None:
+    def _leave_stance(self, commanded: bool) -> None:
         """Let the network walk again.
 
         If the robot has not stood for long, as across a slope, it marks time until it walks again.
         """
         place = self._place
-        self._may_stand = asked or self._stood >= self._steady
+        self._may_stand = commanded or self._stood >= self._steady
         self._stands = self._frozen = False
         self._start()
         if not self._may_stand:
             self._place = place
 
-    def _decide(self, asked: bool, body: BodyNow) -> None:
+    def _decide(self, commanded: bool, body: BodyNow) -> None:
         """Query the network, or let the robot stand."""
         m = body.rotation
         x, y, _ = body.at_m
         heading = math.atan2(m[3], m[0])
         self._past.append((x, y, heading))
-        if asked:
+        if commanded:
             self._place, self._idle_s, self._may_stand = None, 0.0, self._balance is not None
             self._lifted.clear()
             command = self._corrected(body)
@@ -181,7 +184,7 @@ class NetworkGait:
             if self._place is None and (slow or self._idle_s > _HOLD_AFTER_S):
                 self._place = x, y, heading
             command = self._holding(x, y, heading)
-        self._ask(command, body)
+        self._query(command, body)
 
     def _on_both_feet(self) -> bool:
         """Return whether both feet are on the ground.
@@ -233,14 +236,14 @@ class NetworkGait:
             return 0.0, 0.0, 0.0
         dx, dy = self._place[0] - x_m, self._place[1] - y_m
         cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-        wanted = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
+        errors = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
         v, u, w = (
             min(max(_HOLD_HZ * one, -most), most)
-            for one, most in zip(wanted, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
+            for one, most in zip(errors, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
         )
         return v, u, w
 
-    def _ask(self, command: tuple[float, float, float], body: BodyNow) -> None:
+    def _query(self, command: tuple[float, float, float], body: BodyNow) -> None:
         """Let the network set the target angles. Raises PolicyError for NaN and infinity."""
         manifest = self._manifest
         seen = [

@@ -135,9 +135,9 @@ class Trot:
         self._v_mps = towards(self._v_mps, command.v_mps, self._ramps[0])
         self._w_radps = towards(self._w_radps, command.w_radps, self._ramps[1])
         tilt = math.hypot(m[6], m[7])
-        asked = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
+        commanded = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
         shaken = math.hypot(ahead, left) > gains.shake_mps or tilt > gains.shake_rad
-        if asked or shaken:
+        if commanded or shaken:
             if not self._left_steps:
                 self._begin()
             self._left_steps = _STEPS_TO_STAND

@@ -322,8 +322,8 @@ def _steady(robot: Robot, start: Pose, v_mps: float, w_radps: float, target: str
     with walking(robot, FLAT, start) as walk:
         walk.drive(command, 3.0)
         v, w = mean_speeds(walk.drive(command, 4.0))
-    asked = f"{v_mps:.2g} m/s, {w_radps:.2g} rad/s commanded"
-    return LegFigure(asked, f"{v:.2f} m/s, {w:.2f} rad/s", target)
+    commanded = f"{v_mps:.2g} m/s, {w_radps:.2g} rad/s commanded"
+    return LegFigure(commanded, f"{v:.2f} m/s, {w:.2f} rad/s", target)
 
 
 def _curbs(robot: Robot, v_mps: float) -> Iterator[LegFigure]:
