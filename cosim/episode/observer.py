@@ -17,7 +17,7 @@ from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.episode_id import episode_id_of, seed_for
 from cosim.spec.goal import TakePicture, goals_for, in_robot_frame
 from cosim.spec.manifest import Manifest
-from cosim.spec.odometry import LEG_NOISE, GpsNoise, Odometry, OdometryKind, WheelNoise
+from cosim.spec.odometry import LEG_NOISE, DriftNoise, GpsNoise, Odometry, OdometryKind
 from cosim.spec.robot import COURIER, Legs, Robot, robot_called
 from cosim.spec.scenario import Scenario
 
@@ -40,7 +40,7 @@ def odometer_for(
     draws: generator of its errors.
     """
     if kind == "wheel":
-        return WheelOdometer(draws, LEG_NOISE if isinstance(robot.drive, Legs) else WheelNoise())
+        return DeadReckoning(draws, LEG_NOISE if isinstance(robot.drive, Legs) else DriftNoise())
     return Gps(start, draws) if kind == "gps" else _ExactOdometer(start, reported=kind == "exact")
 
 
@@ -58,10 +58,10 @@ class _ExactOdometer:
         return Odometry(place.x_m, place.y_m, turned) if self._reported else None
 
 
-class WheelOdometer:
+class DeadReckoning:
     """Odometry by wheels or legs: it counts turns or steps, so it misses resets of the robot."""
 
-    def __init__(self, draws: np.random.Generator, noise: WheelNoise = WheelNoise()) -> None:  # noqa: B008
+    def __init__(self, draws: np.random.Generator, noise: DriftNoise = DriftNoise()) -> None:  # noqa: B008
         self._draws = draws
         self._noise = noise
         errors = draws.standard_normal(3).tolist()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from cosim.core.versions import versions
-from cosim.spec.options import EpisodeOptions, PolicyProcess
+from cosim.spec.options import EpisodeOptions, PolicyProcess, absolute_gait
 from cosim.spec.run_config import Appearance
 
 METRIC_SCHEMA = 4
@@ -68,7 +68,7 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
             policy_runs=policy_runs,
             latency_ms=options.latency_ms,
             real_time=options.real_time,
-            gait=options.gait,
+            gait=absolute_gait(options.gait),
             gait_hash=gait_hash,
             versions=versions(),
             metric_schema=METRIC_SCHEMA,

@@ -49,7 +49,7 @@ class Odometry(msgspec.Struct, frozen=True):
         return np.array(known, dtype)
 
 
-class WheelNoise(NamedTuple):
+class DriftNoise(NamedTuple):
     """Standard deviations of odometry by wheels or legs.
 
     scale: relative error of the distance, constant in an episode.
@@ -68,7 +68,7 @@ class WheelNoise(NamedTuple):
     sideways: bool = False
 
 
-LEG_NOISE: Final = WheelNoise(
+LEG_NOISE: Final = DriftNoise(
     scale=0.03,
     turn_scale=0.03,
     drift_radpm=math.radians(0.5),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from pathlib import Path
+from typing import Final, Literal
 
 import msgspec
 
@@ -21,6 +22,9 @@ from cosim.spec.run_config import (
     Isolation,
     RunConfig,
 )
+
+ONNX_GAIT: Final = "onnx:"
+"""Beginning of the name of a gait that is an ONNX file."""
 
 PolicyProcess = Literal[
     "in-process",
@@ -109,7 +113,8 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     seed: seed of the run, for policy ids and seeds (`cosim.spec.episode_id`) and the order of
         episodes. If it is None, a run draws one, and a single Episode uses 0.
     robot: robot in place of the scenario's (`cosim.spec.robot`).
-    gait: gait of a robot with legs in place of its own (`physics.dynamics.legs.gait_file`).
+    gait: gait of a robot with legs in place of its own (`physics.dynamics.legs.gait_file`). Its
+        path is recorded as an absolute one.
     goal: goal protocol in place of the manifest's (`cosim.spec.goal`).
     own_camera: allow a camera that the robot does not have (`cosim.episode.manifest_checks`). It
         marks the record as nonstandard.
@@ -154,7 +159,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
         return cls(
             seed=config.seed,
             robot=config.robot,
-            gait=config.gait,
+            gait=absolute_gait(config.gait),
             own_camera=config.own_camera,
             goal=goal_called(config.goal) if config.goal else None,
             camera=config.camera,
@@ -178,3 +183,14 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
             )
         if self.real_time and self.latency_ms:
             raise UsageError("real_time measures the latency of every answer: leave latency_ms out")
+
+
+def absolute_gait(gait: str) -> str:
+    """Return a gait's name with an absolute path, which is valid in any working folder.
+
+    >>> absolute_gait("onnx:/gaits/walk.onnx")
+    'onnx:/gaits/walk.onnx'
+    """
+    if not gait.startswith(ONNX_GAIT):
+        return gait
+    return f"{ONNX_GAIT}{Path(gait.removeprefix(ONNX_GAIT)).expanduser().absolute()}"

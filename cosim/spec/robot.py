@@ -1,13 +1,14 @@
 """Table of robots; everything that depends on the robot is derived from it.
 
 A new robot is a row of `ROBOTS` and a URDF. The base frame is on the ground in the middle of the
-robot, x ahead, y left, z up. Mounts and boxes are given in it.
+robot, x ahead, y left, z up. Mounts and boxes are given in it. The frame of the URDF's base link
+depends on the drive:
 
-- Wheels: the base link's frame is the base frame. Its centre of mass is `com_height_m` above it.
-  Wheels turn forward for positive joint speeds.
-- Legs: the base link's frame is in the middle of the trunk, `Legs.stand_m` above the base frame.
-  Its axes are the principal axes of its inertia. Joint angles are those of `Legs.rest_rad` when the
-  robot is put on the ground.
+- Wheels: it is the base frame. The link's centre of mass is `com_height_m` above it. Wheels turn
+  forward for positive joint speeds.
+- Legs: it is in the middle of the trunk, `Legs.stand_m` above the base frame at rest. Its axes are
+  the principal axes of the link's inertia. Joint angles are those of `Legs.rest_rad` when the robot
+  is put on the ground.
 """
 
 from __future__ import annotations
@@ -64,9 +65,8 @@ class Legs:
     trunk: links that touch the ground only in a fall; "base" is the base link.
     stand_m: height of the base link's frame above the ground at rest.
     span_m: length and width of the rectangle of the feet at rest.
-    cycle_s: duration of a gait cycle, over which speeds and positions are averaged.
+    cycle_s: duration of a cycle of its own gait, over which speeds and positions are averaged.
     gait: row of `physics.dynamics.legs.GAITS`.
-    weights: SHA-256 of the gait's published network, "" without one.
     """
 
     joints: tuple[str, ...]
@@ -80,7 +80,6 @@ class Legs:
     span_m: tuple[float, float]
     cycle_s: float
     gait: Literal["trot", "network"]
-    weights: str = ""
 
     @property
     def pivot_m(self) -> float:
@@ -271,7 +270,6 @@ WALKER = Robot(
         span_m=(0.17, 0.237),
         cycle_s=0.8,
         gait="network",
-        weights="cf668f75b90d1abf73d2b87612a6e76bccc61ff7e083b63582d3f6aaa3c1759d",
     ),
     mounts={
         "front": Mount((0.09, 0.0, 1.20), 10.0),

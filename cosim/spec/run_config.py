@@ -116,7 +116,7 @@ class RunConfig:
         str,
         Option(
             "Gait of a robot with legs in place of its own: onnx:FILE.onnx, with its manifest "
-            "FILE.json beside it.",
+            "FILE.json in the same folder.",
             metavar="onnx:FILE",
             panel=_STREET,
         ),

@@ -70,6 +70,10 @@ class Drive(Protocol):
     def reads_joints(self) -> bool:
         """Whether `BodyNow` must have the joints."""
 
+    @property
+    def cycle_s(self) -> float:
+        """Duration of a gait cycle in seconds, over which speeds are averaged; 0 for wheels."""
+
     def reset(self) -> None:
         """Reset the controller to rest."""
 
@@ -87,6 +91,7 @@ class SkidDrive:
     """
 
     reads_joints = False
+    cycle_s = 0.0
 
     def __init__(self, robot: Robot, skid: Skid, dt_s: float) -> None:
         self._robot = robot

@@ -6,6 +6,7 @@ from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import SUBSTEP_S, Drive, SkidDrive
 from physics.dynamics.legs.gait_file import network_gait, robot_legs, user_gait
 from physics.dynamics.legs.leg_drive import LegDrive
+from physics.dynamics.legs.network_gait import NetworkSetup
 
 
 def drive_of(robot: Robot, dt_s: float) -> Drive:
@@ -15,21 +16,16 @@ def drive_of(robot: Robot, dt_s: float) -> Drive:
     return SkidDrive(robot, robot.drive, dt_s)
 
 
-def gait_drive(robot: Robot, gait: str, dt_s: float = SUBSTEP_S) -> Drive:
-    """Return the drive of a robot with a gait of the user, "onnx:FILE.onnx".
-
-    Raises UsageError or SpecError for a missing, invalid or unsuitable file.
-    """
-    legs = robot_legs(robot, gait)
-    return LegDrive(
-        robot, legs, dt_s, network_gait(robot, legs, dt_s, user_gait(gait, robot, dt_s))
-    )
+def gait_drive(robot: Robot, gait: NetworkSetup, dt_s: float = SUBSTEP_S) -> Drive:
+    """Return the drive of a robot with a gait of the user (`user_gait`)."""
+    legs = robot_legs(robot, gait.manifest.name)
+    return LegDrive(robot, legs, dt_s, network_gait(robot, legs, dt_s, gait), of_user=True)
 
 
 def gait_hash(gait: str, robot: Robot) -> str:
     """Return the hash of the files of a user's gait; "" for the robot's own one.
 
-    Raises as `gait_drive` does, also if the weights of the robot's own gait are missing.
+    Raises as `user_gait` does, also if the weights of the robot's own gait are missing.
     """
     if gait:
         return user_gait(gait, robot, SUBSTEP_S).digest

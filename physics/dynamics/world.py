@@ -72,7 +72,7 @@ class BulletWorld:
 
     surface: ground with buildings and props
     barriers, obstacles: additional static bodies of the episode
-    drive: replaces the robot's own drive
+    drive: replaces the robot's own drive, which is created when the robot is first placed
     """
 
     def __init__(
@@ -87,10 +87,8 @@ class BulletWorld:
         self.robot = robot
         self.barriers = tuple(barriers)
         self.obstacles = tuple(obstacles)
-        self._drive = drive_of(robot, SUBSTEP_S) if drive is None else drive
+        self._drive = drive
         self._watch: LegWatch | None = None
-        if isinstance(robot.drive, Legs):
-            self._watch = LegWatch(robot.drive, SUBSTEP_S)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
         self._loaded_at_m = (0.0, 0.0)
@@ -136,7 +134,7 @@ class BulletWorld:
         """Put the robot at rest at a pose, with its wheels or feet on the ground."""
         bodies = self._engine
         self._load_tiles(pose.x_m, pose.y_m)
-        self._drive.reset()
+        self._own_drive().reset()
         if self._watch is not None:
             self._watch.reset()
         z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
@@ -160,7 +158,7 @@ class BulletWorld:
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
         """Run one tick of physics; people and vehicles move uniformly from `before` to `after`."""
-        bodies = self._engine
+        bodies, drive = self._engine, self._own_drive()
         x, y, _ = pose = bodies.at_m
         self._load_tiles(x, y)
         near: dict[Moving, list[Mover]] = {
@@ -180,7 +178,7 @@ class BulletWorld:
             if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
                 x, y, _ = pose
                 close |= self._watch_near(near, x, y)
-            pose = bodies.step(k, self._drive.step(command, bodies.body_now()))
+            pose = bodies.step(k, drive.step(command, bodies.body_now()))
             trace += pose
             if self._watch is not None:
                 self._watch.add(bodies.speeds())
@@ -192,6 +190,8 @@ class BulletWorld:
         contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
         if self._watch is None:
             return Motion(bodies.robot_state(), poses, contacts)
+        if not all(map(math.isfinite, pose)):
+            raise EngineError(f"PyBullet: the robot with legs is at {pose} (m, m, rad)")
         ground_m = float(self.surface.heights(np.array([bodies.at_m[:2]]))[0])
         touches = bodies.trunk_on_ground()
         robot, down = self._watch.judged(bodies.robot_state(), ground_m, touches)
@@ -250,6 +250,14 @@ class BulletWorld:
         to_unload_m = [_UNLOAD_M - tile_distance(key, x_m, y_m) for key in self._tiles]
         self._loaded_at_m = (x_m, y_m)
         self._reload_after_m = min(to_load_m + to_unload_m) - _ROUNDING_M
+
+    def _own_drive(self) -> Drive:
+        """Return the drive; cameras of a world need none, nor the weights of its gait."""
+        if self._drive is None:
+            self._drive = drive_of(self.robot, SUBSTEP_S)
+        if self._watch is None and isinstance(self.robot.drive, Legs):
+            self._watch = LegWatch(self.robot.drive, self._drive.cycle_s, SUBSTEP_S)
+        return self._drive
 
     @property
     def _engine(self) -> Bodies:

@@ -6,6 +6,7 @@ resources/robots/go2/urdf/go2.urdf. Inertias are those of simple solids of these
 
 from __future__ import annotations
 
+from cosim.spec.robot import DOG
 from physics.robots.model import (
     Joint,
     Link,
@@ -14,6 +15,7 @@ from physics.robots.model import (
     ball_inertia,
     box_inertia,
     rod_inertia,
+    torque_limits_nm,
 )
 
 HIP_AHEAD_M = 0.1934
@@ -29,6 +31,7 @@ FOOT_M = 0.044
 ROTOR_KGM2 = 0.006
 """Inertia of a rotor at its joint."""
 
+_TORQUES_NM = torque_limits_nm(DOG)
 _TRUNK_M = (0.376, 0.094, 0.114)
 _ACROSS = (1.5707963, 0.0, 0.0)
 
@@ -91,7 +94,7 @@ def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]
             (ahead * HIP_AHEAD_M, left * HIP_ASIDE_M, 0.0),
             axis=0,
             range_rad=(-1.0472, 1.0472),
-            torque_nm=23.7,
+            torque_nm=_TORQUES_NM[f"{name}_hip"],
             speed_radps=30.1,
             rotor_kgm2=ROTOR_KGM2,
         ),
@@ -102,7 +105,7 @@ def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]
             (0.0, aside_m, 0.0),
             axis=1,
             range_rad=thigh_rad,
-            torque_nm=23.7,
+            torque_nm=_TORQUES_NM[f"{name}_thigh"],
             speed_radps=30.1,
             rotor_kgm2=ROTOR_KGM2,
         ),
@@ -113,7 +116,7 @@ def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]
             (0.0, 0.0, -SEGMENT_M),
             axis=1,
             range_rad=(-2.7227, -0.83776),
-            torque_nm=35.55,
+            torque_nm=_TORQUES_NM[f"{name}_calf"],
             speed_radps=20.06,
             rotor_kgm2=ROTOR_KGM2,
         ),

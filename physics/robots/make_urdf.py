@@ -22,7 +22,7 @@ MODELS: Final[Mapping[str, Model]] = MappingProxyType(
 
 
 def main() -> None:
-    """Write all files beside this module."""
+    """Write all files to the folder of this module."""
     for name, model in MODELS.items():
         write_atomic(Path(__file__).parent / f"{name}.urdf", model.urdf().encode())
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
+from cosim.spec.robot import Legs, Robot
+
 Triple = tuple[float, float, float]
 
 _ZERO: Triple = (0.0, 0.0, 0.0)
@@ -126,6 +128,12 @@ class Model(NamedTuple):
             if solid.touches:
                 lines.append(f"    <collision>{form}</collision>")
         return [*lines, "  </link>"]
+
+
+def torque_limits_nm(robot: Robot) -> dict[str, float]:
+    """Return the torque limits of a robot with legs by joint."""
+    assert isinstance(robot.drive, Legs)
+    return dict(zip(robot.drive.joints, robot.drive.torque_nm, strict=True))
 
 
 def box_inertia(mass_kg: float, size_m: Triple) -> Triple:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from typing import Final
 
-from physics.robots.model import Joint, Link, Model, Solid, Triple
+from cosim.spec.robot import WALKER
+from physics.robots.model import Joint, Link, Model, Solid, Triple, torque_limits_nm
 
 ROTOR_KGM2: Final = 0.01
 """Inertia of a rotor at its joint."""
 SOLE_M: Final = 0.035
 """Distance of a sole below the roll joint of its ankle, and of its middle ahead of it."""
 
+_TORQUES_NM: Final = torque_limits_nm(WALKER)
 _TILT_RAD: Final = 0.1749
 """Angle by which the roll and yaw joints of a hip are tilted back."""
 _NONE: Triple = (0.0, 0.0, 0.0)
@@ -108,20 +110,19 @@ def _leg_links(side: str, left: float) -> list[Link]:
 def _leg_joints(side: str, left: float) -> list[Joint]:
     outer = (-0.5236, 2.9671) if left > 0 else (-2.9671, 0.5236)
     rows = (
-        ("hip_pitch", (0.0, left * 0.06445, -0.1027), 0.0, 1, (-2.5307, 2.8798), 88.0, 32.0),
-        ("hip_roll", (0.0, left * 0.052, -0.03047), -_TILT_RAD, 0, outer, 139.0, 20.0),
-        ("hip_yaw", (0.025, 0.0, -0.12412), 0.0, 2, (-2.7576, 2.7576), 88.0, 32.0),
+        ("hip_pitch", (0.0, left * 0.06445, -0.1027), 0.0, 1, (-2.5307, 2.8798), 32.0),
+        ("hip_roll", (0.0, left * 0.052, -0.03047), -_TILT_RAD, 0, outer, 20.0),
+        ("hip_yaw", (0.025, 0.0, -0.12412), 0.0, 2, (-2.7576, 2.7576), 32.0),
         (
             "knee",
             (-0.07827, left * 0.00215, -0.17734),
             _TILT_RAD,
             1,
             (-0.08727, 2.8798),
-            139.0,
             20.0,
         ),
-        ("ankle_pitch", (0.0, left * -0.0001, -0.30001), 0.0, 1, (-0.87267, 0.5236), 50.0, 37.0),
-        ("ankle_roll", (0.0, 0.0, -0.01756), 0.0, 0, (-0.2618, 0.2618), 50.0, 37.0),
+        ("ankle_pitch", (0.0, left * -0.0001, -0.30001), 0.0, 1, (-0.87267, 0.5236), 37.0),
+        ("ankle_roll", (0.0, 0.0, -0.01756), 0.0, 0, (-0.2618, 0.2618), 37.0),
     )
     links = ["base", *(link.name for link in _leg_links(side, left))]
     return [
@@ -133,11 +134,11 @@ def _leg_joints(side: str, left: float) -> list[Joint]:
             (0.0, pitch_rad, 0.0),
             axis,
             range_rad,
-            torque_nm,
+            _TORQUES_NM[f"{side}_{name}"],
             speed_radps,
             ROTOR_KGM2,
         )
-        for k, (name, at_m, pitch_rad, axis, range_rad, torque_nm, speed_radps) in enumerate(rows)
+        for k, (name, at_m, pitch_rad, axis, range_rad, speed_radps) in enumerate(rows)
     ]
 
 

@@ -73,8 +73,9 @@ class Episode:
     commands: log of each command before it is simulated.
 
     Raises UsageError for a camera that the robot lacks, for a goal that the policy does not
-    support, and for calls in the wrong order. Raises PolicyError for an invalid command,
-    EngineError when an engine fails or runs already, and the errors of loading its place.
+    support, for a gait whose files differ from the set-up's, and for calls in the wrong order.
+    Raises PolicyError for an invalid command, EngineError when an engine fails or runs already, and
+    the errors of loading its place.
 
     >>> from cosim import load_policy, load_suite
     >>> policy = load_policy("straight")
@@ -154,6 +155,7 @@ class Episode:
                     self._renderer,
                 )
             )
+            self._check_gait(stage.gait_hash)
             if self._through is not None:
                 self._through(stage)
             if self.options.live is not None:
@@ -168,8 +170,10 @@ class Episode:
         self._stage = stage
         self._scorer = stage.scorer
         self._injected = stage.injected
-        drawn = msgspec.structs.replace(self.setup, renderer=stage.renderer)
-        self.record = msgspec.structs.replace(self.record, setup=drawn, scan=stage.scan)
+        setup = msgspec.structs.replace(
+            self.setup, renderer=stage.renderer, gait_hash=stage.gait_hash
+        )
+        self.record = msgspec.structs.replace(self.record, setup=setup, scan=stage.scan)
         self._setup_s = time.perf_counter() - self._began_s
         return self
 
@@ -180,6 +184,15 @@ class Episode:
         at: TracebackType | None,
     ) -> None:
         self.close()
+
+    def _check_gait(self, found: str) -> None:
+        """Raise UsageError if the files of the gait have another hash than those of the set-up."""
+        recorded = self.setup.gait_hash
+        if recorded not in ("", found):
+            raise UsageError(
+                f"gait '{self.setup.gait}': its files have hash {found}, and recorded is "
+                f"{recorded}: restore the files, or begin another run"
+            )
 
     def close(self) -> None:
         """Close all engines; a second call does nothing. `result` remains available."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.core.clock import Clock
-from cosim.core.errors import RunError, UsageError, unknown
+from cosim.core.errors import RunError, unknown
 from cosim.core.progress import Progress, ignore
 from cosim.core.versions import versions
 from cosim.episode.loop import Step
@@ -16,13 +16,12 @@ from cosim.results.log import Log, Tick
 from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records
-from cosim.results.run_setup import appearance_of
+from cosim.results.run_setup import RunSetup, appearance_of
 from cosim.results.traffic import RoadState
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
-from physics.dynamics.drives import gait_hash
 from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.run_episode import drive
@@ -72,27 +71,22 @@ def replay_episode(
         gait=original.record.setup.gait,
         injections=original.record.injections,
     )
-    _check_gait(original)
+    setup = RunSetup.of(options, gait_hash=original.record.setup.gait_hash)
     policy = Replay(original.log.command)
 
     def skip_measures(stage: StagedScenario) -> None:
         stage.scorer.skip_measures()
 
     through = skip_measures if judged_alone else None
-    episode = Episode(original.scenario, policy.manifest, options, watches=watches, through=through)
+    episode = Episode(
+        original.scenario,
+        policy.manifest,
+        options,
+        watches=watches,
+        through=through,
+        setup=setup,
+    )
     return episode, policy
-
-
-def _check_gait(original: RecordedEpisode) -> None:
-    """Raise UsageError if the files of the recorded gait have changed."""
-    setup = original.record.setup
-    if setup.gait_hash:
-        found = gait_hash(setup.gait, robot_called(original.scenario.robot))
-        if found != setup.gait_hash:
-            raise UsageError(
-                f"gait '{setup.gait}': its files have hash {found}, and the episode was recorded "
-                f"with {setup.gait_hash}"
-            )
 
 
 def replay_state_hash(

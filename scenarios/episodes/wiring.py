@@ -38,7 +38,9 @@ from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import join_faults
 from physics.cameras.choice import camera_of, camera_of_choice, drawn_appearance, renderer_of
+from physics.dynamics.drive import SUBSTEP_S
 from physics.dynamics.drives import gait_drive
+from physics.dynamics.legs.gait_file import user_gait
 from physics.dynamics.world import BulletWorld
 from physics.street.furniture import Prop, footprints
 from physics.street.surface import Surface
@@ -67,6 +69,7 @@ class StagedScenario:
     """A scenario whose engines run.
 
     renderer: name of the policy's renderer in records.
+    gait_hash: hash of the files of the user's gait; "" without one.
     scan: look of a scanned place to the policy's cameras; None without either.
     observer: builds observations.
     eyes: creates further cameras.
@@ -76,6 +79,7 @@ class StagedScenario:
     parts: EpisodeEngines
     robot: Robot
     renderer: str
+    gait_hash: str
     scan: ScanLook | None
     scorer: Scorer
     observer: Observer
@@ -108,7 +112,8 @@ def staged(
     with ExitStack() as stack:
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
-        motors = gait_drive(robot, options.gait) if options.gait else None
+        gait = user_gait(options.gait, robot, SUBSTEP_S) if options.gait else None
+        motors = None if gait is None else gait_drive(robot, gait)
         world = stack.enter_context(
             BulletWorld(street, scenario.barriers, robot, scenario.obstacles, motors)
         )
@@ -179,6 +184,7 @@ def staged(
             parts=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
             renderer=renderer,
+            gait_hash="" if gait is None else gait.digest,
             scan=_look_of(street, renderer, options) if camera is not None or cameras else None,
             scorer=Scorer(
                 scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock

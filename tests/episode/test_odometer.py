@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose
-from cosim.episode.observer import Gps, Odometer, WheelOdometer, odometer_for
-from cosim.spec.odometry import LEG_NOISE, GpsNoise, Odometry, WheelNoise
+from cosim.episode.observer import DeadReckoning, Gps, Odometer, odometer_for
+from cosim.spec.odometry import LEG_NOISE, DriftNoise, GpsNoise, Odometry
 from cosim.spec.robot import DOG
 
 START = Pose(10.0, 20.0, 0.5 * math.pi)
@@ -42,7 +42,7 @@ def test_exact_odometry_is_where_the_robot_is_from_its_start() -> None:
 
 def test_wheels_without_errors_count_the_way_and_not_what_carries_the_robot() -> None:
     """A quarter circle of 5 m to the left; then it is put elsewhere, and drives 2 m on."""
-    counted = WheelOdometer(np.random.default_rng(0), WheelNoise(0.0, 0.0, 0.0, 0.0, 0.0))
+    counted = DeadReckoning(np.random.default_rng(0), DriftNoise(0.0, 0.0, 0.0, 0.0, 0.0))
     angles = np.linspace(0.0, 0.5 * math.pi, 200).tolist()
     told = driven(counted, [Pose(5 * math.sin(a), 5 - 5 * math.cos(a), a) for a in angles])
     assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
@@ -75,10 +75,10 @@ def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
 def test_wheels_are_as_wrong_as_declared() -> None:
     """Over 400 episodes of 100 m: scale and noise make the length, drift and noise the heading;
     nothing is wrong of a robot that stands."""
-    noise = WheelNoise()
+    noise = DriftNoise()
     far_m = 100.0
     ends = [
-        driven(WheelOdometer(np.random.default_rng(seed)), straight(far_m)) for seed in range(400)
+        driven(DeadReckoning(np.random.default_rng(seed)), straight(far_m)) for seed in range(400)
     ]
     headings = np.array([one.heading_rad for one in ends if one is not None], dtype=float)
     expected = math.hypot(noise.drift_radpm * far_m, noise.heading_rad * math.sqrt(far_m))
@@ -86,11 +86,11 @@ def test_wheels_are_as_wrong_as_declared() -> None:
         headings.std() == pytest.approx(expected, rel=0.1) and abs(headings.mean()) < 0.2 * expected
     )
     short = [
-        driven(WheelOdometer(np.random.default_rng(seed)), straight(1.0)) for seed in range(400)
+        driven(DeadReckoning(np.random.default_rng(seed)), straight(1.0)) for seed in range(400)
     ]
     lengths = np.array([math.hypot(one.x_m, one.y_m) for one in short if one is not None])
     assert lengths.std() == pytest.approx(math.hypot(noise.scale, noise.along_m), rel=0.1)
-    assert driven(WheelOdometer(np.random.default_rng(1)), [START] * 100) == Odometry(0.0, 0.0, 0.0)
+    assert driven(DeadReckoning(np.random.default_rng(1)), [START] * 100) == Odometry(0.0, 0.0, 0.0)
 
 
 def test_fixes_are_as_wrong_as_declared() -> None:

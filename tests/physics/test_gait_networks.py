@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import math
 import os
 import subprocess
 import sys
@@ -14,16 +16,19 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
-from cosim.core.errors import CosimError, PolicyError, SpecError, UsageError
+from cosim.core.errors import CosimError, EngineError, PolicyError, SpecError, UsageError
+from cosim.core.geometry import Pose
 from cosim.core.state import Command
 from cosim.policies.onnx.graph import Graph
+from cosim.policies.onnx.manifest import file_facts
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.spec.robot import COURIER, DOG, WALKER, Legs
 from physics.dynamics.drive import SUBSTEP_S, BodyNow
-from physics.dynamics.drives import gait_drive
+from physics.dynamics.drives import drive_of, gait_drive
+from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
 from physics.dynamics.legs.gait_graph import network_of_graph
-from physics.dynamics.legs.kinematics import centre_of_mass, link_frames
+from physics.dynamics.legs.leg_drive import LegDrive
 from physics.dynamics.legs.network import (
     Dense,
     Lstm,
@@ -34,7 +39,11 @@ from physics.dynamics.legs.network import (
     tanh,
 )
 from physics.dynamics.legs.walker import WALKER_NETWORK, walker_network
+from physics.dynamics.world import BulletWorld
+from physics.robots import urdf_path
+from physics.robots.kinematics import centre_of_mass, link_tree
 from physics.robots.walker import WALKER_MODEL
+from scenarios.tools.bench.legs import FLAT
 from tests.support.gaits import JOINTS, OBSERVATION, layers_graph, written_gait
 from tests.support.graphs import graph_bytes, port
 
@@ -136,7 +145,7 @@ def test_arrays_of_a_network_make_it_again() -> None:
         ({"2.linear.bias": normal(1, 11)}, r"layer 2 has a weight \(32, 12\) and a bias \(11,\)"),
         ({"1.elu.weight": normal(1, 63, 32)}, "layer 1 takes 63 numbers, and layer 0 has 64"),
         ({"1.elu.bias": np.full(32, np.nan, np.float32)}, "layer 1 has weights that are NaN"),
-        ({"1.elu.bias": np.zeros(32)}, "layer 1 has float32 and float64; wanted is float32"),
+        ({"1.elu.bias": np.zeros(32)}, "layer 1 has float32 and float64; expected float32"),
     ):
         with pytest.raises(ValueError, match=why):
             network_of(whole | change)
@@ -180,8 +189,8 @@ def test_a_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
             assert network.answer(given, ())[0] == pytest.approx(expected, abs=1e-5)
 
 
-def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
-    """With its memory as further inputs and outputs, over several steps."""
+def recurrent_graph() -> bytes:
+    """An LSTM and a layer, with the memory as further inputs and outputs."""
     weights = {
         "w": normal(1, 1, 32, 5),
         "r": normal(2, 1, 32, 8),
@@ -203,7 +212,12 @@ def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
     ]
     memory = [port("h_in", 1, 1, 8), port("c_in", 1, 1, 8)]
     told = [port("actions", 1, 3), port("h_out", 1, 1, 8), port("c_out", 1, 1, 8)]
-    data = graph_bytes(nodes, [port("obs", 1, 5), *memory], told, weights)
+    return graph_bytes(nodes, [port("obs", 1, 5), *memory], told, weights)
+
+
+def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
+    """With its memory as further inputs and outputs, over several steps."""
+    data = recurrent_graph()
     (tmp_path / "g.onnx").write_bytes(data)
     graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
     state = network.empty_memory()
@@ -243,11 +257,42 @@ def test_graphs_of_another_form_are_refused() -> None:
             network_of_graph(data)
 
 
+def test_malformed_graphs_are_refused() -> None:
+    """Operators without inputs, constants of too few dimensions, and random changes of a file."""
+    ends = [port("obs", 1, 4)], [port("out", 1, 4)]
+    held = {"w": normal(1, 4, 4), "v": normal(2, 4), "s": np.float32(1.0)}
+    make = helper.make_node
+    for nodes in (
+        [make("LSTM", [], ["out"])],
+        [make("LSTM", ["obs", "s", "s", "s"], ["out"])],
+        [make("LSTM", ["obs", "v", "v", "v"], ["out"])],
+        [make("LSTM", ["obs", "w", "w", "w"], ["out"])],
+        [make("Gemm", ["obs", "s", "s"], ["out"])],
+        [make("Gemm", ["obs", "w", "w"], ["out"])],
+    ):
+        with pytest.raises(ValueError, match=r"LSTM|Gemm|output|layer"):
+            network_of_graph(graph_bytes(nodes, *ends, held))
+    constant = make("Constant", [], [], value=helper.make_tensor("c", 1, [1], [0.0]))
+    with pytest.raises(ValueError, match="Constant has no output"):
+        network_of_graph(graph_bytes([constant], *ends, held))
+    draws, sound = np.random.default_rng(0), recurrent_graph()
+    for _ in range(500):
+        data = bytearray(sound)
+        for at in draws.integers(0, len(data), 3).tolist():
+            data[at] = int(draws.integers(256))
+        with contextlib.suppress(ValueError, RecursionError), np.errstate(all="ignore"):
+            network_of_graph(bytes(data))
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
         ({"joints": JOINTS | {"tail": JOINTS["rear_left_hip"]}}, "joints has 'tail'.*robot 'dog'"),
         ({"joints": dict(list(JOINTS.items())[1:])}, "joints lacks front_left_hip of robot 'dog'"),
+        (
+            {"balance": {"ankles": ["front_left_calf", "front_right_calf"], "sole_m": 0.0}},
+            "balance is for robots with two feet, and robot 'dog' has 4",
+        ),
         ({"rate_hz": 30}, "rate_hz is 30: an interval must be a multiple of the substep of 5 ms"),
         ({"observation": OBSERVATION[1:]}, "takes 45 numbers, and the observation .* has 42"),
         ({"observation": [{"what": "smell"}]}, "smell"),
@@ -260,9 +305,20 @@ def test_graphs_of_another_form_are_refused() -> None:
             },
             r"kp must be in \[0, 2000\]",
         ),
-        ({"files": {"tiny.onnx": {"bytes": 7, "blake2b": "0" * 64}}}, "wanted is tiny.onnx"),
+        ({"files": {"tiny.onnx": {"bytes": 7, "blake2b": "0" * 64}}}, "expected tiny.onnx"),
     ],
-    ids=["unknown", "missing", "rate", "sizes", "term", "robot", "model", "gain", "hash"],
+    ids=[
+        "unknown",
+        "missing",
+        "balance",
+        "rate",
+        "sizes",
+        "term",
+        "robot",
+        "model",
+        "gain",
+        "hash",
+    ],
 )
 def test_a_gait_that_does_not_fit_its_robot_is_refused(
     changes: dict[str, Any], why: str, tmp_path: Path
@@ -290,6 +346,41 @@ def test_a_gait_is_named_by_its_graph(tmp_path: Path) -> None:
         user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
 
 
+@pytest.mark.parametrize("wrong", ["bytes", "blake2b", "sha256"])
+@pytest.mark.parametrize("names", [("blake2b",), ("sha256",), ("blake2b", "sha256")])
+def test_each_hash_that_a_manifest_gives_is_checked(
+    tmp_path: Path, names: tuple[str, ...], wrong: str
+) -> None:
+    """The right file loads by either hash; another size or hash is refused."""
+    facts = file_facts(layers_graph())
+    given: dict[str, Any] = {"bytes": facts.bytes, **{name: facts.hashes[name] for name in names}}
+    path = written_gait(tmp_path, files={"tiny.onnx": given})
+    assert user_gait(f"onnx:{path}", DOG, SUBSTEP_S).network.sizes == (45, 12)
+    if wrong in given:
+        given[wrong] = 1 if wrong == "bytes" else "0" * 64
+        path = written_gait(tmp_path, files={"tiny.onnx": given})
+        with pytest.raises(UsageError, match=r"tiny\.onnx: .* bytes, .*; expected tiny\.onnx: "):
+            user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
+
+
+def test_speeds_of_a_gait_are_averaged_over_its_own_cycle(tmp_path: Path) -> None:
+    """That of its manifest, or the longest period of a phase, or the robot's."""
+    assert isinstance(DOG.drive, Legs)
+    phases = [{"what": "phase", "period_s": period_s} for period_s in (0.4, 0.7)]
+    for terms, changes, cycle_s in (
+        ([], {}, DOG.drive.cycle_s),
+        (phases, {}, 0.7),
+        (phases, {"cycle_s": 0.5}, 0.5),
+    ):
+        graph = layers_graph(sizes=(45 + 2 * len(terms), 12))
+        path = written_gait(tmp_path, graph, observation=[*OBSERVATION, *terms], **changes)
+        drive = gait_drive(DOG, user_gait(f"onnx:{path}", DOG, SUBSTEP_S))
+        assert drive.cycle_s == cycle_s
+        with BulletWorld(FLAT, robot=DOG, drive=drive) as world:
+            world.place(Pose(0.0, 0.0, 0.0))
+            assert world._watch is not None and world._watch._count == round(cycle_s / SUBSTEP_S)
+
+
 def still_body(**changes: Any) -> BodyNow:
     """A dog at rest."""
     assert isinstance(DOG.drive, Legs)
@@ -304,17 +395,48 @@ def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy
 ) -> None:
     """They name the gait or the joint, and the limit."""
     path = written_gait(tmp_path, layers_graph(scale=1e30))
-    drive = gait_drive(DOG, f"onnx:{path}")
+    drive = gait_drive(DOG, user_gait(f"onnx:{path}", DOG, SUBSTEP_S))
     with (
         np.errstate(all="ignore"),
-        pytest.raises(PolicyError, match=r"gait 'tiny' answered NaN for front_left_hip"),
+        pytest.raises(PolicyError, match=r"gait 'tiny' answered (nan|-?inf) for front_left_hip"),
     ):
-        for _ in range(200):
-            drive.step(Command(1.0, 0.0), still_body())
+        drive.step(Command(1.0, 0.0), still_body())
     strong = {name: row | {"kp": 2000, "scale": 1000} for name, row in JOINTS.items()}
-    drive = gait_drive(DOG, f"onnx:{written_gait(tmp_path, joints=strong)}")
+    gait = user_gait(f"onnx:{written_gait(tmp_path, joints=strong)}", DOG, SUBSTEP_S)
+    drive = gait_drive(DOG, gait)
     with pytest.raises(PolicyError, match=r"joint front_left_hip is .* Nm; its limit is 23.7 Nm"):
         drive.step(Command(1.0, 0.0), still_body())
+
+
+class Fixed:
+    """A gait of constant torques."""
+
+    cycle_s = 0.2
+
+    def __init__(self, torque_nm: float) -> None:
+        self._torques_nm = [torque_nm] * 12
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, command: Command, body: BodyNow) -> list[float]:
+        return self._torques_nm
+
+
+def test_a_shipped_gait_is_clamped_and_its_failures_are_errors_of_the_engine() -> None:
+    """A tumbling robot demands far more than the limits; NaN is no fault of a policy."""
+    assert isinstance(DOG.drive, Legs)
+    tumbles = still_body(speeds_radps=(1e4,) * 12)
+    torques = drive_of(DOG, SUBSTEP_S).step(Command(1.0, 0.0), tumbles).values
+    assert torques == [-most for most in DOG.drive.torque_nm]
+    for torque_nm in (math.inf, -math.inf):
+        strong = LegDrive(DOG, DOG.drive, SUBSTEP_S, Fixed(torque_nm))
+        assert strong.step(Command(1.0, 0.0), still_body()).values[0] == math.copysign(
+            23.7, torque_nm
+        )
+    broken = LegDrive(DOG, DOG.drive, SUBSTEP_S, Fixed(math.nan))
+    with pytest.raises(EngineError, match="torque of joint front_left_hip is nan Nm"):
+        broken.step(Command(1.0, 0.0), still_body())
 
 
 def test_the_posture_of_the_walker_at_rest_is_balanced() -> None:
@@ -322,13 +444,28 @@ def test_the_posture_of_the_walker_at_rest_is_balanced() -> None:
     soles."""
     assert isinstance(WALKER.drive, Legs)
     rest = dict(zip(WALKER.drive.joints, WALKER.drive.rest_rad, strict=True))
-    frames = link_frames(WALKER_MODEL, rest)
+    frames = link_tree(urdf_path(WALKER)).frames(rest)
     for side, left in (("left", 1.0), ("right", -1.0)):
-        (x, y, z), turn = frames[f"{side}_foot"]
+        turn, (x, y, z) = frames[f"{side}_foot"]
         assert z - 0.035 == pytest.approx(-WALKER.drive.stand_m, abs=1e-3)
         assert y == pytest.approx(left * 0.1185, abs=1e-3)
         assert turn[2][2] == pytest.approx(1.0)
         assert centre_of_mass(WALKER_MODEL, frames)[0] - x == pytest.approx(0.035, abs=0.003)
+
+
+def test_a_robot_that_is_upside_down_does_not_balance() -> None:
+    """With its centre of mass below the ankles, or level with them."""
+    assert isinstance(WALKER.drive, Legs)
+    stance = Stance(("left_ankle_pitch", "right_ankle_pitch"), 0.035, (0.0,) * 12, (0.0,) * 12)
+    balance = Balance(WALKER_MODEL, link_tree(urdf_path(WALKER)), WALKER.drive, stance)
+    body = still_body(angles_rad=WALKER.drive.rest_rad)
+    balance.begin(body)
+    assert balance.holds(body)
+    over = list(WALKER.drive.rest_rad)
+    over[0] = over[6] = math.pi
+    body = still_body(angles_rad=tuple(over))
+    balance.begin(body)
+    assert not balance.holds(body)
 
 
 def test_a_walker_without_weights_says_where_they_are_to_be_had(
@@ -338,23 +475,21 @@ def test_a_walker_without_weights_says_where_they_are_to_be_had(
     other."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    assert isinstance(WALKER.drive, Legs)
+    assert isinstance(WALKER.drive, Legs) and WALKER_NETWORK.weights.facts is not None
     with pytest.raises(UsageError) as caught:
         published_gait(WALKER, WALKER.drive, SUBSTEP_S)
     said = str(caught.value)
     assert "robot 'walker': walker.npz is missing, 126154 bytes, BLAKE2b 085c4b6c" in said
-    assert f"145745 bytes, SHA-256 {WALKER.drive.weights}" in said
+    assert f"145745 bytes, SHA-256 {WALKER_NETWORK.weights.facts.sha256}" in said
     assert "`python -m physics.dynamics.legs.walker motion.pt`" in said and "\n" not in said
     assert weights_in_words(WALKER) == ", weights missing (walker.npz)"
     (tmp_path / "walker.npz").write_bytes(b"another")
-    with pytest.raises(UsageError, match=r"walker\.npz: 7 bytes, .*wanted is walker\.npz"):
+    with pytest.raises(UsageError, match=r"walker\.npz: 7 bytes, .*expected walker\.npz"):
         published_gait(WALKER, WALKER.drive, SUBSTEP_S)
 
 
 def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> None:
     """Byte for byte the file that the manifest names, from the published file."""
-    assert WALKER_NETWORK.weights.facts is not None and isinstance(WALKER.drive, Legs)
-    assert WALKER_NETWORK.weights.facts.sha256 == WALKER.drive.weights
     facts = WALKER_NETWORK.graph().facts
     assert facts is not None
     assert (walker_folder / "walker.npz").stat().st_size == facts.bytes
@@ -363,9 +498,7 @@ def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> Non
 def test_another_file_makes_no_arrays(tmp_path: Path) -> None:
     """Neither another file, nor arrays of another network."""
     (tmp_path / "motion.pt").write_bytes(b"no weights")
-    with pytest.raises(
-        UsageError, match=r"motion\.pt: 10 bytes, .*wanted is motion\.pt of unitree"
-    ):
+    with pytest.raises(UsageError, match=r"motion\.pt: 10 bytes, .*expected motion\.pt of unitree"):
         WALKER_NETWORK.write(tmp_path / "motion.pt", tmp_path)
     with pytest.raises(ValueError, match=r"has no 'memory\.weight_ih_l0'"):
         walker_network({})

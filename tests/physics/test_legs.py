@@ -10,26 +10,31 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cosim.core.errors import EngineError
+from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Pose, wrap_angle
-from cosim.core.state import STILL, Command, LegState, Motion, RobotState
+from cosim.core.state import STILL, Command, LegState, Motion, RobotState, Street
 from cosim.spec.camera import CameraSpec
-from cosim.spec.robot import ROBOTS, Legs, Robot
+from cosim.spec.robot import DOG, ROBOTS, Legs, Robot
 from cosim.spec.scenario import Barrier
+from physics.cameras.choice import camera_of
 from physics.cameras.gl.robot_body import link_parts
 from physics.cameras.posture import posture_of
 from physics.cameras.view import robot_shot
 from physics.dynamics.bullet import p
-from physics.dynamics.legs.trot import HIP_ASIDE_M, SEGMENT_M, leg_angles
+from physics.dynamics.drive import BodyNow, Motors
+from physics.dynamics.legs.trot import leg_angles
 from physics.dynamics.legs.watch import LegWatch
 from physics.dynamics.world import BulletWorld
 from physics.robots import urdf_path
+from physics.robots.dog import SEGMENT_M, THIGH_ASIDE_M
 from physics.robots.kinematics import link_tree, turned
 from physics.robots.make_urdf import MODELS
+from physics.street.street_surface import StreetSurface
 from scenarios.tools.bench.legs import (
     FLAT,
     RAMPS,
@@ -44,6 +49,7 @@ from scenarios.tools.bench.legs import (
     walking,
     wander,
 )
+from tests.support.tiny_street import tiny_map
 
 pytestmark = pytest.mark.engine
 
@@ -120,8 +126,8 @@ def test_a_leg_reaches_its_foot() -> None:
             hip, thigh, calf = leg_angles(x, side * y, z, side)
             ahead = -SEGMENT_M * (math.sin(thigh) + math.sin(thigh + calf))
             down = -SEGMENT_M * (math.cos(thigh) + math.cos(thigh + calf))
-            left = side * HIP_ASIDE_M * math.cos(hip) - down * math.sin(hip)
-            up = side * HIP_ASIDE_M * math.sin(hip) + down * math.cos(hip)
+            left = side * THIGH_ASIDE_M * math.cos(hip) - down * math.sin(hip)
+            up = side * THIGH_ASIDE_M * math.sin(hip) + down * math.cos(hip)
             assert (ahead, left, up) == pytest.approx((x, side * y, z))
 
 
@@ -292,7 +298,7 @@ def test_a_low_fence_is_a_collision_of_the_legs_and_the_ground_is_none(robot: Ro
 def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
     """The error has the engine's values; a robot that lies or stands is sound."""
     legs = legs_of(robot)
-    watch = LegWatch(legs, 0.005)
+    watch = LegWatch(legs, legs.cycle_s, 0.005)
     for z_m, sound in ((0.0, True), (-legs.stand_m, True), (-2.0, False), (5.0, False)):
         state = RobotState(Pose(1.0, 2.0, 0.0), z_m=z_m)
         if sound:
@@ -302,6 +308,40 @@ def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
                 watch.judged(state, 0.0, touches=False)
     with pytest.raises(EngineError, match="nan"):
         watch.judged(RobotState(Pose(1.0, 2.0, 0.0), z_m=math.nan), 0.0, touches=False)
+
+
+class Broken:
+    """A drive whose torques are NaN."""
+
+    reads_joints = True
+    cycle_s = 0.2
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, command: Command, body: BodyNow) -> Motors:
+        return Motors([math.nan] * len(body.angles_rad))
+
+
+def test_a_pose_that_is_nan_is_an_engine_error() -> None:
+    """Before the ground below it is looked up, on streets too."""
+    with BulletWorld(StreetSurface(tiny_map(), 0), robot=DOG, drive=Broken()) as world:
+        world.place(Pose(0.0, 0.0, 0.0))
+        with pytest.raises(EngineError, match=r"PyBullet: the robot with legs is at \(nan, nan"):
+            world.step(STILL, Street(0), Street(0), 1)
+
+
+def test_drawing_needs_no_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A world of a walker without weights has a camera; only placing the robot reports them."""
+    monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    with BulletWorld(FLAT, robot=ROBOTS["walker"]) as world:
+        spec = CameraSpec(width=32, height=24)
+        with camera_of("bullet", world, spec) as camera:
+            frame = camera.render(RobotState(Pose(0.0, 0.0, 0.0)), Street(0))
+        assert frame.rgb.shape == (24, 32, 3)
+        with pytest.raises(UsageError, match=r"walker\.npz is missing"):
+            world.place(Pose(0.0, 0.0, 0.0))
 
 
 def test_speeds_are_means_over_a_gait_cycle(walk: Walk) -> None:

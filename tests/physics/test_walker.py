@@ -85,3 +85,22 @@ def test_it_holds_its_place_where_it_cannot_stand_flat(course: Course) -> None:
         walk.drive(STILL, 2.0)
         drift_m, _ = stand(walk, 10.0)
         assert drift_m < 0.1 and walk.fallen == 0
+
+
+def test_a_displaced_robot_without_a_command_stays_where_it_is() -> None:
+    """Carried 1 m aside while it marks time on a slope, it does not walk back: it drifts by less than
+    0.4 m."""
+    slope = Course([(-48.0, 0.0), (0.0, 4.0), (48.0, 0.0)])
+    with walking(WALKER, slope, Pose(-40.0, 0.0, 0.5 * math.pi)) as walk:
+        walk.drive(Command(0.5, 0.0), 1.5)
+        walk.drive(STILL, 1.0)
+        assert not stands(walk)
+        engine = walk.world._engine
+        (x, y, z), turn = p.getBasePositionAndOrientation(engine._robot, engine._client)
+        velocity, spin = p.getBaseVelocity(engine._robot, engine._client)
+        p.resetBasePositionAndOrientation(engine._robot, (x, y + 1.0, z), turn, engine._client)
+        p.resetBaseVelocity(engine._robot, velocity, spin, engine._client)
+        carried = walk.tick(STILL).robot.pose
+        motions = walk.drive(STILL, 3.0)
+        assert max(math.dist(carried.xy, m.robot.pose.xy) for m in motions) < 0.4
+        assert max(abs(m.robot.v_mps) for m in motions[20:]) < 0.3 and walk.fallen == 0

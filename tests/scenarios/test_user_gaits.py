@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -13,10 +14,14 @@ from cosim.core.geometry import Pose
 from cosim.core.state import Command
 from cosim.policies.baselines import Straight
 from cosim.results.run_folder import read_records
+from cosim.results.run_setup import RunSetup
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import DOG
+from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import CrowdSpec, Scenario, Suite, write_suite
+from physics.dynamics.drive import SUBSTEP_S
 from physics.dynamics.drives import gait_drive
+from physics.dynamics.legs.gait_file import user_gait
 from scenarios.episodes.run_episode import run_episode
 from scenarios.tools.bench.legs import FLAT, mean_speeds, stand, straight, walking
 from scenarios.tools.verify.doctor import small_scenario
@@ -56,14 +61,30 @@ def test_a_run_records_its_gait_and_replays_with_it(tmp_path: Path, cosim: Cosim
     assert "as recorded" in cosim("replay", str(run), "a").stdout
     written_gait(tmp_path, layers_graph(seed=1))
     told = cosim("replay", str(run), "a")
-    assert told.returncode == 2 and "the episode was recorded with" in told.stderr
+    assert told.returncode == 2 and "and recorded is" in told.stderr
     told = cosim(*line, "--resume")
     assert told.returncode == 2 and "gait_hash" in told.stderr
 
 
+def test_a_single_episode_records_the_gait_that_moved_it(tmp_path: Path) -> None:
+    """Its hash, and the absolute path; an episode of a run whose files have changed since is
+    invalid, with both hashes."""
+    options = EpisodeOptions(gait=f"onnx:{written_gait(tmp_path)}")
+    with contextlib.chdir(tmp_path):
+        record = run_episode(second("a"), Straight(), EpisodeOptions(gait="onnx:tiny.onnx")).record
+    found = user_gait(options.gait, DOG, SUBSTEP_S).digest
+    assert (record.setup.gait, record.setup.gait_hash) == (options.gait, found)
+    assert EpisodeOptions.asked(RunConfig(suite="s", gait="onnx:tiny.onnx")).gait == (
+        f"onnx:{Path('tiny.onnx').absolute()}"
+    )
+    setup = RunSetup.of(options, gait_hash="0" * 32)
+    record = run_episode(second("a"), Straight(), options, setup=setup).record
+    assert record.status == "invalid" and f"have hash {found}, and recorded is 000" in record.reason
+
+
 @pytest.mark.parametrize(
     ("scale", "kp", "why"),
-    [(1e30, 20, "gait 'tiny' answered NaN for"), (0.1, 2000, "Nm; its limit is 23.7 Nm")],
+    [(1e30, 20, "gait 'tiny' answered "), (0.1, 2000, "Nm; its limit is 23.7 Nm")],
     ids=["nan", "torque"],
 )
 def test_a_gait_that_fails_crashes_the_episode_with_the_reason(
@@ -83,7 +104,9 @@ def test_a_published_network_walks_as_a_gait_of_the_dog(tmp_path: Path) -> None:
     if not (PUBLISHED / "policy.pt").is_file():
         pytest.skip(f"the published network {PUBLISHED}/policy.pt is missing (COSIM_WEIGHTS)")
     gait = robot_lab_gait(tmp_path, PUBLISHED)
-    with walking(DOG, FLAT, START, gait_drive(DOG, f"onnx:{gait}")) as walk:
+    with walking(
+        DOG, FLAT, START, gait_drive(DOG, user_gait(f"onnx:{gait}", DOG, SUBSTEP_S))
+    ) as walk:
         found = straight(walk, 1.0)
         assert found.time_s < 12.0 and found.aside_m < 0.3 and not found.fallen
         drift_m, turned_deg = stand(walk, 10.0)

@@ -89,7 +89,7 @@ class PublishedArrays:
         numbers = self._arrays[name]
         if shape is not None and (numbers.shape != shape or numbers.dtype != np.float32):
             raise ValueError(
-                f"'{name}' is {numbers.dtype} {numbers.shape}; wanted is float32 {shape}"
+                f"'{name}' is {numbers.dtype} {numbers.shape}; expected float32 {shape}"
             )
         self._unused.discard(name)
         return numbers

@@ -58,6 +58,8 @@ def read_nodes(data: bytes) -> GraphNodes:
         node = _node(part)
         value = node.attributes.get("value")
         if node.kind == "Constant" and isinstance(value, np.ndarray):
+            if not node.outputs:
+                raise ValueError("Constant has no output")
             constants[node.outputs[0]] = value
         else:
             nodes.append(node)

@@ -81,6 +81,12 @@ class FileFacts(Ranged, frozen=True, kw_only=True):
         """Hashes by name; "" for a missing one."""
         return {"blake2b": self.blake2b, "sha256": self.sha256}
 
+    def matches(self, found: FileFacts) -> bool:
+        """Return whether a file's size and each hash given here are those found."""
+        return self.bytes == found.bytes and all(
+            digits in ("", found.hashes[name]) for name, digits in self.hashes.items()
+        )
+
     @property
     def in_words(self) -> str:
         """Size and hashes as text for error messages."""

@@ -54,10 +54,10 @@ class NetworkFile:
         if self.facts is None:
             return
         found = file_facts(data)
-        if (found.bytes, found.blake2b) != (self.facts.bytes, self.facts.blake2b):
+        if not self.facts.matches(found):
+            of = f" of {self.source}" if self.source else ""
             raise UsageError(
-                f"{path}: {found.bytes} bytes, BLAKE2b {found.blake2b}; wanted is {self.name} of "
-                f"{self.source}: {self.facts.in_words}"
+                f"{path}: {found.in_words}; expected {self.name}{of}: {self.facts.in_words}"
             )
 
 

@@ -1,4 +1,4 @@
-"""Robot body from the shapes of its URDF: boxes, cylinders, spheres and mesh files in their colours."""
+"""Robot body from the shapes of its URDF: boxes, cylinders, spheres and mesh files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def link_parts(urdf: Path) -> dict[str, tuple[Part, ...]]:
     for link in root.findall("link"):
         parts = []
         for visual in link.findall("visual"):
-            turn, shift = origin_of(visual)
+            turn, shift = map(np.array, origin_of(visual))
             mesh = _shape(visual, urdf)
             material = visual.find("material")
             name = material.get("name", "") if material is not None else ""

@@ -8,14 +8,14 @@ which returns to the middle of the soles.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from cosim.spec.robot import Legs
 from physics.dynamics.drive import BodyNow
-from physics.dynamics.legs.kinematics import Frames, centre_of_mass, link_frames
 from physics.dynamics.legs.pd import torques_nm
+from physics.robots.kinematics import Frame, LinkTree, centre_of_mass, rotate, rows_of
 from physics.robots.model import Model, Triple
 
 _GRAVITY_MPS2: Final = 9.81
@@ -47,8 +47,9 @@ class Stance:
 class Balance:
     """Balance of one robot that stands on both feet."""
 
-    def __init__(self, model: Model, legs: Legs, stance: Stance) -> None:
+    def __init__(self, model: Model, tree: LinkTree, legs: Legs, stance: Stance) -> None:
         self._model = model
+        self._tree = tree
         self._legs = legs
         self._stance = stance
         self._ankles = [legs.joints.index(name) for name in stance.ankles]
@@ -61,9 +62,8 @@ class Balance:
     def lifted_m(self, body: BodyNow) -> float:
         """Return the height of the left ankle over the right one."""
         left, right = self._feet(self._frames(body))
-        m = body.rotation
-        x, y, z = left[0] - right[0], left[1] - right[1], left[2] - right[2]
-        return m[6] * x + m[7] * y + m[8] * z
+        apart = left[0] - right[0], left[1] - right[1], left[2] - right[2]
+        return rotate(rows_of(body.rotation), apart)[2]
 
     def begin(self, body: BodyNow) -> None:
         """Freeze the joints at their present angles."""
@@ -75,10 +75,16 @@ class Balance:
         self._arm_m = x - half[0], y - half[1], z - half[2]
         mx, my, mz = self._model.links[0].middle_m
         self._behind_m = x - mx, y - my, z - mz
-        self._omega_hz = math.sqrt(_GRAVITY_MPS2 / self._arm_m[2])
+        upright = self._arm_m[2] > 0.0
+        self._omega_hz = math.sqrt(_GRAVITY_MPS2 / self._arm_m[2]) if upright else 0.0
 
     def holds(self, body: BodyNow) -> bool:
-        """Return whether ankle torques can keep the balance."""
+        """Return whether ankle torques can keep the balance.
+
+        They cannot if the centre of mass was not above the ankles when the joints were frozen.
+        """
+        if not self._omega_hz:
+            return False
         ahead, left = self._capture_m(body)
         return _HOLDS_M[0] < ahead < _HOLDS_M[1] and abs(left) < _ASIDE_M
 
@@ -96,34 +102,25 @@ class Balance:
     def _capture_m(self, body: BodyNow) -> tuple[float, float]:
         """Return the capture point ahead and to the left of the middle of the ankles."""
         m, (vx, vy, _), (wx, wy, wz) = body.rotation, body.velocity_mps, body.spin_radps
-        x, y, _ = _turned(m, self._arm_m)
-        dx, dy, dz = _turned(m, self._behind_m)
+        turn = rows_of(m)
+        x, y, _ = rotate(turn, self._arm_m)
+        dx, dy, dz = rotate(turn, self._behind_m)
         x += (vx + wy * dz - wz * dy) / self._omega_hz
         y += (vy + wz * dx - wx * dz) / self._omega_hz
         far = math.hypot(m[0], m[3])
         cos, sin = m[0] / far, m[3] / far
         return cos * x + sin * y, cos * y - sin * x
 
-    def _frames(self, body: BodyNow) -> Frames:
+    def _frames(self, body: BodyNow) -> Mapping[str, Frame]:
         angles = dict(zip(self._legs.joints, body.angles_rad, strict=True))
-        return link_frames(self._model, angles)
+        return self._tree.frames(angles)
 
-    def _feet(self, frames: Frames) -> tuple[Triple, Triple]:
+    def _feet(self, frames: Mapping[str, Frame]) -> tuple[Triple, Triple]:
         """Return the positions of both ankles in the base frame."""
         left, right = (
-            frames[joint.child][0]
+            frames[joint.child][1]
             for name in self._stance.ankles
-            for joint in self._model.joints
+            for joint in self._tree.joints
             if joint.name == name
         )
         return left, right
-
-
-def _turned(m: Sequence[float], v: Triple) -> Triple:
-    """Return a vector that is rotated by a matrix of nine entries."""
-    x, y, z = v
-    return (
-        m[0] * x + m[1] * y + m[2] * z,
-        m[3] * x + m[4] * y + m[5] * z,
-        m[6] * x + m[7] * y + m[8] * z,
-    )

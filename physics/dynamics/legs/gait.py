@@ -12,6 +12,10 @@ from physics.dynamics.drive import BodyNow
 class Gait(Protocol):
     """Gait of one robot with legs."""
 
+    @property
+    def cycle_s(self) -> float:
+        """Duration of a gait cycle in seconds, over which speeds are averaged."""
+
     def reset(self) -> None:
         """Return to the first state: the robot stands at rest."""
 

@@ -1,4 +1,4 @@
-"""Load a gait: its manifest, and the network beside it or in a folder of weights."""
+"""Load a gait: its manifest, and the network in the same folder or in a folder of weights."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Final
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.npz import read_open_npz
 from cosim.policies.onnx.weights import NetworkFile, read_file, weights_file
+from cosim.spec.options import ONNX_GAIT
 from cosim.spec.robot import ROBOTS, Legs, Robot
 from physics.dynamics.legs.gait_graph import network_of_graph
 from physics.dynamics.legs.gait_manifest import GaitManifest, read_gait_manifest
@@ -18,20 +19,21 @@ from physics.dynamics.legs.network_gait import NetworkGait, NetworkSetup
 from physics.robots import gait_path
 from physics.robots.make_urdf import MODELS
 
-_ONNX: Final = "onnx:"
 _MOST_BYTES: Final = 64 << 20
 """Largest size of a gait's network in bytes."""
 
 
 def user_gait(name: str, robot: Robot, substep_s: float) -> NetworkSetup:
-    """Load the gait `onnx:FILE.onnx` with the manifest FILE.json beside it.
+    """Load the gait `onnx:FILE.onnx` with the manifest FILE.json in the same folder.
 
     Raises UsageError or SpecError for a missing, invalid or unsuitable file.
     """
     robot_legs(robot, name)
-    path = Path(name.removeprefix(_ONNX))
-    if not name.startswith(_ONNX) or path.suffix != ".onnx":
-        raise UsageError(f"gait '{name}': use onnx:FILE.onnx, with its manifest FILE.json beside")
+    path = Path(name.removeprefix(ONNX_GAIT))
+    if not name.startswith(ONNX_GAIT) or path.suffix != ".onnx":
+        raise UsageError(
+            f"gait '{name}': use onnx:FILE.onnx, with its manifest FILE.json in the same folder"
+        )
     if not path.is_file():
         raise UsageError(f"gait '{name}': {path} does not exist")
     manifest_path = path.with_suffix(".json")
@@ -97,8 +99,8 @@ def _model_path(manifest_path: Path, manifest: GaitManifest) -> Path:
     """Return the path of a gait's network. Raises UsageError if it is missing."""
     facts = manifest.files.get(manifest.model)
     user = f"gait '{manifest.name}' of robot '{manifest.robot}'"
-    beside = [manifest_path.parent] if manifest.model.endswith(".onnx") else []
-    return weights_file(user, manifest.model, facts, manifest.source, beside)
+    folders = [manifest_path.parent] if manifest.model.endswith(".onnx") else []
+    return weights_file(user, manifest.model, facts, manifest.source, folders)
 
 
 def _network(path: Path, data: bytes) -> Network:

@@ -46,7 +46,7 @@ class _Chain:
     def network(self) -> Network:
         """Read all operators."""
         for node in self._graph.nodes:
-            if node.kind == "LSTM" and node.inputs[0] in self._names:
+            if node.kind == "LSTM" and node.inputs[:1] and node.inputs[0] in self._names:
                 self._lstm(node)
             elif any(name in self._names for name in node.inputs):
                 self._read(node)
@@ -73,9 +73,9 @@ class _Chain:
             self._dense(node)
         else:
             self._shift(node)
-        self._go_on(node.outputs[:1])
+        self._continue_with(node.outputs[:1])
 
-    def _go_on(self, names: Sequence[str]) -> None:
+    def _continue_with(self, names: Sequence[str]) -> None:
         self._past |= self._names
         self._names = {name for name in names if name}
 
@@ -120,13 +120,20 @@ class _Chain:
             raise ValueError("LSTM must be of one direction, with its usual activations")
         if len(node.inputs) > 7 and node.inputs[7]:
             raise ValueError("LSTM has peepholes, which are not read")
-        given, own, bias = (self._constant(node, k)[0] for k in (1, 2, 3))
-        size = own.shape[1]
+        given, own, bias = (self._constant(node, k) for k in (1, 2, 3))
+        size = own.shape[-1] if own.ndim else 0
+        shapes = given.shape[:2], own.shape, bias.shape
+        if given.ndim != 3 or shapes != ((1, 4 * size), (1, 4 * size, size), (1, 8 * size)):
+            raise ValueError(
+                f"LSTM has weights {given.shape} and {own.shape}, and a bias {bias.shape}; "
+                "expected (1, 4 n, inputs), (1, 4 n, n) and (1, 8 n)"
+            )
+        given, own, bias = given[0], own[0], bias[0]
         order = np.r_[0:size, 2 * size : 3 * size, 3 * size : 4 * size, size : 2 * size]
         weight, more = self._folded(given[order].T)
         total = (bias[: 4 * size] + bias[4 * size :])[order] + more
         self._layers.append(Lstm(_narrow(np.concatenate([weight, own[order].T])), _narrow(total)))
-        self._go_on(node.outputs[:2])
+        self._continue_with(node.outputs[:2])
 
     def _shift(self, node: Node) -> None:
         """Add a constant to the last layer, or note a constant for the next one."""

@@ -140,14 +140,17 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     """Manifest of a gait.
 
     robot: robot that it moves.
-    model: file of the network beside the manifest, .onnx or .npz.
+    model: file of the network in the folder of the manifest, .onnx or .npz.
     files: size and hashes of the model.
     joints: all joints of the robot, in the order of the network.
     observation: parts of the network's input, in its order.
+    cycle_s: duration of a gait cycle, over which speeds are averaged; by default the longest period
+        of a `phase`, or else the robot's `Legs.cycle_s`.
     most_observed, most_answered: limits of the magnitudes of inputs and outputs.
     most_memory: magnitude of the memory of an LSTM above which the memory is emptied.
     speed, turn: corrections of the commands.
-    balance: standing of a biped; without it, the network holds the place by small commands.
+    balance: standing of a robot with two feet; without it, the network holds the place by small
+        commands.
     """
 
     format: Literal[1]
@@ -160,6 +163,7 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Within(5, 200)]
     joints: dict[str, GaitJoint]
     observation: Annotated[list[Term], ItemCount(1, 32)]
+    cycle_s: Annotated[float, Within(0.05, 10)] | None = None
     most_observed: Annotated[float, Within(0, 1e6, above=True)] = 100.0
     most_answered: Annotated[float, Within(0, 1e6, above=True)] = 100.0
     most_memory: Annotated[float, Within(0, 1e6, above=True)] = 1e6
@@ -176,6 +180,11 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
         """Numbers of inputs and outputs of the network."""
         return sum(term.count(len(self.joints)) for term in self.observation), len(self.joints)
 
+    def cycle_of(self, legs: Legs) -> float:
+        """Return the duration of a gait cycle in seconds."""
+        periods_s = [term.period_s for term in self.observation if isinstance(term, Phase)]
+        return self.cycle_s or max(periods_s, default=legs.cycle_s)
+
     def contradictions(self) -> Iterator[str]:
         if not self.model.endswith((".onnx", ".npz")):
             yield f"model must end in .onnx or .npz, not {self.model!r}"
@@ -185,7 +194,7 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
                     yield f"balance.ankles names {name!r}, which is not in joints"
 
     def check_robot(self, robot: Robot, substep_s: float) -> None:
-        """Raise SpecError unless the gait fits the robot: joints, rate and torques."""
+        """Raise SpecError unless the gait fits the robot: joints, rate and balance."""
         legs = robot.drive
         if robot.name != self.robot or not isinstance(legs, Legs):
             raise SpecError(f"is a gait of robot '{self.robot}', not of '{robot.name}'")
@@ -196,6 +205,11 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
             )
         if missing := [name for name in legs.joints if name not in self.joints]:
             raise SpecError(f"joints lacks {', '.join(missing)} of robot '{robot.name}'")
+        if self.balance is not None and len(legs.feet) != 2:
+            raise SpecError(
+                f"balance is for robots with two feet, and robot '{robot.name}' has "
+                f"{len(legs.feet)}: leave it out"
+            )
         every = 1.0 / (self.rate_hz * substep_s)
         if abs(every - round(every)) > 1e-9:
             raise SpecError(

@@ -24,7 +24,10 @@ GAITS: Final[Mapping[str, Callable[[Robot, Legs, float], Gait]]] = MappingProxyT
 """Gaits by name. The arguments are the robot, its legs and the duration of a substep in seconds."""
 
 _NONSENSE: Final = 20.0
-"""Largest torque of a gait, as a multiple of the joint's limit. Impacts of the feet cause some."""
+"""Largest torque of a user's gait, as a multiple of the joint's limit.
+
+Impacts of the feet cause some torques beyond the limit.
+"""
 
 
 class LegDrive:
@@ -32,13 +35,24 @@ class LegDrive:
 
     dt_s: duration of a substep
     gait: replaces the robot's own gait
+    of_user: whether a failure of the gait is a PolicyError, not an EngineError
     """
 
     reads_joints = True
 
-    def __init__(self, robot: Robot, legs: Legs, dt_s: float, gait: Gait | None = None) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        legs: Legs,
+        dt_s: float,
+        gait: Gait | None = None,
+        *,
+        of_user: bool = False,
+    ) -> None:
+        self._of_user = of_user
         self._legs = legs
         self._gait = GAITS[legs.gait](robot, legs, dt_s) if gait is None else gait
+        self.cycle_s = self._gait.cycle_s
         self._settle = round(SETTLE_S / dt_s)
         self.reset()
 
@@ -57,22 +71,30 @@ class LegDrive:
                 f"PyBullet: the robot is at {body.at_m} m, its joints at {body.angles_rad} rad "
                 f"with {body.speeds_radps} rad/s"
             )
-        return Motors(self._limited(self._gait.step(command, body)))
+        try:
+            torques_nm = self._gait.step(command, body)
+        except PolicyError as error:
+            if self._of_user:
+                raise
+            raise EngineError(str(error)) from error
+        return Motors(self._limited(torques_nm))
 
     def _limited(self, torques_nm: Sequence[float]) -> list[float]:
         """Return torques within the joints' limits.
 
-        Raises PolicyError for NaN, and for a torque that is far beyond its limit.
+        Raises PolicyError for NaN, and for a torque that is far beyond its limit, of a user's gait.
+        Raises EngineError for NaN of the robot's own gait.
         """
         limited: list[float] = []
         for torque, most in zip(torques_nm, self._legs.torque_nm, strict=True):
             if -most <= torque <= most:
                 limited.append(torque)
-            elif abs(torque) < _NONSENSE * most:  # not for NaN
+            elif abs(torque) < _NONSENSE * most or not (self._of_user or math.isnan(torque)):
                 limited.append(math.copysign(most, torque))
             else:
                 name = self._legs.joints[len(limited)]
-                raise PolicyError(
+                fault = PolicyError if self._of_user else EngineError
+                raise fault(
                     f"gait of the robot: torque of joint {name} is {torque:.4g} Nm; its limit is "
                     f"{most:g} Nm, and gaits may exceed it {_NONSENSE:g} times at most"
                 )

@@ -132,7 +132,7 @@ def network_of(arrays: Mapping[str, NDArray[Any]]) -> Network:
         if weight is None or bias is None:
             raise ValueError(f"has no weight and bias of layer {i}")
         if weight.dtype != np.float32 or bias.dtype != np.float32:
-            raise ValueError(f"layer {i} has {weight.dtype} and {bias.dtype}; wanted is float32")
+            raise ValueError(f"layer {i} has {weight.dtype} and {bias.dtype}; expected float32")
         layers.append(Dense(weight, bias, found[0]) if found else Lstm(weight, bias))
     if len(arrays) != 2 * len(layers):
         raise ValueError(f"has {len(arrays)} arrays, an odd number")

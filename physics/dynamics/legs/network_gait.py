@@ -1,5 +1,8 @@
 """Gait of a neural network: observations, target angles, corrections of speed, and standing.
 
+Commands reach the network at once, without the ramps of the robot's row: the network changes its
+speed about as fast as these ramps, and stops later with ramps in front of it (docs/robots.md).
+
 The network decides at its own rate; torques follow its targets in every substep. Without a command
 a biped balances on frozen joints (`balance.py`). Other robots, and a biped whose feet are not
 level, hold their place by small commands to the network.
@@ -33,12 +36,18 @@ from physics.dynamics.legs.gait_manifest import (
 )
 from physics.dynamics.legs.network import Network
 from physics.dynamics.legs.pd import torques_nm
+from physics.robots import urdf_path
+from physics.robots.kinematics import inverse, link_tree, rotate, rows_of
 from physics.robots.model import Model
 
 _HOLD_HZ: Final = 2.0
 """Speed per distance from the place that is held."""
-_HOLD_MOST: Final = 0.6
-"""Largest speed in m/s, and yaw rate in rad/s, of a robot that holds its place."""
+_HOLD_MPS: Final = 0.2
+"""Largest speed of a robot that holds its place."""
+_HOLD_RADPS: Final = 0.6
+"""Largest yaw rate of a robot that holds its place."""
+_ANCHOR_M: Final = 0.1
+"""Distance from the held place above which a displaced robot holds its present place."""
 _SLOW_MPS: Final = 0.08
 """Mean speed over a gait cycle below which a robot may stand."""
 _SLOW_RADPS: Final = 0.1
@@ -92,9 +101,10 @@ class NetworkGait:
                 tuple(row.stand_kp for row in of),
                 tuple(row.stand_kd for row in of),
             )
-            self._balance = Balance(model, legs, stance)
+            self._balance = Balance(model, link_tree(urdf_path(robot)), legs, stance)
         self._steady = round(_STEADY_S / dt_s)
-        self._cycle = max(round(legs.cycle_s / self._decision_s), 1)
+        self.cycle_s = manifest.cycle_of(legs)
+        self._cycle = max(round(self.cycle_s / self._decision_s), 1)
         self.reset()
 
     def reset(self) -> None:
@@ -120,41 +130,41 @@ class NetworkGait:
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
         self._v_mps, self._w_radps = command.v_mps, command.w_radps
-        asked = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
+        commanded = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
         if self._balance is not None and self._stands:
             if not self._frozen:
                 self._balance.begin(body)
                 self._frozen = True
-            if not asked and self._balance.holds(body):
+            if not commanded and self._balance.holds(body):
                 self._stood += 1
                 return self._balance.torques_nm(body)
-            self._leave_stance(asked)
+            self._leave_stance(commanded)
         if self._count % self._every == 0:
-            self._decide(asked, body)
+            self._decide(commanded, body)
             if self._stands and self._balance is not None:
                 return self._balance.torques_nm(body)
         self._count += 1
         return torques_nm(*self._gains, self._targets, body)
 
-    def _leave_stance(self, asked: bool) -> None:
+    def _leave_stance(self, commanded: bool) -> None:
         """Let the network walk again.
 
         If the robot has not stood for long, as across a slope, it marks time until it walks again.
         """
         place = self._place
-        self._may_stand = asked or self._stood >= self._steady
+        self._may_stand = commanded or self._stood >= self._steady
         self._stands = self._frozen = False
         self._start()
         if not self._may_stand:
             self._place = place
 
-    def _decide(self, asked: bool, body: BodyNow) -> None:
+    def _decide(self, commanded: bool, body: BodyNow) -> None:
         """Query the network, or let the robot stand."""
         m = body.rotation
         x, y, _ = body.at_m
         heading = math.atan2(m[3], m[0])
         self._past.append((x, y, heading))
-        if asked:
+        if commanded:
             self._place, self._idle_s, self._may_stand = None, 0.0, self._balance is not None
             self._lifted.clear()
             command = self._corrected(body)
@@ -169,10 +179,12 @@ class NetworkGait:
             if self._stands:
                 return
             self._idle_s += self._decision_s
+            if self._place is not None and math.dist(self._place[:2], (x, y)) > _ANCHOR_M:
+                self._place = x, y, heading
             if self._place is None and (slow or self._idle_s > _HOLD_AFTER_S):
                 self._place = x, y, heading
             command = self._holding(x, y, heading)
-        self._ask(command, body)
+        self._query(command, body)
 
     def _on_both_feet(self) -> bool:
         """Return whether both feet are on the ground.
@@ -224,12 +236,15 @@ class NetworkGait:
             return 0.0, 0.0, 0.0
         dx, dy = self._place[0] - x_m, self._place[1] - y_m
         cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-        wanted = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
-        v, u, w = (min(max(_HOLD_HZ * one, -_HOLD_MOST), _HOLD_MOST) for one in wanted)
+        errors = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
+        v, u, w = (
+            min(max(_HOLD_HZ * one, -most), most)
+            for one, most in zip(errors, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
+        )
         return v, u, w
 
-    def _ask(self, command: tuple[float, float, float], body: BodyNow) -> None:
-        """Let the network set the target angles. Raises PolicyError for NaN."""
+    def _query(self, command: tuple[float, float, float], body: BodyNow) -> None:
+        """Let the network set the target angles. Raises PolicyError for NaN and infinity."""
         manifest = self._manifest
         seen = [
             term.scale * value
@@ -241,15 +256,16 @@ class NetworkGait:
         answer, self._memory = self._network.answer(given, self._memory)
         if any(np.abs(one).max() > manifest.most_memory for one in self._memory):
             self._memory = self._network.empty_memory()  # after a stumble it would walk askew
-        most = manifest.most_answered
-        self._actions = [min(max(value, -most), most) for value in answer.tolist()]
-        if not all(map(math.isfinite, self._actions)):
+        values = answer.tolist()
+        if not all(map(math.isfinite, values)):
             bad = [
-                name
-                for name, value in zip(manifest.joints, self._actions, strict=True)
+                f"{value} for {name}"
+                for name, value in zip(manifest.joints, values, strict=True)
                 if not math.isfinite(value)
             ]
-            raise PolicyError(f"gait '{manifest.name}' answered NaN for {', '.join(bad)}")
+            raise PolicyError(f"gait '{manifest.name}' answered {', '.join(bad)}")
+        most = manifest.most_answered
+        self._actions = [min(max(value, -most), most) for value in values]
         targets = [0.0] * len(self._order)
         for k, rest, scale, action in zip(
             self._order, self._rest, self._scales, self._actions, strict=True
@@ -263,9 +279,9 @@ class NetworkGait:
         """Return the numbers of a part of the observation, before its scale."""
         m = body.rotation
         if isinstance(term, AngularVelocity):
-            return _in_trunk(m, body.spin_radps)
+            return rotate(inverse(rows_of(m)), body.spin_radps)
         if isinstance(term, LinearVelocity):
-            return _in_trunk(m, body.velocity_mps)
+            return rotate(inverse(rows_of(m)), body.velocity_mps)
         if isinstance(term, Gravity):
             return -m[6], -m[7], -m[8]
         if isinstance(term, CommandTerm):
@@ -284,16 +300,6 @@ class NetworkGait:
             * math.fmod(self._count // self._every * self._decision_s / term.period_s, 1.0)
         )
         return math.sin(turns), math.cos(turns)
-
-
-def _in_trunk(m: Sequence[float], v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a vector of the world in the frame with a rotation matrix of nine entries."""
-    x, y, z = v
-    return (
-        m[0] * x + m[3] * y + m[6] * z,
-        m[1] * x + m[4] * y + m[7] * z,
-        m[2] * x + m[5] * y + m[8] * z,
-    )
 
 
 def _wrapped(angle_rad: float) -> float:

@@ -17,12 +17,11 @@ from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import BodyNow, towards
 from physics.dynamics.legs.pd import torques_nm
+from physics.robots.dog import HIP_AHEAD_M, HIP_ASIDE_M, SEGMENT_M, THIGH_ASIDE_M
 
-HIP_ASIDE_M: Final = 0.0955
-"""Distance in metres of a leg's plane from its hip joint."""
-SEGMENT_M: Final = 0.213
-"""Length in metres of thigh and calf."""
-HIPS_M: Final = ((0.1934, 0.0465), (0.1934, -0.0465), (-0.1934, 0.0465), (-0.1934, -0.0465))
+_HIPS_M: Final = tuple(
+    (ahead * HIP_AHEAD_M, left * HIP_ASIDE_M) for ahead in (1.0, -1.0) for left in (1.0, -1.0)
+)
 """Hip joints in the trunk's frame: front left, front right, rear left, rear right."""
 _SIDES: Final = (1.0, -1.0, 1.0, -1.0)
 _PAIRS: Final = ((0, 3), (1, 2))
@@ -33,7 +32,7 @@ _STILL: Final = 1e-9
 
 
 class TrotGains(NamedTuple):
-    """Numbers of the trot, found by `scenarios.tools.bench.legs`.
+    """Numbers of the trot, found by `scenarios.tools.bench.search_trot`.
 
     half_period_s: duration of one pair's swing.
     height_m: height of the trunk's middle over the balls of the feet.
@@ -89,9 +88,9 @@ def leg_angles(x_m: float, y_m: float, z_m: float, side: float) -> tuple[float, 
 
     side: 1 for a left leg, -1 for a right one. Points out of reach are approached.
     """
-    down2 = y_m * y_m + z_m * z_m - HIP_ASIDE_M * HIP_ASIDE_M
+    down2 = y_m * y_m + z_m * z_m - THIGH_ASIDE_M * THIGH_ASIDE_M
     down_m = math.sqrt(max(down2, 1e-4))
-    hip = math.atan2(y_m, -z_m) - math.atan2(side * HIP_ASIDE_M, down_m)
+    hip = math.atan2(y_m, -z_m) - math.atan2(side * THIGH_ASIDE_M, down_m)
     far_m = math.sqrt(x_m * x_m + down_m * down_m)
     far_m = min(max(far_m, _REACH_M[0]), _REACH_M[1])
     half = math.acos(far_m / (2.0 * SEGMENT_M))
@@ -103,10 +102,11 @@ class Trot:
 
     def __init__(self, robot: Robot, legs: Legs, dt_s: float, gains: TrotGains = GAINS) -> None:
         self._ramps = robot.acceleration_mps2 * dt_s, robot.acceleration_radps2 * dt_s
+        self.cycle_s = legs.cycle_s
         self._legs = legs
         self._dt_s = dt_s
         self._gains = gains
-        aside = HIP_ASIDE_M + gains.aside_m
+        aside = THIGH_ASIDE_M + gains.aside_m
         self._neutral = [(gains.ahead_m, side * aside) for side in _SIDES]
         self.reset()
 
@@ -135,9 +135,9 @@ class Trot:
         self._v_mps = towards(self._v_mps, command.v_mps, self._ramps[0])
         self._w_radps = towards(self._w_radps, command.w_radps, self._ramps[1])
         tilt = math.hypot(m[6], m[7])
-        asked = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
+        commanded = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
         shaken = math.hypot(ahead, left) > gains.shake_mps or tilt > gains.shake_rad
-        if asked or shaken:
+        if commanded or shaken:
             if not self._left_steps:
                 self._begin()
             self._left_steps = _STEPS_TO_STAND
@@ -178,7 +178,7 @@ class Trot:
         self._left_m = min(max(self._left_m + left * dt_s, -_ASTRAY_M), _ASTRAY_M)
         aside = gains.y_share * left + gains.y_gain_hz * self._left_m
         for leg in _PAIRS[1 - self._swings]:
-            foot, (hip_x, hip_y) = self._feet[leg], HIPS_M[leg]
+            foot, (hip_x, hip_y) = self._feet[leg], _HIPS_M[leg]
             x, y = hip_x + foot[0], hip_y + foot[1]
             foot[0] -= (v - w * y) * dt_s
             foot[1] -= (w * x - aside) * dt_s
@@ -193,7 +193,7 @@ class Trot:
         shift_y = left * half_s + gains.catch_s * left
         spin = turn * half_s + gains.catch_s * (turn - self._w_radps)
         for leg in _PAIRS[self._swings]:
-            (hip_x, hip_y), (rest_x, rest_y) = HIPS_M[leg], self._neutral[leg]
+            (hip_x, hip_y), (rest_x, rest_y) = _HIPS_M[leg], self._neutral[leg]
             goal_x = rest_x + shift_x - spin * (hip_y + rest_y)
             goal_y = rest_y + shift_y + spin * (hip_x + rest_x)
             foot, begin = self._feet[leg], self._lifted[leg]
@@ -206,7 +206,7 @@ class Trot:
         swinging = _PAIRS[self._swings] if self._left_steps else ()
         angles: list[float] = []
         for leg in range(4):
-            (hip_x, hip_y), (x, y) = HIPS_M[leg], self._feet[leg]
+            (hip_x, hip_y), (x, y) = _HIPS_M[leg], self._feet[leg]
             z = gains.level * (m[6] * hip_x + m[7] * (hip_y + self._neutral[leg][1]))
             z -= gains.height_m
             if leg in swinging:

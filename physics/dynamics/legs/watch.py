@@ -25,11 +25,15 @@ _FLIES_M: Final = 3.0
 
 
 class LegWatch:
-    """Observer of one robot with legs. dt_s: duration of a substep."""
+    """Observer of one robot with legs.
 
-    def __init__(self, legs: Legs, dt_s: float) -> None:
+    cycle_s: duration of a gait cycle, over which speeds are averaged
+    dt_s: duration of a substep
+    """
+
+    def __init__(self, legs: Legs, cycle_s: float, dt_s: float) -> None:
         self._legs = legs
-        self._count = max(round(legs.cycle_s / dt_s), 1)
+        self._count = max(round(cycle_s / dt_s), 1)
         self.reset()
 
     def reset(self) -> None:

@@ -16,19 +16,16 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose, wrap_angle
 from cosim.core.progress import Progress
 from cosim.core.state import STILL, Command, Motion, RobotState, Street
+from cosim.results.referee import FALL_S
 from cosim.spec.robot import COURIER, Robot
 from physics.dynamics.drive import Drive
 from physics.dynamics.world import BulletWorld
 from physics.ground.mesh import Mesh
-from physics.ground.tiles import Key, tile_bounds
+from physics.ground.tiles import CURB_M, Key, tile_bounds
 from physics.street.surface import Chunk, Patch, Surface
 
-CURB_M: Final = 0.12
-"""Height of a curb, metres."""
 COMMAND_S: Final = 2.0
 """Duration of a random command, seconds."""
-FALL_TICKS: Final = 2
-"""Ticks that a robot is down before it has fallen, as in `cosim.results.referee`."""
 _CLOCK: Final = Clock()
 _EMPTY: Final = Street(0)
 _FRICTION: Final = 0.9
@@ -120,7 +117,7 @@ class Walk:
         motion = self.world.step(command, _EMPTY, _EMPTY, _CLOCK.substeps)
         self.robot = motion.robot
         self._down_ticks = self._down_ticks + 1 if motion.down else 0
-        if self._down_ticks > FALL_TICKS:
+        if self._down_ticks > _CLOCK.ticks(FALL_S):
             self.fallen += 1
             self._down_ticks = 0
             self.robot = self.world.place(motion.robot.pose)
@@ -325,8 +322,8 @@ def _steady(robot: Robot, start: Pose, v_mps: float, w_radps: float, target: str
     with walking(robot, FLAT, start) as walk:
         walk.drive(command, 3.0)
         v, w = mean_speeds(walk.drive(command, 4.0))
-    asked = f"{v_mps:.2g} m/s, {w_radps:.2g} rad/s commanded"
-    return LegFigure(asked, f"{v:.2f} m/s, {w:.2f} rad/s", target)
+    commanded = f"{v_mps:.2g} m/s, {w_radps:.2g} rad/s commanded"
+    return LegFigure(commanded, f"{v:.2f} m/s, {w:.2f} rad/s", target)
 
 
 def _curbs(robot: Robot, v_mps: float) -> Iterator[LegFigure]:
