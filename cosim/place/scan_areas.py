@@ -179,7 +179,7 @@ def draft_areas(
 ) -> tuple[ScanArea, ...]:
     """Return the largest connected piece of level, free, measured ground as a sidewalk.
 
-    It is a draft: roads and lawns are not told from sidewalks.
+    It is a draft, in which roads and lawns count as sidewalks.
 
     grade: (H, W) slope of the ground.
     hidden: (H, W) whether ground is behind walls, as seen from the walked side.

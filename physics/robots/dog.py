@@ -153,12 +153,6 @@ def _model() -> Model:
         "dog",
         "a quadruped of 15 kg. Base frame in the middle of the trunk. "
         "Written by physics.robots.make_urdf.",
-        {
-            "body": (0.86, 0.87, 0.89),
-            "lid": (0.10, 0.42, 0.62),
-            "dark": (0.16, 0.16, 0.18),
-            "rubber": (0.05, 0.05, 0.05),
-        },
         tuple(links),
         tuple(joints),
     )

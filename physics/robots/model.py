@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from cosim.spec.robot import Legs, Robot
 
@@ -65,12 +64,20 @@ class Joint(NamedTuple):
     rotor_kgm2: float = 0.0
 
 
+COLOURS: Final = {
+    "body": (0.86, 0.87, 0.89),
+    "lid": (0.10, 0.42, 0.62),
+    "dark": (0.16, 0.16, 0.18),
+    "rubber": (0.05, 0.05, 0.05),
+}
+"""Red, green and blue of the materials of all models."""
+
+
 class Model(NamedTuple):
-    """Robot as links and joints. colours: red, green and blue of each material."""
+    """Robot as links and joints, in materials of `COLOURS`."""
 
     name: str
     remark: str
-    colours: Mapping[str, Triple]
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
 
@@ -99,7 +106,7 @@ class Model(NamedTuple):
         """Return the text of the URDF."""
         lines = ['<?xml version="1.0"?>', f"<!-- {self.name}: {self.remark} -->"]
         lines.append(f'<robot name="{self.name}">')
-        for name, colour in self.colours.items():
+        for name, colour in COLOURS.items():
             rgba = _numbers((*colour, 1.0))
             lines.append(f'  <material name="{name}"><color rgba="{rgba}"/></material>')
         for link in self.links:

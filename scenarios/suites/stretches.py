@@ -37,7 +37,7 @@ _LENGTH_M: Final = 42.0
 _SPACING_M: Final = 15.0
 """Largest distance between the starts of neighbouring stretches of a scan, in metres."""
 _REACH_M: Final = 12.0
-"""Distance up to which the ground beside a way of a scan is measured, in metres."""
+"""Distance to each side of a way of a scan up to which the ground is measured, in metres."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,7 @@ class FollowingGaps:
         return CLOSEST_M + share * (self._gaps_m[name] - CLOSEST_M)
 
     def _with_room(self, near: NearPersons, rows: list[int], shares: Floats) -> list[int]:
-        """Return those rows that have nobody within the gap that they want to take up."""
+        """Return the rows of the persons whose next gap is free of other persons."""
         if not rows:
             return []
         names = [near.names[row] for row in rows]

@@ -125,14 +125,14 @@ def hashed(numbers: NDArray[Any]) -> str:
 def test_a_network_has_the_same_bits_on_every_processor(variables: dict[str, str]) -> None:
     """With other kernels of OpenBLAS, and where numpy uses neither AVX2 nor fused
     multiply-adds."""
-    told = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", PROCESS],
         env={**os.environ, **variables},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert told.stdout.strip() == hashed(answers(walker_like()))
+    assert done.stdout.strip() == hashed(answers(walker_like()))
 
 
 def test_arrays_of_a_network_make_it_again() -> None:
@@ -211,8 +211,8 @@ def recurrent_graph() -> bytes:
         helper.make_node("Gemm", ["flat", "c"], ["actions"], transB=1),
     ]
     memory = [port("h_in", 1, 1, 8), port("c_in", 1, 1, 8)]
-    told = [port("actions", 1, 3), port("h_out", 1, 1, 8), port("c_out", 1, 1, 8)]
-    return graph_bytes(nodes, [port("obs", 1, 5), *memory], told, weights)
+    outputs = [port("actions", 1, 3), port("h_out", 1, 1, 8), port("c_out", 1, 1, 8)]
+    return graph_bytes(nodes, [port("obs", 1, 5), *memory], outputs, weights)
 
 
 def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:

@@ -238,14 +238,14 @@ def test_a_walk_has_one_hash(robot: Robot, walk: Walk) -> None:
     """In this process and in another one, with other kernels of OpenBLAS."""
     here = wandered(walk)
     for kernel in ("Haswell", "Nehalem"):
-        told = subprocess.run(
+        done = subprocess.run(
             [sys.executable, "-c", PROCESS.format(name=robot.name)],
             env={**os.environ, "OPENBLAS_CORETYPE": kernel},
             capture_output=True,
             text=True,
             check=True,
         )
-        assert told.stdout.split()[-1] == here
+        assert done.stdout.split()[-1] == here
 
 
 def test_the_legs_of_both_cameras_meet_the_ground(robot: Robot, walk: Walk) -> None:

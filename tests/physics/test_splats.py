@@ -133,7 +133,7 @@ def walkers(count: int) -> Street:
 
 
 def line_of_people(x_m: float, called: str = "c") -> Street:
-    """Return people side by side across x, half of them beside the wall. called: start of ids."""
+    """Return people side by side across x, half of them next to the wall. called: start of ids."""
     y = np.arange(-1.6, 1.7, 0.4)
     ids = tuple(f"{called}{i:03d}" for i in range(len(y)))
     xy = np.column_stack([np.full(len(y), x_m), y])

@@ -282,7 +282,7 @@ def test_a_fall_of_the_robot_is_not_a_push() -> None:
 
 
 def test_a_fall_on_wheels_contradicts_the_trajectory() -> None:
-    """A robot on wheels has none, at whoever's fault."""
+    """A robot on wheels has none, whatever the fault."""
     way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
     rolled = with_person(driven(way, [0.0] * 100, {60: 0.0}), range(100))
     found = [one.what for one in contradictions(pushed(way, rolled, 50, 60), way, rolled)]

@@ -31,7 +31,7 @@ BLANK = np.zeros((288, 512), dtype=np.uint8)
 
 
 def test_boxes_are_counted() -> None:
-    """A box finds one person of each size at most. A box is false where nobody is, not on people
+    """A box finds one person of each size at most. A box is false where no person is, not on people
     of whom little is seen, nor on pixels of people."""
     people = np.array([[10, 10, 40, 90], [100, 10, 115, 50], [200, 10, 230, 30], [300, 0, 340, 90]])
     seen = SeenPeople(people.astype(float), np.array([True, True, True, False]))
@@ -41,7 +41,7 @@ def test_boxes_are_counted() -> None:
         [
             *([12, 12, 41, 88], [9, 8, 42, 95]),  # the first person, twice
             *([300, 0, 338, 92], [400, 200, 440, 280]),  # little is seen; pixels alone
-            *([450, 100, 470, 160], [115, 50, 140, 90]),  # nobody; a corner of the second person
+            *([450, 100, 470, 160], [115, 50, 140, 90]),  # no person; a corner of the second
         ],
         dtype=float,
     )
@@ -51,8 +51,8 @@ def test_boxes_are_counted() -> None:
     assert false.tolist() == [False, False, False, False, True, True]
     assert counts.people == {"taller than 60 px": [1, 1], "24 to 60 px": [0, 1]}
     assert (counts.detections, counts.false) == (6, 2)
-    nobody = SeenPeople(np.zeros((0, 4)), np.zeros(0, dtype=bool))
-    count_boxes(counts, boxes[4:5], nobody, labels)
+    none = SeenPeople(np.zeros((0, 4)), np.zeros(0, dtype=bool))
+    count_boxes(counts, boxes[4:5], none, labels)
     count_boxes(counts, np.zeros((0, 4)), seen, labels)
     assert (counts.detections, counts.false) == (7, 3)
     assert counts.people["taller than 60 px"] == [1, 2]

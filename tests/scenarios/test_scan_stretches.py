@@ -37,7 +37,7 @@ def _bent_way() -> np.ndarray:
 
 
 def _corridor(width_m: float, folder: Path) -> StreetMap:
-    """The map of a corridor along the path, with posts beside its middle and in wide corridors."""
+    """The map of a corridor along the path, with posts off its middle and in wide corridors."""
     way = _bent_way()
     (x0, y0), (x1, y1) = way.min(axis=0) - 12.0, way.max(axis=0) + 12.0
     grid = flat_grid(x0, y0, x1, y1)

@@ -51,8 +51,8 @@ def test_a_run_records_its_gait_and_replays_with_it(tmp_path: Path, cosim: Cosim
     gait = written_gait(tmp_path)
     run = tmp_path / "run"
     line = f"run {tmp_path}/s.json --policy straight --gait onnx:{gait} --out {run}".split()
-    told = cosim(*line)
-    assert told.returncode == 0, told.stderr
+    done = cosim(*line)
+    assert done.returncode == 0, done.stderr
     (record,) = read_records(run)
     assert record.status == "done" and record.setup.gait == f"onnx:{gait}"
     assert len(record.setup.gait_hash) == 32
@@ -60,10 +60,10 @@ def test_a_run_records_its_gait_and_replays_with_it(tmp_path: Path, cosim: Cosim
     assert own.state_hash != record.state_hash and own.setup.gait == ""
     assert "as recorded" in cosim("replay", str(run), "a").stdout
     written_gait(tmp_path, layers_graph(seed=1))
-    told = cosim("replay", str(run), "a")
-    assert told.returncode == 2 and "and recorded is" in told.stderr
-    told = cosim(*line, "--resume")
-    assert told.returncode == 2 and "gait_hash" in told.stderr
+    done = cosim("replay", str(run), "a")
+    assert done.returncode == 2 and "and recorded is" in done.stderr
+    done = cosim(*line, "--resume")
+    assert done.returncode == 2 and "gait_hash" in done.stderr
 
 
 def test_a_single_episode_records_the_gait_that_moved_it(tmp_path: Path) -> None:

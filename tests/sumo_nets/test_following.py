@@ -22,26 +22,26 @@ def walkers(*x_m: float, mps: float = 1.3) -> NearPersons:
 
 
 def test_a_person_stands_closer_where_it_is_held_up_and_then_takes_up_its_gap_again() -> None:
-    """It does so only when nobody is within its gap, so that it never has to stop for it."""
-    told: dict[str, float] = {}
+    """It does so only when its gap is free, so that it never has to stop for it."""
+    written_m: dict[str, float] = {}
     engine: Any = SimpleNamespace(
         person=SimpleNamespace(
-            setMinGap=told.__setitem__, getAngle=lambda name: heading_to_sumo(0.0)
+            setMinGap=written_m.__setitem__, getAngle=lambda name: heading_to_sumo(0.0)
         )
     )
     gaps = FollowingGaps(engine)
     gaps.enter("c0", 1.2)
     gaps.enter("c1", 0.3)
     gaps.keep(walkers(0.0, 3.0))
-    assert told == {"c0": 1.2, "c1": 0.3}
+    assert written_m == {"c0": 1.2, "c1": 0.3}
     gaps.keep(walkers(0.0, 1.0, mps=0.1))
-    assert told == pytest.approx({"c0": 0.63, "c1": 0.27})
+    assert written_m == pytest.approx({"c0": 0.63, "c1": 0.27})
     gaps.keep(walkers(0.0, 1.5))
-    assert told == pytest.approx({"c0": 0.63, "c1": 0.3})
+    assert written_m == pytest.approx({"c0": 0.63, "c1": 0.3})
     gaps.keep(walkers(0.0, 1.8))
-    assert told == {"c0": 1.2, "c1": 0.3}
+    assert written_m == {"c0": 1.2, "c1": 0.3}
     gaps.keep(walkers(0.0, 1.8, *(2.0 + 0.1 * k for k in range(CROWDED - 1))))
-    assert told["c0"] == 0.25
+    assert written_m["c0"] == 0.25
 
 
 @pytest.mark.engine

@@ -48,10 +48,10 @@ def layers_graph(seed: int = 0, sizes: tuple[int, ...] = (45, 16, 12), scale: fl
     return graph_of_layers(
         [
             (
-                (scale * rng.normal(size=(told, given))).astype(np.float32),
-                (scale * rng.normal(size=told)).astype(np.float32),
+                (scale * rng.normal(size=(answered, given))).astype(np.float32),
+                (scale * rng.normal(size=answered)).astype(np.float32),
             )
-            for given, told in pairwise(sizes)
+            for given, answered in pairwise(sizes)
         ]
     )
 

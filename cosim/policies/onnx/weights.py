@@ -68,15 +68,16 @@ def weight_folders() -> list[Path]:
 
 
 def weights_file(
-    user: str, name: str, facts: FileFacts | None, source: str, beside: Sequence[Path] = ()
+    user: str, name: str, facts: FileFacts | None, source: str, first: Sequence[Path] = ()
 ) -> Path:
-    """Return the path of a file of weights in the folders `beside` or the folders of weights.
+    """Return the path of a file of weights.
 
     user: what needs it, such as "policy 'follow'".
+    first: folders that are searched before the folders of weights.
 
     Raises UsageError with the file's origin if it is missing.
     """
-    places = [*beside, *weight_folders()]
+    places = [*first, *weight_folders()]
     for place in places:
         if (place / name).is_file():
             return place / name

@@ -57,7 +57,7 @@ class LegDrive:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the gait; the robot stands for SETTLE_S."""
+        """Reset the gait, and stand still for SETTLE_S."""
         self._gait.reset()
         self._waits = self._settle
 

@@ -208,8 +208,7 @@ def nearest_m(tracks: pd.DataFrame) -> Floats:
 
 
 def following_m(tracks: pd.DataFrame) -> Floats:
-    """Return (K,) the distance to the nearest person ahead, metres, for each row; inf for a person
-    that follows nobody.
+    """Return (K,) the distance to the nearest person ahead, metres, for each row; inf without one.
 
     Both walk in the same direction, one behind the other.
     """
