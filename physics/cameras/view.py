@@ -15,7 +15,8 @@ from cosim.core.geometry import Floats
 from cosim.core.state import RobotState
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import Robot
-from physics.cameras.posture import Posture, posture_of
+from physics.cameras.posture import posture_of
+from physics.robots.kinematics import attitude
 from physics.street.surface import Surface
 
 VISIBLE_M: Final = 50.0
@@ -146,7 +147,7 @@ def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotSta
     It tilts with the ground, or with the trunk of a robot with legs.
     """
     posture = posture_of(surface, model, robot)
-    turn = _attitude(posture)
+    turn = attitude(posture.roll_rad, posture.pitch_rad, posture.heading_rad)
     mount = spec.on(model)
     x, y, z = mount.at_m
     z -= model.drive.pivot_m
@@ -164,18 +165,3 @@ def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotSta
 def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: float) -> Shot:
     """Return a view from (3,) `eye_m` towards (3,) `target_m`."""
     return Shot(np.asarray(eye_m, dtype=float), np.asarray(target_m, dtype=float), size, fov_deg)
-
-
-def _attitude(posture: Posture) -> tuple[tuple[float, float, float], ...]:
-    """Return the rotation matrix from the base link's frame to the world."""
-    roll, pitch = posture.roll_rad, posture.pitch_rad
-    cz, sz = math.cos(posture.heading_rad), math.sin(posture.heading_rad)
-    cy = math.cos(pitch)
-    sy = math.sin(pitch)
-    cx = math.cos(roll)
-    sx = math.sin(roll)
-    return (
-        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
-        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
-        (-sy, cy * sx, cy * cx),
-    )

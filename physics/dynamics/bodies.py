@@ -21,6 +21,7 @@ from physics.dynamics.movers import Mover, TickPoses
 from physics.ground.mesh import Mesh, join, pybullet_lists
 from physics.ground.tiles import CURB_M
 from physics.robots import urdf_path
+from physics.robots.kinematics import rotate, rows_of
 from physics.street.buildings import Building, Wall
 from physics.street.furniture import Prop, solids_of
 from physics.street.surface import Chunk
@@ -314,7 +315,7 @@ class Bodies:
             h = self._com_height_m
             middle = [c + h * up for c, up in zip(xyz_m, (m[2], m[5], m[8]), strict=True)]
         else:
-            shift = _turned(m, self._middle_m)
+            shift = rotate(rows_of(m), self._middle_m)
             middle = [c + d for c, d in zip(xyz_m, shift, strict=True)]
             middle[2] += self._legs.stand_m
         self._call("resetBasePositionAndOrientation", self._robot, middle, turn)
@@ -363,7 +364,7 @@ class Bodies:
             h = self._com_height_m  # PyBullet reports the centre of mass
             self.at_m = x, y, _ = x - h * m[2], y - h * m[5], z - h * m[8]
         else:
-            dx, dy, dz = _turned(m, self._middle_m)
+            dx, dy, dz = rotate(rows_of(m), self._middle_m)
             self.at_m = x, y, _ = x - dx, y - dy, z - dz - self._legs.stand_m
             states = p.getJointStates(self._robot, self._joints, self._client)
             self._angles = tuple([state[0] for state in states])
@@ -453,16 +454,6 @@ class Bodies:
             return getattr(p, call)(*args, **options, physicsClientId=self._client)
         except p.error as error:
             raise EngineError(f"PyBullet: {call}: {error}") from error
-
-
-def _turned(m: tuple[float, ...], v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a vector that is rotated by a matrix of nine entries."""
-    x, y, z = v
-    return (
-        m[0] * x + m[1] * y + m[2] * z,
-        m[3] * x + m[4] * y + m[5] * z,
-        m[6] * x + m[7] * y + m[8] * z,
-    )
 
 
 def _wall_box(
