@@ -81,6 +81,14 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
 
 
+def test_a_row_names_a_robot_other_than_the_default(tmp_path: Path) -> None:
+    """The note of a row in the tables names the scout, and not the courier."""
+    ways = [short_way("s-0"), short_way("s-1", robot="scout")]
+    (own,) = read_runs([run_of(tmp_path / "run", ["goal", "goal"], "mine", ways)])
+    (table,) = tables_of([own])
+    assert [row.notes for row in table.rows] == ["2 episodes, robot scout"]
+
+
 def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Path) -> None:
     """Of four curves the page gives counts and the plot a bare point, of six straight ways both
     have an interval; crashes have a column."""

@@ -27,6 +27,7 @@ from cosim.results.discerned import (
 )
 from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
 from cosim.results.table import ORACLE, crashed_in, estimate_of, why_inconclusive
+from cosim.spec.robot import COURIER
 from cosim.spec.schedule import BEST_BLIND
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
@@ -309,10 +310,14 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 
 def _notes(table: pd.DataFrame) -> str:
-    """Return the notes of a row: episodes, pairs, crashes, privileged, nonstandard camera."""
+    """Return the notes of a row: episodes, pairs, robots, crashes, privileged, nonstandard camera.
+
+    The default robot is not named.
+    """
     episodes = int((~is_decoy(table)).sum())
     notes = [f"{episodes} episode{'s' * (episodes != 1)}"]
     notes += [pairs_of(table).in_words] * has_decoys(table)
+    notes += [f"robot {name}" for name in sorted({*table["robot"]} - {COURIER.name})]
     if crashed := crashed_in(table):
         notes.append(f"{crashed} crashed")
     notes += ["crowd added"] * bool(table["crowd_added"].any())
