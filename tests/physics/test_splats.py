@@ -24,7 +24,8 @@ from physics.cameras.choice import renderer_of
 from physics.cameras.gl import context
 from physics.cameras.gl.atlas import Atlas
 from physics.cameras.gl.camera import GlCamera
-from physics.cameras.gl.splats import CARD, PROCESSOR, SplatDrawing, distance_keys
+from physics.cameras.gl.splat_sort import CARD, PROCESSOR
+from physics.cameras.gl.splats import SplatDrawing, distance_keys
 from physics.cameras.view import shot
 from physics.dynamics.world import BulletWorld
 from physics.street.scan_surface import ScanSurface

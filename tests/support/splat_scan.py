@@ -12,7 +12,8 @@ from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, ScanMesh, ScanSun, Splats
 from physics.cameras.gl import context
-from physics.cameras.gl.splats import SplatCloud, SplatDrawing, SplatTarget, Tuning, view_rows
+from physics.cameras.gl.splat_sort import Tuning
+from physics.cameras.gl.splats import SplatCloud, SplatDrawing, SplatTarget, Views
 from physics.cameras.view import Shot, shot
 
 AHEAD = shot((0.0, 0.0, 0.0), (1.0, 0.02, -0.05), (160, 96), 60.0)
@@ -144,7 +145,7 @@ def drawn(
             SplatDrawing(gl, tuning),
             SplatTarget(gl, taken.size),
         )
-        drawing.draw(cloud, view_rows(taken), target, limited=False)
+        drawing.draw(cloud, Views.of([taken]), target, limited=False)
         found = target.read()
         for thing in (cloud, drawing, target):
             thing.release()
