@@ -428,10 +428,11 @@ layout(binding = {LIMITS_UNIT}) uniform sampler2D limits;
 #endif
 const uint NONE = 0xffffffffu;
 #if ROWS == 1
+const uint GROUP = {TILE_PX * TILE_PX}u, EACH = {BATCH}u / GROUP;
 shared uint held[{BATCH}];
 shared vec4 held_first[{BATCH}];
 shared uvec4 held_second[{BATCH}];
-shared bool open;
+shared uint open_of[GROUP], kept_of[GROUP];
 #endif
 float depth_at(uint record, vec2 pixel) {{
     float z = uintBitsToFloat(records[record + 1u].z);
@@ -473,6 +474,23 @@ bool paint(uint r, vec4 one, uvec4 second) {{
     }}
     return most < {FULL};
 }}
+#if ROWS == 1
+uint bytes_of(uint bits) {{ return (bits * 0x204081u) & 0x1010101u; }}
+bool touches(uint record, vec2 corner, uvec2 open) {{
+    // Return whether a splat may reach an open pixel. open: a byte for each row of the tile
+    vec4 one = uintBitsToFloat(records[record]);
+    vec2 two = uintBitsToFloat(records[record + 1u].xy);
+    float reach = 1.001 * sqrt(max(two.y + 7.99435344, 0.0));
+    vec2 half_px = reach / two.x * vec2(length(vec2(one.w, two.x)) / one.z, 1.0) + 0.02;
+    vec2 middle_px = one.xy - corner - 0.5;
+    ivec2 low = ivec2(clamp(ceil(middle_px - half_px), 0.0, {TILE_PX}.0));
+    ivec2 high = ivec2(clamp(floor(middle_px + half_px), -1.0, {TILE_PX - 1}.0));
+    if (any(greaterThan(low, high))) return false;
+    uvec2 bits = (uvec2(2u) << uvec2(high)) - (uvec2(1u) << uvec2(low));
+    uvec2 reached = uvec2(bytes_of(bits.y & 15u), bytes_of(bits.y >> 4)) * bits.x;
+    return (reached & open) != uvec2(0u);
+}}
+#endif
 void main() {{
     uint view = VIEWS == 1 ? 0u : gl_WorkGroupID.y / sizes.w;
     ivec2 here = ivec2(gl_GlobalInvocationID.xy) * ivec2(1, ROWS);
@@ -491,22 +509,37 @@ void main() {{
     uint end = starts[tile + 1u];
 #if ROWS == 1
     uint lane = gl_LocalInvocationIndex;
+    vec2 corner = vec2(here - ivec2(gl_LocalInvocationID.xy));
     bool full = false;
+#ifdef LIMITED
+    full = limit[0] == 0.0;
+#endif
     for (uint start = starts[tile]; start < end; start += {BATCH}u) {{
-        uint count = min(end - start, {BATCH}u);
+        open_of[lane] = full ? 0u : 1u;
         barrier();
-        open = false;
-        for (uint k = lane; k < count; k += {TILE_PX * TILE_PX}u) {{
-            held[k] = 2u * lists[start + k];
-            held_first[k] = uintBitsToFloat(records[held[k]]);
-            held_second[k] = records[held[k] + 1u];
+        uvec2 open = uvec2(0u);
+        for (uint l = 0u; l < 32u; ++l) open |= uvec2(open_of[l], open_of[l + 32u]) << l;
+        if (open == uvec2(0u)) break;
+        uint first = start + lane * EACH, keeps = 0u;
+        for (uint k = 0u; k < EACH && first + k < end; ++k)
+            keeps |= touches(2u * lists[first + k], corner, open) ? 1u << k : 0u;
+        kept_of[lane] = uint(bitCount(keeps));
+        barrier();
+        uint count = 0u, to = 0u;
+        for (uint l = 0u; l < GROUP; ++l) {{
+            to += l < lane ? kept_of[l] : 0u;
+            count += kept_of[l];
+        }}
+        for (uint k = 0u; k < EACH; ++k) {{
+            if ((keeps >> k & 1u) == 0u) continue;
+            held[to] = 2u * lists[first + k];
+            held_first[to] = uintBitsToFloat(records[held[to]]);
+            held_second[to] = records[held[to] + 1u];
+            ++to;
         }}
         barrier();
         for (uint k = 0u; k < count && !full; ++k)
             full = paint(held[k], held_first[k], held_second[k]);
-        if (!full) open = true;
-        barrier();
-        if (!open) break;
     }}
 #else
     for (uint k = starts[tile]; k < end; ++k) {{
@@ -526,6 +559,8 @@ void main() {{
 )
 """Blend the splats of a tile from front to back until each pixel is full.
 
+Invocations of one pixel fetch a batch together, without the splats that reach only full pixels:
+tiles with sky have long lists.
 limits: depth up to which splats are drawn; negative where ground splats are not, 0 for none.
 Each invocation draws ROWS pixels of a column. The median depth is that of the splat's plane: its
 inverse is linear in the picture.
