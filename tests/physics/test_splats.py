@@ -77,11 +77,15 @@ def test_splats_agree_with_a_reference_in_float64() -> None:
     assert np.mean(same_m) >= 0.99
 
 
+def _last(splats: Splats, count: int) -> Splats:
+    return Splats(*(getattr(splats, name)[-count:] for name in Splats.__slots__))
+
+
 @pytest.mark.parametrize("count", [1, 70, 5000])
 def test_a_card_draws_as_the_processor_does(count: int) -> None:
     """Sorting in shaders, and other sizes of work, change no bit."""
     splats = random_splats(7, max(count, 300))
-    few = Splats(*(getattr(splats, name)[-count:] for name in Splats.__slots__))
+    few = _last(splats, count)
     here, card = (drawn(few, tuning=tuning) for tuning in (PROCESSOR, CARD))
     assert np.array_equal(here[0], card[0]) and np.array_equal(here[1], card[1])
     assert (here[0][..., 3] < 1.0).any()
@@ -156,6 +160,24 @@ def test_huge_splats_fill_a_large_picture() -> None:
     taken = shot((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1024, 512), 60.0)
     found, _ = drawn(splats, taken)
     assert np.abs(found[..., 3].astype(float) - (1.0 - 3.0 / 255.0) ** count).max() < 1.0 / 255.0
+
+
+def test_a_tile_may_have_more_splats_than_a_loop_has_iterations() -> None:
+    """A splat behind 70,000 small ones is drawn in all pixels around them."""
+    count = 70_000
+    centres = np.zeros((count + 1, 3), dtype=np.float32)
+    centres[:, 0] = 20.0
+    centres[count, 0] = 30.0
+    sizes = np.full((count + 1, 3), 5e-4)
+    sizes[count] = 3.0
+    wide = covariances(np.tile(np.eye(3), (count + 1, 1, 1)), sizes)
+    rgba = np.full((count + 1, 4), 255, dtype=np.uint8)
+    splats = Splats(centres, wide, rgba, np.zeros(count + 1, dtype=bool))
+    taken = shot((0.0, 0.0, 0.0), (1.0, 0.05, 0.05), (64, 64), 60.0)
+    many, few = drawn(splats, taken)[0], drawn(_last(splats, 101), taken)[0]
+    around = (few[..., 3] > 0.2) & (few[..., 3] < 0.6)
+    assert around.sum() > 50
+    assert np.abs(many.astype(float) - few)[around].max() < 0.01
 
 
 def test_a_picture_depends_on_every_splat() -> None:

@@ -542,9 +542,13 @@ void main() {{
             full = paint(held[k], held_first[k], held_second[k]);
     }}
 #else
-    for (uint k = starts[tile]; k < end; ++k) {{
-        uint r = 2u * lists[k];
-        if (paint(r, uintBitsToFloat(records[r]), records[r + 1u])) break;
+#define NEXT {{ uint r = 2u * lists[k++]; full = paint(r, uintBitsToFloat(records[r]), records[r + 1u]); }}
+    bool full = false;
+    for (uint k = starts[tile]; k < end && !full;) {{
+        NEXT
+#ifdef LONG
+        {"if (k < end) NEXT " * 7}
+#endif
     }}
 #endif
     for (int j = 0; j < ROWS; ++j) {{
@@ -562,7 +566,7 @@ void main() {{
 Invocations of one pixel fetch a batch together, without the splats that reach only full pixels:
 tiles with sky have long lists.
 limits: depth up to which splats are drawn; negative where ground splats are not, 0 for none.
-Each invocation draws ROWS pixels of a column. The median depth is that of the splat's plane: its
+Each invocation draws ROWS pixels of a column. LONG: for lists that are too long for a loop. The median depth is that of the splat's plane: its
 inverse is linear in the picture.
 """
 

@@ -37,6 +37,8 @@ _LEAST_KEY: Final = 251904
 _MOST_KEY: Final = 65535
 _KEY_BITS: Final = 16
 _VIEW_ROWS: Final = 5
+_LOOP_MAX: Final = 65000
+"""Number of iterations after which llvmpipe may end the loops of an invocation."""
 
 
 def lattice_point(eye_m: Floats) -> NDArray[np.float32]:
@@ -212,8 +214,11 @@ class SplatDrawing:
         lists, starts = self._listed(views, count, total)
         bind(records, starts, lists, slopes)
         target.bind()
-        name = "PAINT LIMITED" if limited else "PAINT"
         across, down = views.tiles
+        name = "PAINT LIMITED" if limited else "PAINT"
+        if self.tuning.rows > 1:
+            sums = read_words(self._context, starts, 0, across * down + 1)
+            name += " LONG" if np.diff(sums).max() > _LOOP_MAX else ""
         size = across * glsl.TILE_PX, len(views.rows) * down * glsl.TILE_PX
         run.run(name, size, (glsl.TILE_PX,) * 2)
 
