@@ -95,7 +95,8 @@ class BatchDrawing:
             self._surfaces.bind()
             self._context.front_face = "cw"  # draw upside down, to read the top row first
             for start, some in self._together(few, target.size):
-                self._draw_some(start, some, target, lambda i, first=first: drawn(first + i))
+                for i in self._draw_some(start, some, target):
+                    drawn(first + i)
             first += len(few)
 
     def _arrange(self, pictures: Sequence[PictureOrder]) -> Shots:
@@ -161,18 +162,17 @@ class BatchDrawing:
                 begun = i
 
     def _draw_some(
-        self,
-        start: int,
-        pictures: Sequence[PictureOrder],
-        target: Target,
-        drawn: Callable[[int], None],
-    ) -> None:
-        """Draw pictures that belong together into the target, one after the other."""
+        self, start: int, pictures: Sequence[PictureOrder], target: Target
+    ) -> Iterator[int]:
+        """Draw pictures that belong together into the target; yield the number of each.
+
+        start: number of the first
+        """
         cloud = pictures[0].stage.cloud
         if cloud is None:
             target.clear()
             self._draw(start, pictures[0], target)
-            drawn(start)
+            yield start
             return
         stack = self._pictures.stack(target.size, len(pictures))
         self._pictures.draw(
@@ -187,7 +187,7 @@ class BatchDrawing:
             self._context.enable_only(moderngl.DEPTH_TEST)
             self._pictures.compose(nth, picture.light, stack, target)
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-            drawn(start + nth)
+            yield start + nth
 
     def _bind(self, i: int, picture: PictureOrder) -> None:
         """Bind a picture's scene block and shadow maps."""

@@ -147,8 +147,10 @@ class Stack:
         self.limits.use(glsl.LIMITS_UNIT)
 
     def release(self) -> None:
-        for one in (*self.layers, self.splats, self.limits):
-            one.release()
+        while self.layers:
+            self.layers.pop().release()
+        self.splats.release()
+        self.limits.release()
 
 
 @dataclass(slots=True)
@@ -195,7 +197,7 @@ class SplatPictures:
 
     def most(self, size: tuple[int, int]) -> int:
         """Return the maximum number of pictures of a size that are drawn together."""
-        tallest = self._context.info["GL_MAX_TEXTURE_SIZE"]
+        tallest: int = self._context.info["GL_MAX_TEXTURE_SIZE"]
         return max(1, min(self.drawing.tuning.views, tallest // size[1]))
 
     def stack(self, size: tuple[int, int], pictures: int) -> Stack:
