@@ -185,8 +185,17 @@ class NumpySort:
 def read_words(
     context: moderngl.Context, buffer: moderngl.Buffer, first: int, count: int
 ) -> NDArray[np.uint32]:
-    """Read `count` words of a buffer that shaders have written; it waits for the renderer."""
+    """Read `count` words of a buffer that shaders have written; it waits for the renderer.
+
+    They are copied to a buffer of their own first: some drivers move the whole of a buffer that is
+    read out of the memory of the card.
+    """
     if not count:
         return np.zeros(0, dtype=np.uint32)
     context.memory_barrier(moderngl.BUFFER_UPDATE_BARRIER_BIT)
-    return np.frombuffer(buffer.read(4 * count, offset=4 * first), dtype=np.uint32)
+    size = 4 * count
+    copy = context.buffer(reserve=size)
+    context.copy_buffer(copy, buffer, size, read_offset=4 * first)
+    words = np.frombuffer(copy.read(), dtype=np.uint32)
+    copy.release()
+    return words
