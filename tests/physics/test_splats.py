@@ -24,7 +24,17 @@ from physics.cameras.choice import renderer_of
 from physics.cameras.gl import context
 from physics.cameras.gl.atlas import Atlas
 from physics.cameras.gl.camera import GlCamera
-from physics.cameras.gl.splats import CARD, PROCESSOR, SplatDrawing, distance_keys
+from physics.cameras.gl.splat_layers import splat_pictures
+from physics.cameras.gl.splat_sort import (
+    CARD,
+    PROCESSOR,
+    Buffers,
+    ShaderSort,
+    SplatShaders,
+    Tuning,
+    read_words,
+)
+from physics.cameras.gl.splats import SplatDrawing, distance_keys
 from physics.cameras.view import shot
 from physics.dynamics.world import BulletWorld
 from physics.street.scan_surface import ScanSurface
@@ -34,6 +44,7 @@ from tests.support.splat_scan import (
     WALL_X_M,
     covariances,
     drawn,
+    drawn_together,
     picture_hash,
     random_splats,
     reference_picture,
@@ -66,14 +77,77 @@ def test_splats_agree_with_a_reference_in_float64() -> None:
     assert np.mean(same_m) >= 0.99
 
 
+def _last(splats: Splats, count: int) -> Splats:
+    return Splats(*(getattr(splats, name)[-count:] for name in Splats.__slots__))
+
+
 @pytest.mark.parametrize("count", [1, 70, 5000])
 def test_a_card_draws_as_the_processor_does(count: int) -> None:
     """Sorting in shaders, and other sizes of work, change no bit."""
     splats = random_splats(7, max(count, 300))
-    few = Splats(*(getattr(splats, name)[-count:] for name in Splats.__slots__))
+    few = _last(splats, count)
     here, card = (drawn(few, tuning=tuning) for tuning in (PROCESSOR, CARD))
     assert np.array_equal(here[0], card[0]) and np.array_equal(here[1], card[1])
     assert (here[0][..., 3] < 1.0).any()
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [{}, {"views": 2}, {"splats": 9000}, {"pairs": 20_000}],
+    ids=lambda limits: " ".join(limits) or "one pass",
+)
+def test_views_drawn_together_have_the_bits_of_each_alone(limits: dict[str, int]) -> None:
+    """Five views at once, one of them without a splat in view, whole or in passes of limited
+    memory: bit for bit the pictures of single views."""
+    splats = random_splats(7, 3000)
+    aims = [(1.0, 0.02, -0.05), (1.0, 0.5, 0.1), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)]
+    eyes = [(0.0, 0.0, 0.0), (1.0, 0.3, 0.2), (0.0, 0.0, 90.0), (9.0, 0.0, 0.0), (-2.0, 1.0, 0.0)]
+    views = [
+        shot(eye, tuple(e + a for e, a in zip(eye, aim, strict=True)), (150, 92), 60.0)
+        for eye, aim in zip(eyes, aims, strict=True)
+    ]
+    together = drawn_together(splats, views, CARD._replace(**limits))
+    for found, taken in zip(together, views, strict=True):
+        alone = drawn(splats, taken, PROCESSOR)
+        assert np.array_equal(found[0], alone[0]) and np.array_equal(found[1], alone[1])
+    filled = [(colour[..., 3] < 1.0).any() for colour, _ in together]
+    assert filled == [True, True, False, True, True]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2047, 2048, 100_000])
+def test_sorts_in_shaders_are_those_of_numpy(count: int) -> None:
+    """Sums, and pairs sorted stably by 11 bits of their keys, also of many blocks."""
+    rng = np.random.default_rng(count)
+    keys = rng.integers(0, 2000, count).astype(np.uint32)
+    numbers = np.arange(count, dtype=np.uint32)
+    with context.context() as gl:
+        shaders, buffers = SplatShaders(gl, CARD), Buffers(gl)
+        names = ("keys", "values", "keys next", "values next", "summed")
+        held = [buffers.room(name, count + 1) for name in names]
+        for buffer, data in zip((held[0], held[1], held[4]), (keys, numbers, keys), strict=True):
+            buffer.write(data)
+        sort = ShaderSort(shaders, buffers)
+        found = sort.sort((held[0], held[1]), (held[2], held[3]), count, 11)
+        sort.sums(held[4], count)
+        sorted_keys, order = (read_words(gl, buffer, 0, count) for buffer in found)
+        sums = read_words(gl, held[4], 0, count + 1)
+        buffers.release()
+    expected = keys.argsort(kind="stable")
+    assert np.array_equal(order, expected) and np.array_equal(sorted_keys, keys[expected])
+    assert np.array_equal(sums, np.concatenate([[0], np.cumsum(keys)]))
+
+
+def test_sums_in_shaders_have_three_levels() -> None:
+    """More values than the square of a block."""
+    count = 2048 * 2048 + 5
+    with context.context() as gl:
+        shaders, buffers = SplatShaders(gl, CARD), Buffers(gl)
+        values = buffers.room("values", count + 1)
+        values.write(np.full(count, 3, dtype=np.uint32))
+        ShaderSort(shaders, buffers).sums(values, count)
+        sums = read_words(gl, values, 0, count + 1)
+        buffers.release()
+    assert np.array_equal(sums, 3 * np.arange(count + 1))
 
 
 def test_huge_splats_fill_a_large_picture() -> None:
@@ -86,6 +160,24 @@ def test_huge_splats_fill_a_large_picture() -> None:
     taken = shot((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1024, 512), 60.0)
     found, _ = drawn(splats, taken)
     assert np.abs(found[..., 3].astype(float) - (1.0 - 3.0 / 255.0) ** count).max() < 1.0 / 255.0
+
+
+def test_a_tile_may_have_more_splats_than_a_loop_has_iterations() -> None:
+    """A splat behind 70,000 small ones is drawn in all pixels around them."""
+    count = 70_000
+    centres = np.zeros((count + 1, 3), dtype=np.float32)
+    centres[:, 0] = 20.0
+    centres[count, 0] = 30.0
+    sizes = np.full((count + 1, 3), 5e-4)
+    sizes[count] = 3.0
+    wide = covariances(np.tile(np.eye(3), (count + 1, 1, 1)), sizes)
+    rgba = np.full((count + 1, 4), 255, dtype=np.uint8)
+    splats = Splats(centres, wide, rgba, np.zeros(count + 1, dtype=bool))
+    taken = shot((0.0, 0.0, 0.0), (1.0, 0.05, 0.05), (64, 64), 60.0)
+    many, few = drawn(splats, taken)[0], drawn(_last(splats, 101), taken)[0]
+    around = (few[..., 3] > 0.2) & (few[..., 3] < 0.6)
+    assert around.sum() > 50
+    assert np.abs(many.astype(float) - few)[around].max() < 0.01
 
 
 def test_a_picture_depends_on_every_splat() -> None:
@@ -212,24 +304,33 @@ def test_without_the_depth_test_splats_cover_everything(monkeypatch: pytest.Monk
     assert min(_shares(4.0)) < 0.5
 
 
-def test_a_batch_draws_scans_as_their_own_cameras_do() -> None:
-    """Two scanned places and two robots at once: bit for bit the pictures of single cameras."""
+@pytest.mark.parametrize("tuning", [PROCESSOR, CARD], ids=["processor", "card"])
+def test_a_batch_draws_scans_as_their_own_cameras_do(
+    tuning: Tuning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two scanned places and four robots at once: bit for bit the pictures of single cameras."""
     scans = [street_scan(sun=SUN), street_scan(noise_m=0.02)]
-    worlds = [BulletWorld(ScanSurface(tiny_map(), scan, 0)) for scan in scans]
-    poses = (Pose(-3.0, 2.0, 0.0), Pose(2.0, 0.5, 0.3))
+    worlds = [BulletWorld(ScanSurface(tiny_map(), scans[k], 0)) for k in (0, 0, 0, 1)]
+    poses = (Pose(-3.0, 2.0, 0.0), Pose(-1.0, 1.0, 0.1), Pose(0.0, 3.0, -0.2), Pose(2.0, 0.5, 0.3))
     robots = [RobotState(pose) for pose in poses]
     spec = CameraSpec(width=96, height=64)
     single = []
     for world, robot in zip(worlds, robots, strict=True):
         with GlCamera(world, spec) as camera:
             single.append(camera.render(robot, walkers(4)))
+    with context.context() as gl:
+        drawing = SplatDrawing(gl, tuning)
+        monkeypatch.setattr(splat_pictures(gl), "drawing", drawing)
     with Atlas(spec) as atlas:
         keys = [atlas.join(world) for world in worlds]
-        seen = [(keys[k], robots[k], walkers(4)) for k in (1, 0)]
+        order = (3, 1, 0, 2)
+        seen = [(keys[k], robots[k], walkers(4)) for k in order]
         found = atlas.render(seen) + atlas.render(seen[:1])
-    for frame, k in zip(found, (1, 0, 1), strict=True):
+    for frame, k in zip(found, (*order, order[0]), strict=True):
         assert np.array_equal(frame.rgb, single[k].rgb)
         assert np.array_equal(frame.labels, single[k].labels)  # type: ignore[arg-type]
+    with context.context():
+        drawing.release()
 
 
 def test_labels_and_depth_are_those_of_the_mesh() -> None:

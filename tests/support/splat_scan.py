@@ -12,7 +12,8 @@ from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, ScanMesh, ScanSun, Splats
 from physics.cameras.gl import context
-from physics.cameras.gl.splats import SplatCloud, SplatDrawing, SplatTarget, Tuning, view_rows
+from physics.cameras.gl.splat_sort import Tuning
+from physics.cameras.gl.splats import SplatCloud, SplatDrawing, SplatTarget, Views
 from physics.cameras.view import Shot, shot
 
 AHEAD = shot((0.0, 0.0, 0.0), (1.0, 0.02, -0.05), (160, 96), 60.0)
@@ -138,17 +139,26 @@ def drawn(
     splats: Splats, taken: Shot = AHEAD, tuning: Tuning | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return premultiplied colour with transmittance, and median depth, as the camera draws them."""
+    return drawn_together(splats, [taken], tuning)[0]
+
+
+def drawn_together(
+    splats: Splats, views: list[Shot], tuning: Tuning | None = None
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return what `drawn` does for views of one size that are drawn together."""
+    height = views[0].size[1]
     with context.context() as gl:
         cloud, drawing, target = (
             SplatCloud(gl, splats),
             SplatDrawing(gl, tuning),
-            SplatTarget(gl, taken.size),
+            SplatTarget(gl, views[0].size, len(views)),
         )
-        drawing.draw(cloud, view_rows(taken), target, limited=False)
-        found = target.read()
+        drawing.draw(cloud, Views.of(views), target, limited=False)
+        colour, median = target.read()
         for thing in (cloud, drawing, target):
             thing.release()
-    return found
+    rows = [slice(k * height, (k + 1) * height) for k in range(len(views))]
+    return [(colour[one], median[one]) for one in rows]
 
 
 def picture_hash() -> str:

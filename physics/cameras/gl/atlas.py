@@ -3,7 +3,7 @@
 Environments join and leave at any time, each with a world, a light and a robot; a batch holds any
 subset.
 Each picture has the same bits as that of a separate `GlCamera`.
-It is drawn separately and copied behind the previous one into a buffer on the graphics card.
+It is copied behind the previous one into a buffer on the graphics card.
 Waiting for that buffer dominates the cost, so call `begin` for the next pictures before `end` for
 the last ones.
 """

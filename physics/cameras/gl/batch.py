@@ -1,7 +1,7 @@
 """Batches of pictures of any number of environments.
 
-Moving objects of all pictures are posed, culled and uploaded together.
-Each picture is then drawn separately, so that its bits do not depend on the batch.
+Moving objects of all pictures are posed, culled and uploaded together, and splats of one scan are
+drawn together. Triangles of each picture are drawn separately. Bits do not depend on the batch.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shading import Pass, SceneBlocks, camera_matrix
 from physics.cameras.gl.shadows import TO_TEXTURE, ShadowMaps, casting
 from physics.cameras.gl.shots import Shots
-from physics.cameras.gl.splat_layers import splat_pictures
+from physics.cameras.gl.splat_layers import Layers, splat_pictures
 from physics.cameras.gl.splats import SplatCloud
 from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.targets import Target
@@ -94,10 +94,9 @@ class BatchDrawing:
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self._surfaces.bind()
             self._context.front_face = "cw"  # draw upside down, to read the top row first
-            for i, picture in enumerate(few):
-                target.clear()
-                self._draw(i, picture, target)
-                drawn(first + i)
+            for start, some in self._together(few, target.size):
+                for i in self._draw_some(start, some, target):
+                    drawn(first + i)
             first += len(few)
 
     def _arrange(self, pictures: Sequence[PictureOrder]) -> Shots:
@@ -146,16 +145,62 @@ class BatchDrawing:
                     draw = partial(self._draw_pass, i, one.stage)
                     one.stage.shadows.draw(middle, anchor, one.stage.light, draw)
 
+    def _together(
+        self, pictures: Sequence[PictureOrder], size: tuple[int, int]
+    ) -> Iterator[tuple[int, Sequence[PictureOrder]]]:
+        """Split pictures into those that are drawn together, with the number of the first.
+
+        These are pictures in a row with splats of the same cloud.
+        """
+        begun = 0
+        most = self._pictures.most(size)
+        for i in range(1, len(pictures) + 1):
+            cloud = pictures[begun].stage.cloud
+            alone = cloud is None or i - begun == most
+            if i == len(pictures) or alone or pictures[i].stage.cloud is not cloud:
+                yield begun, pictures[begun:i]
+                begun = i
+
+    def _draw_some(
+        self, start: int, pictures: Sequence[PictureOrder], target: Target
+    ) -> Iterator[int]:
+        """Draw pictures that belong together into the target; yield the number of each.
+
+        start: number of the first
+        """
+        cloud = pictures[0].stage.cloud
+        if cloud is None:
+            target.clear()
+            self._draw(start, pictures[0], target)
+            yield start
+            return
+        stack = self._pictures.stack(target.size, len(pictures))
+        self._pictures.draw(
+            cloud,
+            [one.taken for one in pictures],
+            stack,
+            lambda nth, layers: self._draw_layers(start + nth, pictures[nth], layers),
+        )
+        for nth, picture in enumerate(pictures):
+            self._bind(start + nth, picture)
+            target.clear()
+            self._context.enable_only(moderngl.DEPTH_TEST)
+            self._pictures.compose(nth, picture.light, stack, target)
+            self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+            yield start + nth
+
+    def _bind(self, i: int, picture: PictureOrder) -> None:
+        """Bind a picture's scene block and shadow maps."""
+        if picture.stage.shadows is not None:
+            picture.stage.shadows.bind()
+        self._blocks.bind(2 * i)
+
     def _draw(self, i: int, picture: PictureOrder, target: Target) -> None:
+        """Draw a picture without splats."""
         gl = self._context
         stage = picture.stage
-        if stage.shadows is not None:
-            stage.shadows.bind()
-        self._blocks.bind(2 * i)
+        self._bind(i, picture)
         gl.depth_func = "<"
-        if stage.cloud is not None:
-            self._draw_splats(i, picture, stage.cloud, target)
-            return
         self._draw_pass(i, stage, "colour")
         # Paint changes colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
@@ -166,12 +211,11 @@ class BatchDrawing:
         gl.depth_func = "<="
         stage.backdrop.draw()
 
-    def _draw_splats(
-        self, i: int, picture: PictureOrder, cloud: SplatCloud, target: Target
-    ) -> None:
-        """Draw objects before the sky and the scan's mesh apart, and compose them with splats."""
+    def _draw_layers(self, i: int, picture: PictureOrder, layers: Layers) -> None:
+        """Draw objects before the sky, and the scan's mesh apart."""
         gl = self._context
-        layers = self._pictures.layers(target.size)
+        self._bind(i, picture)
+        gl.depth_func = "<"
         layers.objects.use()
         layers.objects.clear(depth=1.0)
         self._draw_pass(i, picture.stage, "colour")
@@ -182,7 +226,6 @@ class BatchDrawing:
         gl.depth_func = "<"
         gl.enable_only(moderngl.DEPTH_TEST)
         picture.stage.scene.draw_mesh()
-        self._pictures.compose(cloud, picture.taken, picture.light, layers, target)
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
     def _draw_pass(self, i: int, stage: Stage, which: Pass) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
@@ -24,7 +25,7 @@ from physics.cameras.gl import splat_shaders as glsl
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.scans import SHADE
 from physics.cameras.gl.shading import programs
-from physics.cameras.gl.splats import SplatCloud, SplatDrawing, SplatTarget, view_rows
+from physics.cameras.gl.splats import SplatCloud, SplatDrawing, SplatTarget, Views
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import Sky, sky_of
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
@@ -58,6 +59,7 @@ layout(binding = {glsl.MESH_DEPTH_UNIT}) uniform sampler2D mesh_depth;
 layout(binding = {glsl.COLOUR_UNIT}) uniform sampler2D splats;
 layout(binding = {glsl.MEDIAN_UNIT}) uniform sampler2D median;
 layout(binding = {glsl.LIMITS_UNIT}) uniform sampler2D limits;
+uniform int first_row;
 in vec2 spot;
 {glsl.METRES}
 float shaded(vec3 at, vec3 normal) {{
@@ -75,11 +77,11 @@ float shaded(vec3 at, vec3 normal) {{
     return mix(1.0, mix(SHADED, 1.0, lit), smoothstep(0.0, 0.2, dot(normal, sun.xyz)));
 }}
 void main() {{
-    ivec2 here = ivec2(gl_FragCoord.xy);
-    vec4 behind = texelFetch(objects, here, 0), blended = texelFetch(splats, here, 0);
+    ivec2 here = ivec2(gl_FragCoord.xy), stacked = here + ivec2(0, first_row);
+    vec4 behind = texelFetch(objects, here, 0), blended = texelFetch(splats, stacked, 0);
     vec4 surface = texelFetch(mesh, here, 0);
-    float far = texelFetch(mesh_depth, here, 0).r, limit = abs(texelFetch(limits, here, 0).r);
-    float object = texelFetch(objects_depth, here, 0).r, middle = texelFetch(median, here, 0).r;
+    float far = texelFetch(mesh_depth, here, 0).r, limit = abs(texelFetch(limits, stacked, 0).r);
+    float object = texelFetch(objects_depth, here, 0).r, middle = texelFetch(median, stacked, 0).r;
     bool covered = blended.a <= 0.5, none = limit >= {glsl.NOTHING_M:.1f};
     vec3 colour = blended.rgb;
     if (far < 1.0 && limit > 0.0) {{
@@ -98,12 +100,9 @@ void main() {{
 
 
 class Layers:
-    """Layers of pictures of one size."""
+    """Layers of a picture that are drawn by triangles."""
 
     def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
-        self.size = size
-        self.splats = SplatTarget(context, size)
-        self.limits = context.texture(size, 1, dtype="f4")
         self._objects = context.texture(size, 4, dtype="f2")
         self._mesh = context.texture(size, 4)
         self._depths = [context.depth_texture(size) for _ in range(2)]
@@ -119,18 +118,39 @@ class Layers:
             (self._depths[0], glsl.OBJECTS_DEPTH_UNIT),
             (self._mesh, glsl.MESH_UNIT),
             (self._depths[1], glsl.MESH_DEPTH_UNIT),
-            (self.splats.colour, glsl.COLOUR_UNIT),
-            (self.splats.median, glsl.MEDIAN_UNIT),
-            (self.limits, glsl.LIMITS_UNIT),
         ):
             texture.use(unit)
 
     def release(self) -> None:
         self.objects.release()
         self.mesh.release()
-        for texture in (self._objects, self._mesh, *self._depths, self.limits):
+        for texture in (self._objects, self._mesh, *self._depths):
             texture.release()
+
+
+class Stack:
+    """Layers of pictures of one size that are drawn together.
+
+    The splats and the limits of all pictures are in one texture each, one picture below the other.
+    """
+
+    def __init__(self, context: moderngl.Context, size: tuple[int, int], pictures: int) -> None:
+        self.layers = [Layers(context, size) for _ in range(pictures)]
+        self.splats = SplatTarget(context, size, pictures)
+        self.limits = context.texture(self.splats.size, 1, dtype="f4")
+
+    def bind(self, nth: int) -> None:
+        """Bind the layers of the nth picture to their texture units."""
+        self.layers[nth].bind()
+        self.splats.colour.use(glsl.COLOUR_UNIT)
+        self.splats.median.use(glsl.MEDIAN_UNIT)
+        self.limits.use(glsl.LIMITS_UNIT)
+
+    def release(self) -> None:
+        while self.layers:
+            self.layers.pop().release()
         self.splats.release()
+        self.limits.release()
 
 
 @dataclass(slots=True)
@@ -148,9 +168,9 @@ class SplatPictures:
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self.drawing = SplatDrawing(context)
-        self._sizes: OrderedDict[tuple[int, int], Layers] = OrderedDict()
+        self._sizes: OrderedDict[tuple[int, int], Stack] = OrderedDict()
         self._clouds: list[_Held] = []
-        self._arrays: dict[int, moderngl.VertexArray] = {}
+        self._arrays: dict[int, tuple[moderngl.VertexArray, moderngl.Uniform]] = {}
 
     def cloud(self, splats: Splats) -> SplatCloud:
         """Return the cloud of splats, shared by all cameras that use it until `release`."""
@@ -175,39 +195,63 @@ class SplatPictures:
         """Return a cloud; it may be used again."""
         next(one for one in self._clouds if one.cloud is cloud).users -= 1
 
-    def layers(self, size: tuple[int, int]) -> Layers:
-        """Return the layers of a size; the last few sizes are cached."""
-        if size not in self._sizes:
+    def most(self, size: tuple[int, int]) -> int:
+        """Return the maximum number of pictures of a size that are drawn together."""
+        tallest: int = self._context.info["GL_MAX_TEXTURE_SIZE"]
+        return max(1, min(self.drawing.tuning.views, tallest // size[1]))
+
+    def stack(self, size: tuple[int, int], pictures: int) -> Stack:
+        """Return the layers of at least `pictures` pictures; those of the last few sizes are
+        cached."""
+        held = self._sizes.pop(size, None)
+        if held is not None and len(held.layers) < pictures:
+            held.release()
+            held = None
+        if held is None:
             if len(self._sizes) == _SIZES_MAX:
                 self._sizes.popitem(last=False)[1].release()
-            self._sizes[size] = Layers(self._context, size)
-        self._sizes.move_to_end(size)
-        return self._sizes[size]
+            held = Stack(self._context, size, pictures)
+        self._sizes[size] = held
+        return held
 
-    def compose(
-        self, cloud: SplatCloud, taken: Shot, light: Lighting, layers: Layers, target: Target
+    def draw(
+        self,
+        cloud: SplatCloud,
+        taken: Sequence[Shot],
+        stack: Stack,
+        triangles: Callable[[int, Layers], None],
     ) -> None:
-        """Draw splats, and compose all layers of a picture into the target.
+        """Draw all layers of pictures of one size. triangles: draws the layers of the nth one."""
+        views = Views.of(taken)
+        for nth in range(len(taken)):
+            triangles(nth, stack.layers[nth])
+            stack.bind(nth)
+            self.drawing.limit(views, nth, stack.limits)
+        self.drawing.draw(cloud, views, stack.splats, limited=True)
+
+    def compose(self, nth: int, light: Lighting, stack: Stack, target: Target) -> None:
+        """Compose the layers of the nth picture into the target.
 
         The picture's scene block and shadow maps must be bound.
         """
-        layers.bind()
-        rows = view_rows(taken)
-        self.drawing.limit(rows, layers.limits)
-        self.drawing.draw(cloud, rows, layers.splats, limited=True)
+        stack.bind(nth)
         gl = self._context
         target.use()
         gl.depth_func = _ALWAYS
-        self._array(light).render(moderngl.TRIANGLES, vertices=3)
+        array, first_row = self._array(light)
+        first_row.value = nth * target.size[1]
+        array.render(moderngl.TRIANGLES, vertices=3)
         gl.depth_func = "<"
 
-    def _array(self, light: Lighting) -> moderngl.VertexArray:
+    def _array(self, light: Lighting) -> tuple[moderngl.VertexArray, moderngl.Uniform]:
         contact = not light.sun.any()
         key = 2 * light.shadows + contact
         if key not in self._arrays:
             fragment = ("#define CONTACT\n" if contact else "") + _FRAGMENT
             program = programs(self._context, _VERTEX, fragment, light.shadows).colour
-            self._arrays[key] = self._context.vertex_array(program, [])
+            first_row = program["first_row"]
+            assert isinstance(first_row, moderngl.Uniform)
+            self._arrays[key] = self._context.vertex_array(program, []), first_row
         return self._arrays[key]
 
 

@@ -1,7 +1,8 @@
-"""Compute shaders of splats: keys, stable sort, projection, lists of tiles, and the picture.
+"""Compute shaders of splats: keys, stable sort, projection, lists of tiles, and the pictures.
 
-All shaders read the uniform block `Splatting` (binding VIEW_BINDING), see `view_rows` in
-`physics.cameras.gl.splats`. Buffers are storage blocks with the bindings of the shader.
+A pass draws several views of a cloud; their pictures are stacked in one texture. The views are in
+the uniform block `Splatting` (binding VIEW_BINDING), see `Views` in `physics.cameras.gl.splats`.
+Buffers are storage blocks with the bindings of the shader.
 
 Pictures are upside down in textures: row 0 is the top one.
 No shader uses atomic operations, so that the order of blending depends on no schedule.
@@ -17,6 +18,12 @@ from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 VIEW_BINDING: Final = 1
 TILE_PX: Final = 8
 """Side of a tile in pixels."""
+DIGITS: Final = 256
+"""Values of a digit of a sort; a power of two."""
+SORTED: Final = 2048
+"""Pairs of a block of a sort."""
+SCANNED: Final = 2048
+"""Values of a block of prefix sums."""
 BATCH: Final = 256
 """Splats of a tile that its invocations fetch together, with one pixel for each invocation."""
 NEAR_M: Final = 0.2
@@ -55,215 +62,230 @@ float metres(float depth) {{
 """Conversion of the depth buffer to metres along the view."""
 
 _BLOCK: Final = f"""#version 430
-layout(std140, binding = {VIEW_BINDING}) uniform Splatting {{
-    vec4 eye;     // xyz in the frame of the splats; w focal length in pixels
-    vec4 right;   // w tangent of half the width
-    vec4 up;      // w tangent of half the height
+struct View {{
+    vec4 eye;      // xyz in the frame of the splats; w focal length in pixels
+    vec4 right;    // w tangent of half the width
+    vec4 up;       // w tangent of half the height
     vec4 ahead;
-    uvec4 sizes;  // width and height in pixels, columns and rows of tiles
-    uvec4 counts; // splats
-    vec4 lattice; // xyz of the point from which distances are sorted
+    vec4 lattice;  // xyz of the point from which distances are sorted
 }};
+layout(std140, binding = {VIEW_BINDING}) uniform Splatting {{
+    uvec4 sizes;   // width and height of a picture in pixels, columns and rows of its tiles
+    uvec4 counts;  // splats of the cloud, views, number of the first view's picture
+    View views[VIEWS];
+}};
+// The views of a pass share their lists: the splat s of view v has the number v * counts.x + s.
+uint view_of(uint number) {{ return VIEWS == 1 ? 0u : number / counts.x; }}
 """
+
+_LINE_INDEX: Final = "gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * 4194240u"
+"""Number of an invocation in a dispatch of several lines."""
 
 KEYS: Final = (
     _BLOCK
-    + """
+    + f"""
 layout(local_size_x = 64) in;
-layout(std430, binding = 0) readonly buffer Splats { uvec4 splats[]; };
-layout(std430, binding = 1) writeonly buffer Keys { uint keys[]; };
-layout(std430, binding = 2) writeonly buffer Values { uint values[]; };
-void main() {
-    uint i = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * 4194240u;
-    if (i >= counts.x) return;
-    precise vec3 d = uintBitsToFloat(splats[3u * i].xyz) - lattice.xyz;
+layout(std430, binding = 0) readonly buffer Splats {{ uvec4 splats[]; }};
+layout(std430, binding = 1) readonly buffer Seen {{ uint seen[]; }};
+layout(std430, binding = 2) writeonly buffer Keys {{ uint keys[]; }};
+layout(std430, binding = 3) writeonly buffer Values {{ uint values[]; }};
+void main() {{
+    uint i = {_LINE_INDEX};
+    if (i >= counts.x * counts.y) return;
+    uint at = seen[i];
+    if (seen[i + 1u] == at) return;
+    uint view = view_of(i);
+    precise vec3 d = uintBitsToFloat(splats[3u * (i - view * counts.x)].xyz) - views[view].lattice.xyz;
     precise float xx = d.x * d.x;
     precise float yy = d.y * d.y;
     precise float zz = d.z * d.z;
     precise float xy = xx + yy;
     precise float all = xy + zz;
     uint bits = floatBitsToUint(all) >> 12;
-    keys[i] = min(max(bits, 251904u) - 251904u, 65535u);
-    values[i] = i;
-}
+    keys[at] = min(max(bits, 251904u) - 251904u, 65535u);
+    values[at] = i;
+}}
 """
 )
-"""Keys of the order: the bits of the squared distance, in steps of 2048 to a factor of two.
+"""List the splats in view, and their keys: the bits of the squared distance.
 
-251904 is the key of 2^-4, a distance of 0.25 m. Steps are below 0.03 % of the distance.
+251904 is the key of 2^-4, a distance of 0.25 m. A factor of two has 2048 steps, each below 0.03 %
+of the distance.
 """
 
-CLEAR: Final = """#version 430
+SCAN: Final = f"""#version 430
+layout(local_size_x = 256) in;
+layout(std430, binding = 0) buffer Values {{ uint values[]; }};
+layout(std430, binding = 1) writeonly buffer Sums {{ uint sums[]; }};
+uniform uint total;
+shared uint parts[256];
+void main() {{
+    const uint EACH = {SCANNED // 256}u;
+    uint t = gl_LocalInvocationID.x, first = gl_WorkGroupID.x * {SCANNED}u + t * EACH;
+    uint one[EACH], sum = 0u;
+    for (uint k = 0u; k < EACH; ++k) {{
+        one[k] = first + k < total ? values[first + k] : 0u;
+        sum += one[k];
+    }}
+    parts[t] = sum;
+    barrier();
+    for (uint step = 1u; step < 256u; step *= 2u) {{
+        uint before = t >= step ? parts[t - step] : 0u;
+        barrier();
+        parts[t] += before;
+        barrier();
+    }}
+    if (t == 255u) sums[gl_WorkGroupID.x] = parts[t];
+    sum = parts[t] - sum;
+    for (uint k = 0u; k < EACH; ++k) {{
+        if (first + k <= total) values[first + k] = sum;
+        sum += one[k];
+    }}
+}}
+"""
+"""Replace values by the sums of those before in their block, and write the sums of blocks.
+
+The sum of all follows the values.
+"""
+
+ADD: Final = f"""#version 430
 layout(local_size_x = 64) in;
-layout(std430, binding = 0) writeonly buffer Counts { uint counts[]; };
+layout(std430, binding = 0) buffer Values {{ uint values[]; }};
+layout(std430, binding = 1) readonly buffer Sums {{ uint sums[]; }};
 uniform uint total;
-void main() {
-    uint i = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * 4194240u;
-    if (i < total) counts[i] = 0u;
-}
+void main() {{
+    uint i = {_LINE_INDEX};
+    if (i < total) values[i] += sums[i / {SCANNED}u];
+}}
 """
+"""Add the sums of the blocks before."""
 
-_SORTED: Final = """
+_SORTED: Final = f"""
 uniform uint total;
-uniform uint chunk;   // items of an invocation
-uniform uint chunks;
-uniform uint digits;
+uniform uint blocks;
 uniform uint shift;
+const uint EACH = {SORTED}u / LANESu;
+shared uint held[{DIGITS // 2} * (LANES + 1)];  // two counters of 16 bits for each lane
+uint word_of(uint digit, uint lane) {{ return (digit >> 1) * (LANESu + 1u) + lane; }}
+uint bits_of(uint digit) {{ return (digit & 1u) << 4; }}
+uint digit_of(uint key) {{ return (key >> shift) & {DIGITS - 1}u; }}
 """
+"""Counters of the digits of a block. Odd strides spread them over the banks of the memory."""
 
 COUNT: Final = (
     """#version 430
 layout(local_size_x = LANES) in;
-layout(std430, binding = 0) buffer Counts { uint counts[]; };
+layout(std430, binding = 0) writeonly buffer Counts { uint counts[]; };
 layout(std430, binding = 1) readonly buffer Keys { uint keys[]; };
 """
     + _SORTED
-    + """
-void main() {
-    uint c = gl_GlobalInvocationID.x;
-    if (c >= chunks) return;
-    uint end = min((c + 1u) * chunk, total);
-    for (uint i = c * chunk; i < end; ++i)
-        counts[c * digits + ((keys[i] >> shift) % digits)] += 1u;
-}
-"""
-)
-"""Count the keys of each chunk by digit."""
-
-COLUMNS: Final = (
-    """#version 430
-layout(local_size_x = 64) in;
-layout(std430, binding = 0) buffer Counts { uint counts[]; };
-layout(std430, binding = 1) writeonly buffer Groups { uint groups[]; };
-uniform uint group;   // chunks of a group
-"""
-    + _SORTED
-    + """
-void main() {
-    uint digit = gl_GlobalInvocationID.x, g = gl_GlobalInvocationID.y;
-    if (digit >= digits) return;
-    uint sum = 0u;
-    uint end = min((g + 1u) * group, chunks);
-    for (uint c = g * group; c < end; ++c) {
-        uint one = counts[c * digits + digit];
-        counts[c * digits + digit] = sum;
-        sum += one;
-    }
-    groups[g * digits + digit] = sum;
-}
-"""
-)
-"""Replace the counts of a digit by their sums over the chunks before, within a group."""
-
-GROUPS: Final = (
-    """#version 430
-layout(local_size_x = 64) in;
-layout(std430, binding = 0) buffer Groups { uint groups[]; };
-layout(std430, binding = 1) writeonly buffer Totals { uint totals[]; };
-uniform uint groups_of;
-"""
-    + _SORTED
-    + """
-void main() {
-    uint digit = gl_GlobalInvocationID.x;
-    if (digit >= digits) return;
-    uint sum = 0u;
-    for (uint g = 0u; g < groups_of; ++g) {
-        uint one = groups[g * digits + digit];
-        groups[g * digits + digit] = sum;
-        sum += one;
-    }
-    totals[digit] = sum;
-}
-"""
-)
-"""Replace the sums of the groups by those of the groups before."""
-
-SCAN: Final = """#version 430
-layout(local_size_x = 256) in;
-layout(std430, binding = 0) buffer Totals { uint totals[]; };
-uniform uint digits;
-shared uint sums[256];
-void main() {
-    uint t = gl_LocalInvocationID.x;
-    uint each = (digits + 255u) / 256u;
-    uint first = min(t * each, digits), end = min(first + each, digits);
-    uint sum = 0u;
-    for (uint i = first; i < end; ++i) sum += totals[i];
-    sums[t] = sum;
+    + f"""
+void main() {{
+    uint lane = gl_LocalInvocationID.x, block = gl_WorkGroupID.x;
+    for (uint d = 0u; d < {DIGITS}u; d += 2u) held[word_of(d, lane)] = 0u;
+    for (uint k = 0u; k < EACH; ++k) {{
+        uint i = block * {SORTED}u + k * LANESu + lane;
+        if (i >= total) break;
+        uint digit = digit_of(keys[i]);
+        held[word_of(digit, lane)] += 1u << bits_of(digit);
+    }}
     barrier();
-    for (uint step = 1u; step < 256u; step *= 2u) {
-        uint before = t >= step ? sums[t - step] : 0u;
-        barrier();
-        sums[t] += before;
-        barrier();
-    }
-    sum = sums[t] - sum;
-    for (uint i = first; i < end; ++i) {
-        uint one = totals[i];
-        totals[i] = sum;
-        sum += one;
-    }
-    if (t == 255u) totals[digits] = sums[255];
-}
+    for (uint d = 2u * lane; d < {DIGITS}u; d += 2u * LANESu) {{
+        uint sum = 0u;
+        for (uint l = 0u; l < LANESu; ++l) sum += held[word_of(d, l)];
+        counts[d * blocks + block] = sum & 0xffffu;
+        counts[(d + 1u) * blocks + block] = sum >> 16;
+    }}
+}}
 """
-"""Replace values by the sums of those before, and append the sum of all. One group of 256."""
+)
+"""Count the keys of each block by digit: one group for each block."""
 
 SCATTER: Final = (
     """#version 430
 layout(local_size_x = LANES) in;
-layout(std430, binding = 0) buffer Counts { uint counts[]; };
+layout(std430, binding = 0) readonly buffer Counts { uint counts[]; };
 layout(std430, binding = 1) readonly buffer Keys { uint keys[]; };
-layout(std430, binding = 2) readonly buffer Groups { uint groups[]; };
-layout(std430, binding = 3) readonly buffer Totals { uint totals[]; };
-layout(std430, binding = 4) readonly buffer Values { uint values[]; };
-layout(std430, binding = 5) writeonly buffer KeysOut { uint keys_out[]; };
-layout(std430, binding = 6) writeonly buffer ValuesOut { uint values_out[]; };
-uniform uint group;
-uniform uint keep_keys;
+layout(std430, binding = 2) readonly buffer Values { uint values[]; };
+layout(std430, binding = 3) writeonly buffer KeysOut { uint keys_out[]; };
+layout(std430, binding = 4) writeonly buffer ValuesOut { uint values_out[]; };
 """
     + _SORTED
-    + """
-void main() {
-    uint c = gl_GlobalInvocationID.x;
-    if (c >= chunks) return;
-    uint end = min((c + 1u) * chunk, total);
-    uint before = (c / group) * digits;
-    for (uint i = c * chunk; i < end; ++i) {
-        uint key = keys[i];
-        uint digit = (key >> shift) % digits;
-        uint at = counts[c * digits + digit];
-        counts[c * digits + digit] = at + 1u;
-        at += groups[before + digit] + totals[digit];
-        values_out[at] = values[i];
-        if (keep_keys != 0u) keys_out[at] = key;
-    }
-}
+    + f"""
+shared uint staged[{SORTED} + LANES];
+shared uint starts[{DIGITS}];
+void main() {{
+    uint lane = gl_LocalInvocationID.x, first = gl_WorkGroupID.x * {SORTED}u;
+    uint items = min(total - first, {SORTED}u);
+    for (uint d = 0u; d < {DIGITS}u; d += 2u) held[word_of(d, lane)] = 0u;
+    for (uint i = lane; i < items; i += LANESu) staged[i + i / EACH] = keys[first + i];
+    for (uint d = lane; d < {DIGITS}u; d += LANESu) starts[d] = counts[d * blocks + gl_WorkGroupID.x];
+    barrier();
+    uint begin = min(lane * EACH, items), end = min(begin + EACH, items);
+    for (uint i = begin; i < end; ++i) {{
+        uint digit = digit_of(staged[i + lane]);
+        held[word_of(digit, lane)] += 1u << bits_of(digit);
+    }}
+    barrier();
+    for (uint d = 2u * lane; d < {DIGITS}u; d += 2u * LANESu) {{
+        uint sum = 0u;
+        for (uint l = 0u; l < LANESu; ++l) {{
+            uint one = held[word_of(d, l)];
+            held[word_of(d, l)] = sum;
+            sum += one;
+        }}
+    }}
+    barrier();
+    for (uint i = begin; i < end; ++i) {{
+        uint key = staged[i + lane];
+        uint digit = digit_of(key), word = word_of(digit, lane);
+        uint before = held[word];
+        held[word] = before + (1u << bits_of(digit));
+        uint at = starts[digit] + ((before >> bits_of(digit)) & 0xffffu);
+        keys_out[at] = key;
+        values_out[at] = values[first + i];
+    }}
+}}
 """
 )
-"""Move values to their places, in the order of the input within a digit."""
+"""Move pairs to their places, in the order of the input within a digit.
+
+Each lane moves EACH pairs in a row. counts: sums of those before, by digit and then by block.
+"""
 
 PROJECT: Final = (
     _BLOCK
     + f"""
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Splats {{ uvec4 splats[]; }};
-layout(std430, binding = 1) readonly buffer Order {{ uint order[]; }};
-layout(std430, binding = 2) writeonly buffer Records {{ uvec4 records[]; }};
-layout(std430, binding = 3) writeonly buffer Rects {{ uvec2 rects[]; }};
-layout(std430, binding = 4) writeonly buffer Slopes {{ vec2 slopes[]; }};
+layout(std430, binding = 1) writeonly buffer Tiles {{ uint tiles[]; }};
+#ifndef CULL
+layout(std430, binding = 2) readonly buffer Order {{ uint order[]; }};
+layout(std430, binding = 3) writeonly buffer Records {{ uvec4 records[]; }};
+layout(std430, binding = 4) writeonly buffer Rects {{ uvec2 rects[]; }};
+layout(std430, binding = 5) writeonly buffer Slopes {{ vec2 slopes[]; }};
+#endif
+uniform uint total;
 const float SCALE = 0.84932180;  // sqrt(log2(e) / 2)
 const float FAINTEST = -7.99435344;  // log2(1 / 255)
 void main() {{
-    uint i = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * 4194240u;
-    if (i >= counts.x) return;
-    uint s = 3u * order[i];
+    uint i = {_LINE_INDEX};
+    if (i >= total) return;
+#ifdef CULL
+    uint number = i;
+#else
+    uint number = order[i];
+    rects[i] = uvec2(0u);
+#endif
+    tiles[i] = 0u;
+    uint view = view_of(number), s = 3u * (number - view * counts.x);
+    vec4 eye = views[view].eye, right = views[view].right;
+    vec4 up = views[view].up, ahead = views[view].ahead;
     uvec4 centre = splats[s];
     vec3 d = uintBitsToFloat(centre.xyz) - eye.xyz;
     float z = dot(ahead.xyz, d);
     uint rgba = centre.w;
     float opacity = float(rgba >> 24) / 255.0;
-    rects[i] = uvec2(0u);
     if (!(z > {NEAR_M}) || opacity < 1.0 / 255.0) return;
     float x = dot(right.xyz, d) / z, y = dot(up.xyz, d) / z;
     vec4 first = uintBitsToFloat(splats[s + 1u]);
@@ -286,7 +308,12 @@ void main() {{
     vec2 low = max(floor((at - half_px) / {TILE_PX}.0), vec2(0.0));
     vec2 high = min(floor((at + half_px) / {TILE_PX}.0) + 1.0, vec2(sizes.zw));
     if (!all(lessThan(low, high))) return;
-    rects[i] = uvec2(uint(low.x) | (uint(low.y) << 16), uint(high.x) | (uint(high.y) << 16));
+#ifdef CULL
+    tiles[i] = 1u;
+#else
+    tiles[i] = uint(high.x - low.x) * uint(high.y - low.y);
+    uint row = view * sizes.w;
+    rects[i] = uvec2(uint(low.x) | (row + uint(low.y)) << 16, uint(high.x) | (row + uint(high.y)) << 16);
     float root = sqrt(c * det);
     uint marks = (rgba & 0xffffffu) | (second.z > 0.5 ? 0x1000000u : 0u);
     mat3 lower = mat3(col, vec3(0.0, first.z, second.x), vec3(0.0, 0.0, second.y));
@@ -298,10 +325,14 @@ void main() {{
     slopes[i] = vec2(vv * zu - ff * zv, uu * zv - ff * zu) / max(dot(n, n) + 1e-4 * uu * vv, 1e-37);
     records[2u * i] = floatBitsToUint(vec4(at, SCALE * c / root, -SCALE * b / root));
     records[2u * i + 1u] = uvec4(floatBitsToUint(vec3(SCALE / sqrt(c), lo, z)), marks);
+#endif
 }}
 """
 )
-"""Project splats in their order to records of 8 words, and to rectangles of tiles.
+"""Project splats in their order to records of 8 words, to rectangles and numbers of tiles.
+
+CULL: write only whether each splat is in each view. The tiles of a view follow those of the views
+before.
 
 A record is the pixel, three factors of the inverse covariance, log2 of the opacity, the depth, and
 the colour with the mark of the ground. Slopes are those of the depth in metres per pixel, of the
@@ -309,55 +340,22 @@ splat with its standard deviations squared, and so nearly flat.
 The factors have no cancellation in long, thin splats.
 """
 
-SUMS: Final = (
-    _BLOCK
-    + """
-layout(local_size_x = LANES) in;
-layout(std430, binding = 0) readonly buffer Rects { uvec2 rects[]; };
-layout(std430, binding = 1) writeonly buffer Sums { uint sums[]; };
-layout(std430, binding = 2) writeonly buffer Before { uint before[]; };
-uniform uint chunk;
-void main() {
-    uint c = gl_GlobalInvocationID.x;
-    uint end = min((c + 1u) * chunk, counts.x);
-    if (c * chunk >= end) return;
-    uint sum = 0u;
-    for (uint i = c * chunk; i < end; ++i) {
-        uvec2 rect = rects[i];
-        before[i] = sum;
-        sum += ((rect.y & 0xffffu) - (rect.x & 0xffffu)) * ((rect.y >> 16) - (rect.x >> 16));
-    }
-    sums[c] = sum;
-}
-"""
-)
-"""Count the pairs of tile and splat of each chunk, and those before each splat in its chunk."""
-
 EMIT: Final = (
     _BLOCK
     + """
 layout(local_size_x = LANES) in;
 layout(std430, binding = 0) readonly buffer Rects { uvec2 rects[]; };
-layout(std430, binding = 1) readonly buffer Sums { uint sums[]; };
-layout(std430, binding = 2) readonly buffer Before { uint before[]; };
-layout(std430, binding = 3) writeonly buffer Keys { uint keys[]; };
-layout(std430, binding = 4) writeonly buffer Values { uint values[]; };
-uniform uint chunk;
-uniform uint chunks;
+layout(std430, binding = 1) readonly buffer Before { uint before[]; };
+layout(std430, binding = 2) writeonly buffer Keys { uint keys[]; };
+layout(std430, binding = 3) writeonly buffer Values { uint values[]; };
+uniform uint drawn;  // splats
 uniform uint span;   // pairs of an invocation
 uniform uint total;
 uint splat_of(uint pair) {
-    uint low = 0u, high = chunks;
+    uint low = 0u, high = drawn;
     while (low + 1u < high) {
         uint middle = (low + high) / 2u;
-        if (sums[middle] <= pair) low = middle; else high = middle;
-    }
-    uint inside = pair - sums[low];
-    high = min((low + 1u) * chunk, counts.x);
-    low *= chunk;
-    while (low + 1u < high) {
-        uint middle = (low + high) / 2u;
-        if (before[middle] <= inside) low = middle; else high = middle;
+        if (before[middle] <= pair) low = middle; else high = middle;
     }
     return low;
 }
@@ -365,7 +363,7 @@ void main() {
     uint pair = gl_GlobalInvocationID.x * span;
     uint end = min(pair + span, total);
     if (pair >= end) return;
-    uint i = splat_of(pair), x, y, x0, x1, y1, nth = pair - sums[i / chunk] - before[i];
+    uint i = splat_of(pair), x, y, x0, x1, y1, nth = pair - before[i];
     uvec2 rect = rects[i];
     for (bool begins = true; pair < end; ++pair) {
         if (begins) {
@@ -396,6 +394,25 @@ void main() {
 llvmpipe ends the loops of an invocation after 65535 iterations, so no loop goes over all tiles.
 """
 
+STARTS: Final = """#version 430
+layout(local_size_x = 64) in;
+layout(std430, binding = 0) readonly buffer Keys { uint keys[]; };
+layout(std430, binding = 1) writeonly buffer Starts { uint starts[]; };
+uniform uint tiles;
+uniform uint total;
+void main() {
+    uint tile = gl_GlobalInvocationID.x;
+    if (tile > tiles) return;
+    uint low = 0u, high = total;
+    while (low < high) {
+        uint middle = (low + high) / 2u;
+        if (keys[middle] < tile) low = middle + 1u; else high = middle;
+    }
+    starts[tile] = low;
+}
+"""
+"""Find where the sorted pairs of each tile start."""
+
 PAINT: Final = (
     _BLOCK
     + f"""
@@ -411,10 +428,11 @@ layout(binding = {LIMITS_UNIT}) uniform sampler2D limits;
 #endif
 const uint NONE = 0xffffffffu;
 #if ROWS == 1
+const uint GROUP = {TILE_PX * TILE_PX}u, EACH = {BATCH}u / GROUP;
 shared uint held[{BATCH}];
 shared vec4 held_first[{BATCH}];
 shared uvec4 held_second[{BATCH}];
-shared bool open;
+shared uint open_of[GROUP], kept_of[GROUP];
 #endif
 float depth_at(uint record, vec2 pixel) {{
     float z = uintBitsToFloat(records[record + 1u].z);
@@ -456,8 +474,28 @@ bool paint(uint r, vec4 one, uvec4 second) {{
     }}
     return most < {FULL};
 }}
+#if ROWS == 1
+uint bytes_of(uint bits) {{ return (bits * 0x204081u) & 0x1010101u; }}
+bool touches(uint record, vec2 corner, uvec2 open) {{
+    // Return whether a splat may reach an open pixel. open: a byte for each row of the tile
+    vec4 one = uintBitsToFloat(records[record]);
+    vec2 two = uintBitsToFloat(records[record + 1u].xy);
+    float reach = 1.001 * sqrt(max(two.y + 7.99435344, 0.0));
+    vec2 half_px = reach / two.x * vec2(length(vec2(one.w, two.x)) / one.z, 1.0) + 0.02;
+    vec2 middle_px = one.xy - corner - 0.5;
+    ivec2 low = ivec2(clamp(ceil(middle_px - half_px), 0.0, {TILE_PX}.0));
+    ivec2 high = ivec2(clamp(floor(middle_px + half_px), -1.0, {TILE_PX - 1}.0));
+    if (any(greaterThan(low, high))) return false;
+    uvec2 bits = (uvec2(2u) << uvec2(high)) - (uvec2(1u) << uvec2(low));
+    uvec2 reached = uvec2(bytes_of(bits.y & 15u), bytes_of(bits.y >> 4)) * bits.x;
+    return (reached & open) != uvec2(0u);
+}}
+#endif
 void main() {{
+    uint view = VIEWS == 1 ? 0u : gl_WorkGroupID.y / sizes.w;
     ivec2 here = ivec2(gl_GlobalInvocationID.xy) * ivec2(1, ROWS);
+    here.y -= int(view * sizes.w * {TILE_PX}u);
+    ivec2 picture = ivec2(0, (view + counts.z) * sizes.y);
     at = vec2(here) + 0.5;
     uint tile = gl_WorkGroupID.y * sizes.z + gl_WorkGroupID.x;
     for (int j = 0; j < ROWS; ++j) {{
@@ -465,40 +503,59 @@ void main() {{
         middle[j] = NONE;
         sum[j] = vec3(0.0);
 #ifdef LIMITED
-        limit[j] = texelFetch(limits, min(here + ivec2(0, j), ivec2(sizes.xy) - 1), 0).r;
+        limit[j] = texelFetch(limits, picture + min(here + ivec2(0, j), ivec2(sizes.xy) - 1), 0).r;
 #endif
     }}
     uint end = starts[tile + 1u];
 #if ROWS == 1
     uint lane = gl_LocalInvocationIndex;
+    vec2 corner = vec2(here - ivec2(gl_LocalInvocationID.xy));
     bool full = false;
+#ifdef LIMITED
+    full = limit[0] == 0.0;
+#endif
     for (uint start = starts[tile]; start < end; start += {BATCH}u) {{
-        uint count = min(end - start, {BATCH}u);
+        open_of[lane] = full ? 0u : 1u;
         barrier();
-        open = false;
-        for (uint k = lane; k < count; k += {TILE_PX * TILE_PX}u) {{
-            held[k] = 2u * lists[start + k];
-            held_first[k] = uintBitsToFloat(records[held[k]]);
-            held_second[k] = records[held[k] + 1u];
+        uvec2 open = uvec2(0u);
+        for (uint l = 0u; l < 32u; ++l) open |= uvec2(open_of[l], open_of[l + 32u]) << l;
+        if (open == uvec2(0u)) break;
+        uint first = start + lane * EACH, keeps = 0u;
+        for (uint k = 0u; k < EACH && first + k < end; ++k)
+            keeps |= touches(2u * lists[first + k], corner, open) ? 1u << k : 0u;
+        kept_of[lane] = uint(bitCount(keeps));
+        barrier();
+        uint count = 0u, to = 0u;
+        for (uint l = 0u; l < GROUP; ++l) {{
+            to += l < lane ? kept_of[l] : 0u;
+            count += kept_of[l];
+        }}
+        for (uint k = 0u; k < EACH; ++k) {{
+            if ((keeps >> k & 1u) == 0u) continue;
+            held[to] = 2u * lists[first + k];
+            held_first[to] = uintBitsToFloat(records[held[to]]);
+            held_second[to] = records[held[to] + 1u];
+            ++to;
         }}
         barrier();
         for (uint k = 0u; k < count && !full; ++k)
             full = paint(held[k], held_first[k], held_second[k]);
-        if (!full) open = true;
-        barrier();
-        if (!open) break;
     }}
 #else
-    for (uint k = starts[tile]; k < end; ++k) {{
-        uint r = 2u * lists[k];
-        if (paint(r, uintBitsToFloat(records[r]), records[r + 1u])) break;
+#define NEXT {{ uint r = 2u * lists[k++]; full = paint(r, uintBitsToFloat(records[r]), records[r + 1u]); }}
+    bool full = false;
+    for (uint k = starts[tile]; k < end && !full;) {{
+        NEXT
+#ifdef LONG
+        {"if (k < end) NEXT " * 7}
+#endif
     }}
 #endif
     for (int j = 0; j < ROWS; ++j) {{
         ivec2 pixel = here + ivec2(0, j);
         if (all(lessThan(pixel, ivec2(sizes.xy)))) {{
-            imageStore(painted, pixel, vec4(sum[j] / 255.0, left[j]));
-            imageStore(median, pixel, vec4(middle[j] == NONE ? 0.0 : depth_at(middle[j], vec2(pixel) + 0.5)));
+            imageStore(painted, picture + pixel, vec4(sum[j] / 255.0, left[j]));
+            imageStore(median, picture + pixel, vec4(middle[j] == NONE ? 0.0 : depth_at(middle[j], vec2(pixel) + 0.5)));
         }}
     }}
 }}
@@ -506,8 +563,10 @@ void main() {{
 )
 """Blend the splats of a tile from front to back until each pixel is full.
 
+Invocations of one pixel fetch a batch together, without the splats that reach only full pixels:
+tiles with sky have long lists.
 limits: depth up to which splats are drawn; negative where ground splats are not, 0 for none.
-Each invocation draws ROWS pixels of a column. The median depth is that of the splat's plane: its
+Each invocation draws ROWS pixels of a column. LONG: for lists that are too long for a loop. The median depth is that of the splat's plane: its
 inverse is linear in the picture.
 """
 
@@ -519,8 +578,12 @@ layout(r32f, binding = 0) writeonly uniform image2D limits;
 layout(binding = {OBJECTS_DEPTH_UNIT}) uniform sampler2D objects_depth;
 layout(binding = {MESH_UNIT}) uniform sampler2D mesh;
 layout(binding = {MESH_DEPTH_UNIT}) uniform sampler2D mesh_depth;
+uniform uint nth;  // view
 {METRES}
 void main() {{
+    uint view = VIEWS == 1 ? 0u : nth;
+    vec4 eye = views[view].eye, right = views[view].right;
+    vec4 up = views[view].up, ahead = views[view].ahead;
     ivec2 here = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(here, ivec2(sizes.xy)))) return;
     float object = texelFetch(objects_depth, here, 0).r;
@@ -536,7 +599,7 @@ void main() {{
         limit = behind < {BEHIND_M} ? 0.0 : ground ? metres(object) : -metres(object);
         if (!ground && behind > {HIDDEN_M}) limit = {NOTHING_M:.1f};
     }}
-    imageStore(limits, here, vec4(limit));
+    imageStore(limits, here + ivec2(0, (nth + counts.z) * sizes.y), vec4(limit));
 }}
 """
 )

@@ -1,12 +1,14 @@
 """Drawing of Gaussian splats: order, projection, lists of tiles, and blending, in compute shaders.
 
 A picture is a function of splats and view alone. Splats are ordered by their distance from the
-nearest point of a lattice of eyes, so the order does not depend on the heading.
+nearest point of a lattice of eyes, so the order does not depend on the heading. A pass may draw
+several views of a cloud; each has the bits of a pass of its own.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import moderngl
@@ -16,7 +18,16 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.place.scan import Splats
 from physics.cameras.gl import splat_shaders as glsl
-from physics.cameras.gl.context import is_card
+from physics.cameras.gl.splat_sort import (
+    Buffers,
+    NumpySort,
+    ShaderSort,
+    SplatShaders,
+    Tuning,
+    bind,
+    read_words,
+    tuning_of,
+)
 from physics.cameras.view import Shot
 
 LATTICE_M: Final = 0.25
@@ -24,43 +35,10 @@ LATTICE_M: Final = 0.25
 _ORDERS_MAX: Final = 4
 _LEAST_KEY: Final = 251904
 _MOST_KEY: Final = 65535
-_COUNTS_MAX: Final = 1 << 23
-"""Maximum number of counters of a sort."""
-_CHUNK_MAX: Final = 32768
-"""Maximum number of items of a chunk: llvmpipe ends loops after 65535 iterations."""
-_VIEW_ROWS: Final = 7
-_LINE: Final = 65535 * 64
-"""Maximum number of invocations in one dimension of a dispatch."""
-
-
-class Tuning(NamedTuple):
-    """Sizes of work; they affect the speed alone.
-
-    sorts_here: sort by numpy, not in shaders
-    lanes: invocations of a work group of the serial shaders
-    chunks: maximum number of chunks of a sort
-    group: chunks that are summed by one invocation
-    splats_chunk: splats whose pairs are counted by one invocation
-    pairs_span: pairs that are listed by one invocation
-    rows: pixels of an invocation that blends
-    """
-
-    sorts_here: bool
-    lanes: int
-    chunks: int
-    group: int
-    splats_chunk: int
-    pairs_span: int
-    rows: int
-
-
-PROCESSOR: Final = Tuning(True, 8, 128, 16, 1024, 512, 8)
-CARD: Final = Tuning(False, 32, 4096, 64, 32, 64, 1)
-
-
-def tuning_of(context: moderngl.Context) -> Tuning:
-    """Return the sizes of work for the context's renderer."""
-    return CARD if is_card(context) else PROCESSOR
+_KEY_BITS: Final = 16
+_VIEW_ROWS: Final = 5
+_LOOP_MAX: Final = 65000
+"""Number of iterations after which llvmpipe may end the loops of an invocation."""
 
 
 def lattice_point(eye_m: Floats) -> NDArray[np.float32]:
@@ -106,118 +84,8 @@ def packed_splats(splats: Splats) -> NDArray[np.float32]:
     return rows
 
 
-class SplatShaders:
-    """Compute shaders of a context. tuning: sizes of work."""
-
-    def __init__(self, context: moderngl.Context, tuning: Tuning) -> None:
-        self._context = context
-        self.tuning = tuning
-        self._shaders: dict[str, tuple[moderngl.ComputeShader, dict[str, moderngl.Uniform]]] = {}
-
-    def run(self, name: str, size: tuple[int, int], each: tuple[int, int], **uniforms: int) -> None:
-        """Run a shader over (x, y) invocations in groups of `each`, and wait for its writes."""
-        if name not in self._shaders:
-            code: str = getattr(glsl, name.split()[0])
-            if "LIMITED" in name.split():
-                code = code.replace("#version 430\n", "#version 430\n#define LIMITED\n")
-            lanes, rows = self.tuning.lanes, self.tuning.rows
-            for word, value in (("LANES", lanes), ("ROWS", rows), ("DOWN", glsl.TILE_PX // rows)):
-                code = code.replace(word, str(value))
-            made = self._context.compute_shader(code)
-            members = {member: made[member] for member in made}
-            self._shaders[name] = (
-                made,
-                {k: one for k, one in members.items() if isinstance(one, moderngl.Uniform)},
-            )
-        shader, known = self._shaders[name]
-        for uniform, value in uniforms.items():
-            if uniform in known:  # the compiler removes unused ones
-                known[uniform].value = value
-        x, y = (-(-count // group) for count, group in zip(size, each, strict=True))
-        shader.run(x, y)
-        self._context.memory_barrier(
-            moderngl.SHADER_STORAGE_BARRIER_BIT
-            | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
-            | moderngl.TEXTURE_FETCH_BARRIER_BIT
-        )
-
-    def along(self, name: str, count: int, **uniforms: int) -> None:
-        """Run a shader over `count` invocations, in several lines if there are too many."""
-        line = min(count, _LINE)
-        self.run(name, (line, -(-count // _LINE)), (64, 1), **uniforms)
-
-
-class Buffers:
-    """Storage buffers by name, which grow as needed and lose their content then."""
-
-    def __init__(self, context: moderngl.Context) -> None:
-        self._context = context
-        self._held: dict[str, moderngl.Buffer] = {}
-
-    def room(self, name: str, words: int) -> moderngl.Buffer:
-        """Return a buffer of at least `words` words of 4 bytes."""
-        held = self._held.get(name)
-        if held is None or held.size < 4 * words:
-            if held is not None:
-                held.release()
-            self._held[name] = self._context.buffer(reserve=max(64, 5 * words))
-        return self._held[name]
-
-    def release(self) -> None:
-        while self._held:
-            self._held.popitem()[1].release()
-
-
-class StableSort:
-    """Stable counting sort of (key, value) pairs by a digit of the key, without atomics."""
-
-    def __init__(self, shaders: SplatShaders, buffers: Buffers) -> None:
-        self._shaders = shaders
-        self._buffers = buffers
-
-    def sort(
-        self,
-        pairs: tuple[moderngl.Buffer, moderngl.Buffer],
-        into: tuple[moderngl.Buffer | None, moderngl.Buffer],
-        total: int,
-        digits: int,
-        shift: int = 0,
-    ) -> moderngl.Buffer:
-        """Sort pairs by `(key >> shift) % digits` into other buffers.
-
-        into: keys, None to drop them, and values
-        Returns the (digits + 1,) starts of the digits.
-        """
-        run, tuning, room = self._shaders, self._shaders.tuning, self._buffers.room
-        most = max(1, min(tuning.chunks, _COUNTS_MAX // digits))
-        chunk = min(max(1, -(-total // most)), _CHUNK_MAX)
-        chunks = max(1, -(-total // chunk))
-        groups = -(-chunks // tuning.group)
-        counts, sums = room("counts", chunks * digits), room("groups", groups * digits)
-        starts = room(f"starts {digits}", digits + 1)
-        sizes = {"total": total, "chunk": chunk, "chunks": chunks, "digits": digits, "shift": shift}
-        counts.bind_to_storage_buffer(0)
-        run.along("CLEAR", chunks * digits, total=chunks * digits)
-        pairs[0].bind_to_storage_buffer(1)
-        run.run("COUNT", (chunks, 1), (tuning.lanes, 1), **sizes)
-        sums.bind_to_storage_buffer(1)
-        run.run("COLUMNS", (digits, groups), (64, 1), group=tuning.group, **sizes)
-        sums.bind_to_storage_buffer(0)
-        starts.bind_to_storage_buffer(1)
-        run.run("GROUPS", (digits, 1), (64, 1), groups_of=groups, **sizes)
-        starts.bind_to_storage_buffer(0)
-        run.run("SCAN", (1, 1), (1, 1), digits=digits)
-        keys = into[0] if into[0] is not None else pairs[0]
-        for place, buffer in enumerate((counts, pairs[0], sums, starts, pairs[1], keys, into[1])):
-            buffer.bind_to_storage_buffer(place)
-        keep = int(into[0] is not None)
-        lanes = (tuning.lanes, 1)
-        run.run("SCATTER", (chunks, 1), lanes, group=tuning.group, keep_keys=keep, **sizes)
-        return starts
-
-
 class SplatCloud:
-    """Splats of a scan on the renderer, and their orders for the last points of the lattice."""
+    """Splats of a scan on the renderer. Orders by numpy are cached for the last lattice points."""
 
     def __init__(self, context: moderngl.Context, splats: Splats) -> None:
         self._context = context
@@ -228,7 +96,7 @@ class SplatCloud:
     def __len__(self) -> int:
         return len(self._splats)
 
-    def order(self, point: NDArray[np.float32], drawing: SplatDrawing) -> moderngl.Buffer:
+    def order(self, point: NDArray[np.float32]) -> moderngl.Buffer:
         """Return the numbers of the splats by distance from a point; ties by number."""
         key = tuple(point.tolist())
         if key in self._orders:
@@ -238,11 +106,8 @@ class SplatCloud:
             held = self._context.buffer(reserve=4 * len(self))
         else:
             held = self._orders.popitem(last=False)[1]
-        if drawing.tuning.sorts_here:
-            keys = distance_keys(self._splats.centres, point)
-            held.write(keys.argsort(kind="stable").astype(np.uint32))
-        else:
-            drawing.sort(self, held)
+        keys = distance_keys(self._splats.centres, point)
+        held.write(keys.argsort(kind="stable").astype(np.uint32))
         self._orders[key] = held
         return held
 
@@ -250,6 +115,40 @@ class SplatCloud:
         self.buffer.release()
         while self._orders:
             self._orders.popitem()[1].release()
+
+
+class Views(NamedTuple):
+    """Views of pictures of one size.
+
+    size: width and height in pixels
+    rows: (N, _VIEW_ROWS, 4) values of `View` in the shaders
+    """
+
+    size: tuple[int, int]
+    rows: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, taken: Sequence[Shot]) -> Views:
+        """Return at least one view."""
+        rows = np.zeros((len(taken), _VIEW_ROWS, 4), dtype=np.float32)
+        for row, one in zip(rows, taken, strict=True):
+            wide, tall = one.half_picture
+            row[0] = *one.eye_m, 0.5 * one.size[1] / tall
+            row[1:4, :3] = one.axes
+            row[1:3, 3] = wide, tall
+            row[4, :3] = lattice_point(one.eye_m)
+        return cls(taken[0].size, rows)
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Return columns and rows of tiles of a picture."""
+        width, height = self.size
+        return -(-width // glsl.TILE_PX), -(-height // glsl.TILE_PX)
+
+    def block(self, splats: int, first: int) -> NDArray[np.float32]:
+        """Return the rows of the block `Splatting`. first: number of the first view's picture."""
+        sizes = np.array([(*self.size, *self.tiles), (splats, len(self.rows), first, 0)])
+        return np.concatenate([sizes.astype(np.uint32).view(np.float32), self.rows.reshape(-1, 4)])
 
 
 class SplatDrawing:
@@ -260,95 +159,121 @@ class SplatDrawing:
         self.tuning = tuning or tuning_of(context)
         self._shaders = SplatShaders(context, self.tuning)
         self._buffers = Buffers(context)
-        self._sort = StableSort(self._shaders, self._buffers)
-        self._view = context.buffer(reserve=16 * _VIEW_ROWS, dynamic=True)
-        self.pairs = 0
-        """Number of pairs of tile and splat in the last picture."""
-
-    def sort(self, cloud: SplatCloud, into: moderngl.Buffer) -> None:
-        """Sort a cloud by distance from the lattice point of the view, in shaders."""
-        names = ("near", "near values", "near next", "near values next")
-        keys, values, keys_next, values_next = (self._buffers.room(n, len(cloud)) for n in names)
-        for place, buffer in enumerate((cloud.buffer, keys, values)):
-            buffer.bind_to_storage_buffer(place)
-        self._shaders.along("KEYS", len(cloud))
-        self._sort.sort((keys, values), (keys_next, values_next), len(cloud), 256)
-        self._sort.sort((keys_next, values_next), (None, into), len(cloud), 256, 8)
+        here = self.tuning.sorts_here
+        self._sort = NumpySort(context) if here else ShaderSort(self._shaders, self._buffers)
+        rows = 2 + _VIEW_ROWS * self.tuning.views
+        self._block = context.buffer(reserve=16 * rows, dynamic=True)
+        self.splats = self.pairs = 0
+        """Numbers of projected splats, and of pairs of tile and splat, in the last pass."""
 
     def draw(
-        self, cloud: SplatCloud, rows: NDArray[np.float32], target: SplatTarget, limited: bool
+        self, cloud: SplatCloud, views: Views, target: SplatTarget, limited: bool, first: int = 0
     ) -> None:
-        """Draw a cloud.
+        """Draw a cloud into the pictures of views, in several passes if they need much memory.
 
-        rows: of `view_rows`
         limited: draw up to the depths in the texture of unit LIMITS_UNIT
+        first: number of the first view's picture in the target
         """
-        run, room = self._shaders, self._buffers.room
-        sizes = rows.view(np.uint32)[4]
-        tiles = int(sizes[2] * sizes[3])
-        rows.view(np.uint32)[5, 0] = len(cloud)
-        self._view.write(rows)
-        self._view.bind_to_uniform_block(glsl.VIEW_BINDING)
-        order = cloud.order(rows[6, :3].copy(), self)
-        records, rects = room("records", 8 * len(cloud)), room("rects", 2 * len(cloud))
-        slopes = room("slopes", 2 * len(cloud))
-        for place, buffer in enumerate((cloud.buffer, order, records, rects, slopes)):
-            buffer.bind_to_storage_buffer(place)
-        run.along("PROJECT", len(cloud))
-        lists, starts = self._listed(len(cloud), tiles, rects)
-        for place, buffer in enumerate((records, starts, lists, slopes)):
-            buffer.bind_to_storage_buffer(place)
-        target.bind()
-        name = "PAINT LIMITED" if limited else "PAINT"
-        across, down = sizes[2:].tolist()
-        run.run(name, (across * glsl.TILE_PX, down * glsl.TILE_PX), (glsl.TILE_PX,) * 2)
+        most = max(1, min(self.tuning.views, self.tuning.splats // max(len(cloud), 1)))
+        few = -(-len(views.rows) // -(-len(views.rows) // most))
+        for start in range(0, len(views.rows), few):
+            part = views._replace(rows=views.rows[start : start + few])
+            self._draw_pass(cloud, part, target, limited, first + start)
 
-    def limit(self, rows: NDArray[np.float32], limits: moderngl.Texture) -> None:
-        """Compute the limits of a picture from its layers, which are bound to their units."""
-        self._view.write(rows)
-        self._view.bind_to_uniform_block(glsl.VIEW_BINDING)
+    def limit(self, views: Views, nth: int, limits: moderngl.Texture) -> None:
+        """Compute the limits of the nth view from its layers, which are bound to their units."""
+        few = min(self.tuning.views, len(views.rows))
+        start = nth // few * few
+        self._bind_views(views._replace(rows=views.rows[start : start + few]), 0, start)
         limits.bind_to_image(0, read=False, write=True)
-        across, down = rows.view(np.uint32)[4, :2].tolist()
-        self._shaders.run("LIMITS", (across, down), (glsl.TILE_PX,) * 2)
+        self._shaders.run("LIMITS", views.size, (glsl.TILE_PX,) * 2, nth=nth - start)
+
+    def _bind_views(self, views: Views, splats: int, first: int) -> None:
+        self._block.write(views.block(splats, first))
+        self._block.bind_to_uniform_block(glsl.VIEW_BINDING)
+
+    def _draw_pass(
+        self, cloud: SplatCloud, views: Views, target: SplatTarget, limited: bool, first: int
+    ) -> None:
+        run, room = self._shaders, self._buffers.room
+        self._bind_views(views, len(cloud), first)
+        order, count = self._order(cloud, views)
+        tiles, records = room("tiles", count + 1), room("records", 8 * count)
+        rects, slopes = room("rects", 2 * count), room("slopes", 2 * count)
+        bind(cloud.buffer, tiles, order, records, rects, slopes)
+        run.along("PROJECT", count, total=count)
+        self._sort.sums(tiles, count)
+        # Room for all pairs must be known before they are written.
+        total = int(read_words(self._context, tiles, count, 1)[0])
+        self.splats, self.pairs = count, total
+        half = len(views.rows) // 2
+        if half and total > self.tuning.pairs:
+            for part, start in ((views.rows[:half], first), (views.rows[half:], first + half)):
+                self._draw_pass(cloud, views._replace(rows=part), target, limited, start)
+            return
+        lists, starts = self._listed(views, count, total)
+        bind(records, starts, lists, slopes)
+        target.bind()
+        across, down = views.tiles
+        name = "PAINT LIMITED" if limited else "PAINT"
+        if self.tuning.rows > 1:
+            sums = read_words(self._context, starts, 0, across * down + 1)
+            name += " LONG" if np.diff(sums).max() > _LOOP_MAX else ""
+        size = across * glsl.TILE_PX, len(views.rows) * down * glsl.TILE_PX
+        run.run(name, size, (glsl.TILE_PX,) * 2)
+
+    def _order(self, cloud: SplatCloud, views: Views) -> tuple[moderngl.Buffer, int]:
+        """Return numbers of splats by distance, and how many; in shaders, only those in view."""
+        if self.tuning.sorts_here:
+            return cloud.order(views.rows[0, 4, :3].copy()), len(cloud)
+        room, everything = self._buffers.room, len(views.rows) * len(cloud)
+        seen = room("seen", everything + 1)
+        bind(cloud.buffer, seen)
+        self._shaders.along("PROJECT CULL", everything, total=everything)
+        self._sort.sums(seen, everything)
+        count = int(read_words(self._context, seen, everything, 1)[0])
+        names = ("near", "near values", "near next", "near values next")
+        keys, values, keys_next, values_next = (room(name, count) for name in names)
+        bind(cloud.buffer, seen, keys, values)
+        self._shaders.along("KEYS", everything)
+        found = self._sort.sort((keys, values), (keys_next, values_next), count, _KEY_BITS)
+        return found[1], count
 
     def _listed(
-        self, count: int, tiles: int, rects: moderngl.Buffer
+        self, views: Views, count: int, total: int
     ) -> tuple[moderngl.Buffer, moderngl.Buffer]:
         """Return the splats of each tile in their order, and where the tiles start."""
-        run, tuning, room = self._shaders, self.tuning, self._buffers.room
-        chunk, lanes = tuning.splats_chunk, (tuning.lanes, 1)
-        chunks = -(-count // chunk)
-        sums, before = room("sums", chunks + 1), room("before", count)
-        for place, buffer in enumerate((rects, sums, before)):
-            buffer.bind_to_storage_buffer(place)
-        run.run("SUMS", (chunks, 1), lanes, chunk=chunk)
-        sums.bind_to_storage_buffer(0)
-        run.run("SCAN", (1, 1), (1, 1), digits=chunks)
-        # Room for all pairs must be known before they are written: the only value that is read.
-        self._context.memory_barrier(moderngl.BUFFER_UPDATE_BARRIER_BIT)
-        total = int(np.frombuffer(sums.read(4, offset=4 * chunks), dtype=np.uint32)[0])
-        self.pairs = total
-        keys, values, lists = (room(name, total + 1) for name in ("tiles", "of tiles", "lists"))
-        for place, buffer in enumerate((rects, sums, before, keys, values)):
-            buffer.bind_to_storage_buffer(place)
-        span = tuning.pairs_span
-        size = -(-max(total, 1) // span), 1
-        run.run("EMIT", size, lanes, chunk=chunk, chunks=chunks, span=span, total=total)
-        starts = self._sort.sort((keys, values), (None, lists), total, tiles)
+        run, room, lanes = self._shaders, self._buffers.room, (self.tuning.lanes, 1)
+        names = ("pairs", "pairs values", "pairs next", "pairs values next")
+        keys, values, keys_next, values_next = (room(name, total) for name in names)
+        bind(room("rects", 2 * count), room("tiles", count + 1), keys, values)
+        span = self.tuning.pairs_span
+        run.run("EMIT", (-(-total // span), 1), lanes, drawn=count, span=span, total=total)
+        across, down = views.tiles
+        tiles = across * down * len(views.rows)
+        bits = (tiles - 1).bit_length()
+        keys, lists = self._sort.sort((keys, values), (keys_next, values_next), total, bits)
+        starts = room("starts", tiles + 1)
+        bind(keys, starts)
+        run.run("STARTS", (tiles + 1, 1), (64, 1), tiles=tiles, total=total)
         return lists, starts
 
     def release(self) -> None:
         self._buffers.release()
-        self._view.release()
+        self._block.release()
 
 
 class SplatTarget:
-    """Premultiplied colour with transmittance in half floats, and median depth, of one size."""
+    """Premultiplied colour with transmittance in half floats, and median depth.
 
-    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
-        self.size = size
-        self.colour = context.texture(size, 4, dtype="f2")
-        self.median = context.texture(size, 1, dtype="f4")
+    size: of a picture
+    pictures: number of pictures, one below the other
+    """
+
+    def __init__(self, context: moderngl.Context, size: tuple[int, int], pictures: int = 1) -> None:
+        self.size = size[0], pictures * size[1]
+        self.colour = context.texture(self.size, 4, dtype="f2")
+        self.median = context.texture(self.size, 1, dtype="f4")
 
     def bind(self) -> None:
         self.colour.bind_to_image(0, read=False, write=True)
@@ -364,17 +289,3 @@ class SplatTarget:
     def release(self) -> None:
         self.colour.release()
         self.median.release()
-
-
-def view_rows(taken: Shot) -> NDArray[np.float32]:
-    """Return the (_VIEW_ROWS, 4) rows of the block `Splatting` for a view, with its order."""
-    rows = np.zeros((_VIEW_ROWS, 4), dtype=np.float32)
-    width, height = taken.size
-    wide, tall = taken.half_picture
-    rows[0] = *taken.eye_m, 0.5 * height / tall
-    rows[1:4, :3] = taken.axes
-    rows[1:3, 3] = wide, tall
-    tiles = (-(-width // glsl.TILE_PX), -(-height // glsl.TILE_PX))
-    rows.view(np.uint32)[4] = width, height, *tiles
-    rows[6, :3] = lattice_point(taken.eye_m)
-    return rows
