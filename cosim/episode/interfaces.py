@@ -19,6 +19,7 @@ from cosim.spec.goal import Goal
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import Robot
+from cosim.spec.sensors import Imu, Scan, Tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,9 @@ class Observation:
     depth: (H, W) float32 metres along the camera's axis.
     labels: (H, W) uint8 ids of `cosim.core.state.LABELS`.
     pictures: pictures of the further cameras by name.
+    scan: the last revolution of the lidar.
+    imu: reading of the inertial sensor.
+    people: tracked people.
 
     >>> from cosim.spec.robot import COURIER
     >>> now = Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER)
@@ -84,6 +88,9 @@ class Observation:
     depth: NDArray[np.float32] | None = None
     labels: NDArray[np.uint8] | None = None
     pictures: Mapping[str, CameraPicture] = filled(default_factory=dict)
+    scan: Scan | None = None
+    imu: Imu | None = None
+    people: Tracks | None = None
 
 
 class Policy(Protocol):
