@@ -128,6 +128,10 @@ class Scan(msgspec.Struct, frozen=True, eq=False):
     ranges_m: NDArray[np.float32]
     spec: ScanSpec
 
+    def copied(self) -> Scan:
+        """Return the same scan with an array of its own."""
+        return Scan(self.ranges_m.copy(), self.spec)
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return `ranges_m`."""
         return np.array(self.ranges_m, dtype)
@@ -159,6 +163,10 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
     ids: NDArray[np.int32]
     positions_m: NDArray[np.float32]
     velocities_mps: NDArray[np.float32]
+
+    def copied(self) -> Tracks:
+        """Return the same tracks with arrays of their own."""
+        return Tracks(self.ids.copy(), self.positions_m.copy(), self.velocities_mps.copy())
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return (N, 4): positions and velocities."""
