@@ -21,6 +21,10 @@ ImuKind = Literal["none", "exact", "noisy"]
 PeopleKind = Literal["none", "seen"]
 """Names of the rows of `PEOPLE`."""
 
+SensorTrack = Literal["privileged", "people", "lidar", "picture", "blind"]
+"""Sensor tracks, the strongest first. A policy is in the track of its strongest source of knowledge
+of the street; results of different tracks are not compared."""
+
 IMU: Final[Mapping[str, str]] = MappingProxyType(
     {
         "none": "nothing",
@@ -132,6 +136,10 @@ class Scan(msgspec.Struct, frozen=True, eq=False):
         """Return the same scan with an array of its own."""
         return Scan(self.ranges_m.copy(), self.spec)
 
+    def mirrored(self) -> Scan:
+        """Return the scan with left and right exchanged."""
+        return Scan(self.ranges_m[:, -np.arange(self.spec.rays)], self.spec)
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return `ranges_m`."""
         return np.array(self.ranges_m, dtype)
@@ -146,6 +154,11 @@ class Imu(msgspec.Struct, frozen=True):
 
     gyro_radps: tuple[float, float, float]
     accel_mps2: tuple[float, float, float]
+
+    def mirrored(self) -> Imu:
+        """Return the reading with left and right exchanged."""
+        (roll, pitch, yaw), (x, y, z) = self.gyro_radps, self.accel_mps2
+        return Imu((-roll, pitch, -yaw), (x, -y, z))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return (6,) float64: angular speeds, then specific force."""
@@ -168,6 +181,11 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
         """Return the same tracks with arrays of their own."""
         return Tracks(self.ids.copy(), self.positions_m.copy(), self.velocities_mps.copy())
 
+    def mirrored(self) -> Tracks:
+        """Return the tracks with left and right exchanged."""
+        swap = np.array([1.0, -1.0], dtype=np.float32)
+        return Tracks(self.ids, self.positions_m * swap, self.velocities_mps * swap)
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return (N, 4): positions and velocities."""
         return np.array(np.hstack([self.positions_m, self.velocities_mps]), dtype)
@@ -175,6 +193,9 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
 
 TRACKING_RANGE_M: Final = 15.0
 """Horizontal range in metres within which people are tracked, in all directions."""
+
+MOST_TRACKS: Final = 256
+"""Largest number of tracks in an observation; the farthest people are left out."""
 
 
 class TrackNoise(NamedTuple):

@@ -86,7 +86,7 @@ def test_a_row_names_a_robot_other_than_the_default(tmp_path: Path) -> None:
     ways = [short_way("s-0"), short_way("s-1", robot="scout")]
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", "goal"], "mine", ways)])
     (table,) = tables_of([own])
-    assert [row.notes for row in table.rows] == ["2 episodes, robot scout"]
+    assert [row.notes for row in table.rows] == ["2 episodes, blind, robot scout"]
 
 
 def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Path) -> None:

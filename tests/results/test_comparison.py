@@ -136,7 +136,7 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
 def test_runs_by_other_terms_are_called_neither_better_nor_worse(
     runs: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Another goal protocol, odometry, knowledge or latency is named, and no verdict given; the
+    """Another goal protocol, odometry, sensor track or latency is named, and no verdict given; the
     differences stay."""
     run = rewritten(
         runs / "b",
@@ -152,7 +152,7 @@ def test_runs_by_other_terms_are_called_neither_better_nor_worse(
     (note,) = told.notes
     assert note == (
         "No verdict of b against a: they drove by other terms, goal none (a) and route_point (b); "
-        "odometry none (a) and exact (b); knowledge of its own sensors (a) and privileged (b); "
+        "odometry none (a) and exact (b); sensor track blind (a) and privileged (b); "
         "latency 0 ms (a) and 200 ms (b). What differs is called neither better nor worse"
     )
     said = cosim("compare", str(runs / "a"), str(run))

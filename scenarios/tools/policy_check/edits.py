@@ -51,6 +51,9 @@ def in_mirror(seen: Observation) -> Observation:
         w_radps=-seen.w_radps,
         goal=None if seen.goal is None else seen.goal.mirrored(),
         odometry=odometry,
+        scan=None if seen.scan is None else seen.scan.mirrored(),
+        imu=None if seen.imu is None else seen.imu.mirrored(),
+        people=None if seen.people is None else seen.people.mirrored(),
         camera=None
         if seen.camera is None or seen.rgb is None
         else _camera_in_mirror(seen.camera, seen.rgb.shape[1]),
@@ -101,7 +104,7 @@ LATER: Final = of_each(
 
 
 def showing(name: str, other: Observations, ages: Sequence[int] | None = None) -> Edit:
-    """Return an edit that shows the pictures of another drive.
+    """Return an edit that shows the pictures, scans and people of another drive.
 
     ages: ages of the replaced observations, in answers; None for all. All other fields are
     unchanged.
@@ -117,8 +120,15 @@ def showing(name: str, other: Observations, ages: Sequence[int] | None = None) -
 
 
 def _seeing(mine: Observation, theirs: Observation) -> Observation:
+    """Return an observation with the pictures, scan and people of another one."""
     return replace(
-        mine, rgb=theirs.rgb, depth=theirs.depth, labels=theirs.labels, pictures=theirs.pictures
+        mine,
+        rgb=theirs.rgb,
+        depth=theirs.depth,
+        labels=theirs.labels,
+        pictures=theirs.pictures,
+        scan=theirs.scan,
+        people=theirs.people,
     )
 
 
