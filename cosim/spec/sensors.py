@@ -229,3 +229,17 @@ class ImuNoise(NamedTuple):
     gyro_bias_radps: float = 0.003
     accel_bias_mps2: float = 0.05
     bias_s: float = 100.0
+
+
+AT_REST: Final = Imu((0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+"""Reading of a robot at rest on level ground."""
+
+NO_TRACKS: Final = Tracks(
+    np.zeros(0, np.int32), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+)
+"""Tracks without a person."""
+
+
+def clear_scan(spec: ScanSpec) -> Scan:
+    """Return a scan without a return."""
+    return Scan(np.full((spec.rings, spec.rays), np.inf, np.float32), spec)

@@ -196,7 +196,7 @@ class RayCaster:
         bodies = Solids(moving.vehicles, _cylinders(people, rows, feet))
         hits = first_hits(rays, joined([solids, bodies]))
         first_body = len(solids.boxes.x) + len(moving.vehicles.x) + len(solids.cylinders.x)
-        own = hits.index == first_body + np.tile(np.arange(len(rows)), len(_POINTS))
+        own = hits.solid == first_body + np.tile(np.arange(len(rows)), len(_POINTS))
         clear = np.where(own | (hits.distance >= far), far, 0.0)
         seen = self._with_triangles(rays, clear, near, range_m) >= far
         return rows[seen.reshape(len(_POINTS), -1).any(axis=0)]

@@ -71,11 +71,11 @@ class Hits(NamedTuple):
     """First solid on each ray.
 
     distance: (N,) metres, inf without a hit.
-    index: (N,) index of the solid, -1 without a hit.
+    solid: (N,) index of the solid, -1 without a hit.
     """
 
     distance: Floats
-    index: NDArray[np.intp]
+    solid: NDArray[np.intp]
 
 
 def boxes_of(rows: list[tuple[float, ...]]) -> Boxes:
