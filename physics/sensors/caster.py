@@ -199,7 +199,9 @@ class RayCaster:
         own = hits.solid == first_body + np.tile(np.arange(len(rows)), len(_POINTS))
         clear = np.where(own | (hits.distance >= far), far, 0.0)
         seen = self._with_triangles(rays, clear, near, range_m) >= far
-        return rows[seen.reshape(len(_POINTS), -1).any(axis=0)]
+        shown: NDArray[np.bool_] = seen.reshape(len(_POINTS), -1).any(axis=0)
+        found: NDArray[np.intp] = rows[shown]
+        return found
 
     def _rays(self, robot: RobotState, height_m: float, directions: Floats) -> Rays:
         """Return rays in the world frame."""
@@ -258,7 +260,7 @@ class RayCaster:
                 chunk = self._surface.chunk(key)
                 ground = join([patch.mesh for patch in chunk.ground])
                 meshes = [mesh for mesh in (ground, *chunk.standing) if len(mesh)]
-                heights = np.concatenate([mesh.vertices[:, 2] for mesh in meshes] or [[]])
+                heights = np.concatenate([np.zeros(0), *(mesh.vertices[:, 2] for mesh in meshes)])
                 self._meshes[key] = _Meshes(
                     tuple([client.add_concave(mesh) for mesh in meshes]),
                     float(heights.min(initial=math.inf)),
@@ -328,7 +330,7 @@ def _barrier_row(surface: Surface, barrier: Barrier) -> tuple[float, ...]:
 
 def _tile_solids(chunk: Chunk) -> Solids:
     """Return the buildings and props of a tile."""
-    rows = [
+    rows: list[tuple[float, ...]] = [
         (x, y, heading, length, width, z, z + height)
         for building in chunk.buildings
         for (x, y, z), heading, (length, width, height) in building_boxes(building)

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
+import cosim
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
+from cosim.episode.loop import Step
+from cosim.results.referee import Verdict
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.scenario import CrowdSpec, Scenario
+from cosim.spec.scenario import CrowdSpec, Scenario, Suite
 from cosim.spec.sensors import ScanSpec
 from scenarios.episodes.episode import Episode
+from scenarios.episodes.replay import load_recorded, replay_episode
+from scenarios.episodes.sensor_replay import sensor_replay
 from scenarios.tools.verify.doctor import small_scenario
 
 BLIND = Manifest("blind", rate_hz=10.0, camera=None)
@@ -96,3 +102,45 @@ def test_the_sensor_track_is_that_of_the_strongest_source(
     """A camera beside a lidar is in the track of the lidar; an inertial sensor alone is blind."""
     manifest = dataclasses.replace(Manifest("mine", camera=CameraSpec()), **sensors)  # type: ignore[arg-type]
     assert manifest.track == track
+
+
+class Sensing:
+    """Drives a bend, and keeps what it senses."""
+
+    manifest = dataclasses.replace(SENSING, rate_hz=5.0, goal="random_point")
+
+    def __init__(self) -> None:
+        self.seen: list[Observation] = []
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self.seen = []
+
+    def act(self, observation: Observation) -> Command:
+        self.seen.append(observation)
+        return Command(0.7, 0.2)
+
+
+@pytest.mark.engine
+def test_a_replay_repeats_the_readings_of_the_recorded_policy(tmp_path: Path) -> None:
+    """Scans, tracks and inertial readings of a run, computed again from its files, have the same
+    bits at the same ticks, across resets of the robot."""
+    scenario = msgspec.structs.replace(crowded(), time_limit_s=4.0)
+    policy = Sensing()
+    cosim.run(Suite(name="brief", version="1", scenarios=(scenario,)), policy, out=tmp_path / "run")
+    told = load_recorded(tmp_path / "run", scenario.id)
+    found: list[Observation] = []
+    with sensor_replay(told) as sensors:
+        assert sensors is not None
+        episode, replayed = replay_episode(told)
+
+        def keep(step: Step, verdict: Verdict) -> None:
+            if (seen := sensors.read(step, verdict)) is not None:
+                found.append(seen)
+
+        with episode:
+            episode.watch(keep)
+            observation = episode.reset()
+            while not episode.over:
+                observation = episode.advance(replayed.act(observation))
+    assert [one.tick for one in found] == [one.tick for one in policy.seen]
+    assert bytes_of(found) == bytes_of(policy.seen)
