@@ -14,7 +14,7 @@ from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import ODOMETRY
 from cosim.spec.robot import Mount, Robot
-from cosim.spec.sensors import IMU, PEOPLE, ScanSpec
+from cosim.spec.sensors import ScanSpec, imu_called, people_called
 
 
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
@@ -26,13 +26,10 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
     """
     settled = manifest if goal is None else replace(manifest, goal=goal)
     kind = GOALS[goal_called(settled.goal)]
-    for what, name, table in (
-        ("odometry", settled.odometry, ODOMETRY),
-        ("inertial sensor (imu)", settled.imu, IMU),
-        ("kind of tracked people", settled.people, PEOPLE),
-    ):
-        if name not in table:
-            raise unknown(what, name, table)
+    if settled.odometry not in ODOMETRY:
+        raise unknown("odometry", settled.odometry, ODOMETRY)
+    imu_called(settled.imu)
+    people_called(settled.people)
     if not isinstance(settled.scan, ScanSpec | None):
         raise UsageError(
             f"policy '{manifest.name}': scan must be a cosim.ScanSpec or None, not {settled.scan!r}"

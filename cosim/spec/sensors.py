@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple, cast
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.errors import unknown
 from cosim.core.geometry import Floats
 from cosim.spec.validation import Ranged, Within
 
@@ -45,6 +46,20 @@ PEOPLE: Final[Mapping[str, str]] = MappingProxyType(
 
 MOST_RETURNS: Final = 2**17
 """Largest number of distances in a scan."""
+
+
+def imu_called(name: str) -> ImuKind:
+    """Return a name as a row of `IMU`. Raises UsageError with the valid names."""
+    if name not in IMU:
+        raise unknown("inertial sensor (imu)", name, IMU)
+    return cast(ImuKind, name)
+
+
+def people_called(name: str) -> PeopleKind:
+    """Return a name as a row of `PEOPLE`. Raises UsageError with the valid names."""
+    if name not in PEOPLE:
+        raise unknown("kind of tracked people", name, PEOPLE)
+    return cast(PeopleKind, name)
 
 
 class ScanSpec(Ranged, frozen=True, dict=True):
@@ -243,3 +258,21 @@ NO_TRACKS: Final = Tracks(
 def clear_scan(spec: ScanSpec) -> Scan:
     """Return a scan without a return."""
     return Scan(np.full((spec.rings, spec.rays), np.inf, np.float32), spec)
+
+
+PEOPLE_ROWS: Final = 32
+"""Number of tracked people in arrays of fixed size, the nearest ones."""
+
+
+def scan_row(scan: Scan) -> NDArray[np.float32]:
+    """Return the distances of a scan, (rings, rays); without a return the range."""
+    return np.minimum(scan.ranges_m, np.float32(scan.spec.range_m))
+
+
+def people_rows(tracks: Tracks) -> NDArray[np.float32]:
+    """Return the nearest people as (PEOPLE_ROWS, 5): 1, positions and velocities; else 0."""
+    rows = np.zeros((PEOPLE_ROWS, 5), np.float32)
+    numbers = np.asarray(tracks)[:PEOPLE_ROWS]
+    rows[: len(numbers), 0] = 1.0
+    rows[: len(numbers), 1:] = numbers
+    return rows

@@ -22,7 +22,7 @@ from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.goal import GOALS, TextSpace
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
-from cosim.spec.sensors import TRACKING_RANGE_M
+from cosim.spec.sensors import PEOPLE_ROWS, TRACKING_RANGE_M, people_rows
 
 Actions = Literal["command", "waypoints"]
 SeenParts = dict[str, Any]
@@ -32,8 +32,6 @@ _FARTHEST_M: Final = 10_000.0
 _MOST_GYRO_RADPS: Final = 35.0
 _MOST_ACCEL_MPS2: Final = 160.0
 _MOST_PERSON_MPS: Final = 10.0
-PEOPLE_ROWS: Final = 32
-"""Number of tracked people in an observation of a learner, the nearest ones."""
 
 
 def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
@@ -91,9 +89,7 @@ def seen_by(observation: Observation, space: spaces.Dict) -> SeenParts:
         ]
     parts |= {"scan": observation.scan, "imu": observation.imu}
     if (people := observation.people) is not None:
-        tracks = np.asarray(people)[:PEOPLE_ROWS]
-        parts["people"] = np.zeros((PEOPLE_ROWS, 5), np.float32)
-        parts["people"][: len(tracks)] = np.column_stack([np.ones(len(tracks)), tracks])
+        parts["people"] = people_rows(people)
     return {name: _within(parts[name], one) for name, one in space.items()}
 
 
