@@ -30,7 +30,7 @@ class Solids(NamedTuple):
     cylinders: Floats
 
     def __len__(self) -> int:
-        return self.boxes.shape[1] + self.cylinders.shape[1]
+        return int(self.boxes.shape[1] + self.cylinders.shape[1])
 
 
 class Rays(NamedTuple):

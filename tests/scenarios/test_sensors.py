@@ -9,20 +9,22 @@ import msgspec
 import numpy as np
 import pytest
 
-import cosim
+import cosim as product
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
+from cosim.results.run_folder import read_records
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.scenario import CrowdSpec, Scenario, Suite
+from cosim.spec.scenario import CrowdSpec, Scenario, Suite, write_suite
 from cosim.spec.sensors import ScanSpec
 from scenarios.episodes.episode import Episode
 from scenarios.episodes.replay import load_recorded, replay_episode
 from scenarios.episodes.sensor_replay import sensor_replay
 from scenarios.tools.verify.doctor import small_scenario
+from tests.conftest import Cosim
 
 BLIND = Manifest("blind", rate_hz=10.0, camera=None)
 SENSING = dataclasses.replace(
@@ -126,7 +128,9 @@ def test_a_replay_repeats_the_readings_of_the_recorded_policy(tmp_path: Path) ->
     bits at the same ticks, across resets of the robot."""
     scenario = msgspec.structs.replace(crowded(), time_limit_s=4.0)
     policy = Sensing()
-    cosim.run(Suite(name="brief", version="1", scenarios=(scenario,)), policy, out=tmp_path / "run")
+    product.run(
+        Suite(name="brief", version="1", scenarios=(scenario,)), policy, out=tmp_path / "run"
+    )
     told = load_recorded(tmp_path / "run", scenario.id)
     found: list[Observation] = []
     with sensor_replay(told) as sensors:
@@ -144,3 +148,54 @@ def test_a_replay_repeats_the_readings_of_the_recorded_policy(tmp_path: Path) ->
                 observation = episode.advance(replayed.act(observation))
     assert [one.tick for one in found] == [one.tick for one in policy.seen]
     assert bytes_of(found) == bytes_of(policy.seen)
+
+
+MINE = """
+import numpy as np
+import cosim
+
+
+class Mine:
+    manifest = cosim.Manifest(
+        "mine", rate_hz=5.0, camera=None, scan=cosim.ScanSpec(rays=90), imu="noisy", people="seen"
+    )
+
+    def reset(self, episode_id, seed):
+        pass
+
+    def act(self, seen):
+        scan, people = np.asarray(seen.scan), np.asarray(seen.people)
+        turn = float(scan[0, 45:60].min(initial=9.0) - scan[0, 30:45].min(initial=9.0))
+        turn += float(people.sum()) + float(seen.people.ids.sum()) + seen.imu.gyro_radps[2]
+        return cosim.Command(0.7, 0.01 * turn)
+"""
+
+
+@pytest.mark.engine
+def test_an_isolated_policy_senses_the_same(tmp_path: Path, cosim: Cosim) -> None:
+    """A policy that drives by scan, tracks and inertial readings reaches the same state hash in
+    this process and in a sandbox, and its row has the sensors and their track."""
+    scenario = msgspec.structs.replace(crowded(), time_limit_s=3.0)
+    write_suite(Suite(name="brief", version="1", scenarios=(scenario,)), tmp_path / "brief.json")
+    (tmp_path / "mine.py").write_text(MINE)
+    hashes = set()
+    for out, more in (("here", ()), ("afar", ("--isolated",))):
+        asked = (
+            "run",
+            "brief.json",
+            "--policy",
+            "mine.py:Mine",
+            "--seed",
+            "3",
+            "--out",
+            out,
+            *more,
+        )
+        said = cosim(*asked, cwd=tmp_path)
+        assert said.returncode == 0, said.stderr
+        (record,) = read_records(tmp_path / out)
+        assert record.status == "done" and record.manifest.track == "people"
+        hashes.add(record.state_hash)
+    assert len(hashes) == 1
+    row = (tmp_path / "here/results.csv").read_text()
+    assert "people,none,5.0" in row and "90 rays, 20 m, at 0.3 m, noise 0.02 m" in row
