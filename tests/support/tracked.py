@@ -1,11 +1,18 @@
-"""Whether the people that sensors report are in pictures from the same eye."""
+"""Whether the people that sensors report are in pictures from the same eye.
+
+python -m tests.support.tracked [FRAMES]    in crowds of a generated and of an imported place
+"""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import cosim as cosim  # before numpy is loaded: see cosim/rounding.py
+
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,11 +21,12 @@ from cosim.core.state import LABELS, Frame, RobotState, Street
 from cosim.policies.privileged.route import Route
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import Mount, robot_called
-from cosim.spec.scenario import Scenario
+from cosim.spec.scenario import CityMap, CrowdSpec, Scenario
 from cosim.spec.sensors import TRACKING_RANGE_M
 from physics.sensors.caster import RayCaster
 from scenarios.episodes.episode import Episode
 from scenarios.places.nets import surface_of_place
+from scenarios.suites.catalog import load_suite
 
 _BODY_M = 0.8
 """Largest distance in m of a pixel of a person's body from the person's position."""
@@ -109,3 +117,22 @@ def _judged(
     reported[rows] = True
     missed = int((inside & ~reported & (pixels > 100)).sum())
     return Reported(pixels[inside & reported] > 0, missed)
+
+
+def main(frames: int) -> None:
+    """Print how many people are reported in the picture, and how many of these are hidden."""
+    ways = load_suite("long-horizon").scenarios
+    crowd = CrowdSpec(persons=150, radius_m=45.0, vehicles=20)
+    for real in (False, True):
+        way = next(one for one in ways if isinstance(one.place, CityMap) is real)
+        found = [*reports(msgspec.structs.replace(way, crowd=crowd), frames)]
+        shown = np.concatenate([one.shown for one in found])
+        missed = sum(one.missed for one in found)
+        print(
+            f"{way.id}: {len(found)} frames, {len(shown)} reported people in the picture, "
+            f"{int((~shown).sum())} of them hidden; {missed} not reported with over 100 pixels"
+        )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import People, RobotState, Street, Trunk, Vehicles
+from cosim.core.state import Doing, People, RobotState, Street, Trunk, Vehicles
 from cosim.spec.robot import COURIER
 from cosim.spec.sensors import TRACKING_RANGE_M, ScanSpec
 from physics.dynamics.bodies import Bodies
@@ -95,7 +95,7 @@ def _busy_street(draws: np.random.Generator, at: Pose) -> Street:
     """Return people and vehicles around a pose."""
     xy = at.xy + draws.uniform(-_AROUND_M, _AROUND_M, (_PEOPLE, 2)) / math.sqrt(2.0)
     names = tuple(map(str, range(_PEOPLE)))
-    doing = ("walk",) * _PEOPLE
+    doing: tuple[Doing, ...] = ("walk",) * _PEOPLE
     turns = draws.uniform(-math.pi, math.pi, _PEOPLE + _VEHICLES)
     people = People.of(names, xy, turns[:_PEOPLE], np.ones(_PEOPLE), doing)
     cars = at.xy + draws.uniform(5.0, _AROUND_M, (_VEHICLES, 2)) * draws.choice(
