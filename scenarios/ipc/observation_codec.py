@@ -78,7 +78,10 @@ def encoded_about(seen: Observation) -> EpisodeConstants:
         if known is None
         else _encode((known.route.points, shapely.to_wkb(known.free), known.waits_m))
     )
-    lidar = {} if seen.scan is None else msgspec.to_builtins(seen.scan.spec)
+    lidar: dict[str, Any] = {}
+    if seen.scan is not None:
+        spec = seen.scan.spec
+        lidar = msgspec.to_builtins(spec) | {"angles_rad": spec.angles_rad.tolist()}
     return EpisodeConstants(robot, calibrations, ground, lidar)
 
 
@@ -133,7 +136,7 @@ class ObservationDecoder(EpisodeDecoder):
         "picture": CameraPicture,
         "goal": lambda **fields: decoded_goal(fields),
         "odometry": Odometry,
-        "lidar": lambda **fields: msgspec.convert(fields, ScanSpec),
+        "lidar": lambda angles_rad, **fields: msgspec.convert(fields, ScanSpec),
         "scan": Scan,
         "imu": Imu,
         "people": Tracks,

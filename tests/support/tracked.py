@@ -10,8 +10,6 @@ import sys
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import cosim as cosim  # before numpy is loaded: see cosim/rounding.py
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
