@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import unknown
 from cosim.core.geometry import Floats
+from cosim.core.state import write_protect
 from cosim.spec.validation import Ranged, Within
 
 ImuKind = Literal["none", "exact", "noisy"]
@@ -125,7 +126,8 @@ class ScanSpec(Ranged, frozen=True, dict=True):
         """(3, rings * rays) unit vectors in the frame of the robot's trunk, ring by ring."""
         up, turn = np.meshgrid(self.elevations_rad, self.angles_rad, indexing="ij")
         level = np.cos(up)
-        return np.stack([level * np.cos(turn), level * np.sin(turn), np.sin(up)]).reshape(3, -1)
+        vectors = np.stack([level * np.cos(turn), level * np.sin(turn), np.sin(up)])
+        return write_protect(vectors.reshape(3, -1))
 
     @property
     def in_words(self) -> str:
