@@ -144,6 +144,10 @@ class Scan(msgspec.Struct, frozen=True, eq=False):
 
     ranges_m: (rings, rays) float32 distances; `inf` without a return.
     spec: the lidar; `spec.angles_rad` has the bearings.
+
+    >>> scan = Scan(np.full((1, 8), 2.5, np.float32), ScanSpec(rays=8))
+    >>> float(np.asarray(scan).min()), scan.spec.angles_rad[4]
+    (2.5, np.float64(0.0))
     """
 
     ranges_m: NDArray[np.float32]
@@ -167,6 +171,9 @@ class Imu(msgspec.Struct, frozen=True):
 
     gyro_radps: angular speeds about x, y and z.
     accel_mps2: specific force; (0, 0, 9.81) for a robot at rest on level ground.
+
+    >>> np.asarray(Imu((0.0, 0.0, 0.5), (0.2, 0.0, 9.81))).tolist()
+    [0.0, 0.0, 0.5, 0.2, 0.0, 9.81]
     """
 
     gyro_radps: tuple[float, float, float]
@@ -188,6 +195,10 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
     ids: (N,) int32 ids of tracks; a person may get another one.
     positions_m: (N, 2) float32 in the robot's frame: x forward, y left.
     velocities_mps: (N, 2) float32 velocities over the ground, in the axes of the robot's frame.
+
+    >>> one = np.array([[3.0, 1.0]], np.float32)
+    >>> np.asarray(Tracks(np.array([7], np.int32), one, -one)).tolist()
+    [[3.0, 1.0, -3.0, -1.0]]
     """
 
     ids: NDArray[np.int32]
