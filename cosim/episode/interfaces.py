@@ -19,6 +19,7 @@ from cosim.spec.goal import Goal
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import Robot
+from cosim.spec.sensors import Imu, Scan, Tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,9 @@ class Observation:
     depth: (H, W) float32 metres along the camera's axis.
     labels: (H, W) uint8 ids of `cosim.core.state.LABELS`.
     pictures: pictures of the further cameras by name.
+    scan: the last revolution of the lidar.
+    imu: reading of the inertial sensor.
+    people: tracked people.
 
     >>> from cosim.spec.robot import COURIER
     >>> now = Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER)
@@ -84,6 +88,9 @@ class Observation:
     depth: NDArray[np.float32] | None = None
     labels: NDArray[np.uint8] | None = None
     pictures: Mapping[str, CameraPicture] = filled(default_factory=dict)
+    scan: Scan | None = None
+    imu: Imu | None = None
+    people: Tracks | None = None
 
 
 class Policy(Protocol):
@@ -177,6 +184,32 @@ class World(Protocol):
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
         """Advance one tick; people and vehicles move linearly from `before` to `after`."""
+
+
+class RangeSensor(Protocol):
+    """Casts rays from a robot against the collision shapes of the street."""
+
+    def distances(
+        self,
+        robot: RobotState,
+        street: Street,
+        height_m: float,
+        directions: NDArray[np.float64],
+        range_m: float,
+    ) -> NDArray[np.float64]:
+        """Return the (N,) distances in metres at which rays first hit; inf beyond the range.
+
+        height_m: height of the sensor above the ground under a level robot.
+        directions: (3, N) unit vectors in the frame of the robot's trunk.
+        """
+
+    def seen_people(
+        self, robot: RobotState, street: Street, height_m: float, range_m: float
+    ) -> NDArray[np.intp]:
+        """Return the rows of people within a range of whom a part is visible from a robot.
+
+        height_m: height of the eye above the ground under a level robot.
+        """
 
 
 class Camera(Protocol):

@@ -12,6 +12,7 @@ from cosim.core.errors import SpecError
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
+from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec, SensorTrack
 
 WaypointRuleName = Literal["shipped", "atan2"]
 """Names of the rules that turn a waypoint into a command."""
@@ -71,6 +72,9 @@ class Manifest:
     odometry: kind of odometry (`cosim.spec.odometry.ODOMETRY`).
     cameras: further cameras by name.
     goals: supported goal protocols, () for any; a run with another one is refused.
+    scan: its lidar, None for a policy without one.
+    imu: kind of inertial sensor (`cosim.spec.sensors.IMU`).
+    people: kind of tracked people (`cosim.spec.sensors.PEOPLE`).
 
     The manifest itself raises nothing. An episode refuses invalid values, such as a period that is
     not a whole number of ticks.
@@ -89,6 +93,20 @@ class Manifest:
     odometry: OdometryKind = "none"
     cameras: Mapping[str, CameraSpec] = filled(default_factory=dict)
     goals: tuple[GoalProtocol, ...] = ()
+    scan: ScanSpec | None = None
+    imu: ImuKind = "none"
+    people: PeopleKind = "none"
+
+    @property
+    def track(self) -> SensorTrack:
+        """Sensor track: the strongest of the policy's sources of knowledge of the street."""
+        sources: dict[SensorTrack, bool] = {
+            "privileged": self.privileged,
+            "people": self.people != "none",
+            "lidar": self.scan is not None,
+            "picture": self.camera is not None,
+        }
+        return next((track for track, given in sources.items() if given), "blind")
 
     @property
     def picture_size(self) -> tuple[int, int]:
