@@ -29,7 +29,7 @@ from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
 from physics.dynamics.legs.gait_graph import network_of_graph
 from physics.dynamics.legs.leg_drive import LegDrive
-from physics.dynamics.legs.network import (
+from cosim.core.network import (
     Dense,
     Lstm,
     Network,

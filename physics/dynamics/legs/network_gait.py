@@ -34,7 +34,7 @@ from physics.dynamics.legs.gait_manifest import (
     PastActions,
     Term,
 )
-from physics.dynamics.legs.network import Network
+from cosim.core.network import Network
 from physics.dynamics.legs.pd import torques_nm
 from physics.robots import urdf_path
 from physics.robots.kinematics import inverse, link_tree, rotate, rows_of

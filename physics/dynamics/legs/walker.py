@@ -21,7 +21,7 @@ from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.policies.onnx.weights import NetworkFile
 from cosim.spec.robot import WALKER
 from physics.dynamics.legs.gait_manifest import read_gait_manifest
-from physics.dynamics.legs.network import Dense, Lstm, Network
+from cosim.core.network import Dense, Lstm, Network
 from physics.robots import gait_path
 
 _INPUTS: Final = 47
