@@ -2,11 +2,12 @@
 
 W. Wu et al., "MetaUrban: an embodied AI simulation platform for urban micromobility", ICLR 2025;
 the policy that is shipped with it, after 576,000 of 100 million steps of training. The input is
-that of the code at the same commit, which differs from its comments: the y axis is to the left,
-rays are counter-clockwise, nine points are filled, and the robot's state is mostly 0.
+that of the code at the same commit: rays are counter-clockwise, nine points are filled, and the
+robot's own state is mostly 0. One thing differs: the y axis of points is to the right, as the
+code's comments say. With y to the left the network does not follow a straight line.
 
-The route's points are on the straight line to the goal. Steering and throttle move the car-like
-robot of the simulator; its speed and turning rate after a step are the command.
+Steering and throttle move the car-like robot of the simulator; its speed and turning rate after a
+step are the command.
 """
 
 from __future__ import annotations
@@ -27,13 +28,12 @@ from cosim.episode.interfaces import Observation
 from cosim.policies.onnx.converting import PublishedArrays
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.policies.published.network_policy import (
-    POINT_GOALS,
     Arrays,
     NetworkPolicy,
     file_of,
-    goal_point,
     torch_layer,
 )
+from cosim.spec.goal import RoutePoints
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 from cosim.spec.sensors import Scan, ScanSpec
@@ -42,12 +42,8 @@ RAYS: Final = 240
 """Number of rays of the lidar."""
 RANGE_M: Final = 50.0
 """Range of the lidar in metres."""
-POINTS: Final = 9
-"""Number of points of the route in the input."""
-FIRST_M: Final = 4.0
-"""Distance along the route of the first point in metres."""
-APART_M: Final = 2.0
-"""Distance of points along the route in metres."""
+FIRST_POINT: Final = 2
+"""First point of the route in the input, 4 m along it; the last one is 20 m along it."""
 POINT_UNIT_M: Final = 30.0
 """Unit of a point's coordinates in metres."""
 STEP_S: Final = 0.1
@@ -65,8 +61,8 @@ BRAKE_MPS2: Final = 4 * 57.5 / (0.02 * MASS_KG)
 _INPUTS: Final = 271
 _STATE: Final = 9
 _ROUTE: Final = 22
-_MIDDLE: Final = 0.5
-"""Value of a lateral offset, or of an angle, of 0."""
+OFFSET_MOST_M: Final = (2.25, 5.0)
+"""Largest offsets from the route in the robot's state and in the route's part, in metres."""
 
 
 def ppo_network(arrays: Arrays) -> Network:
@@ -92,18 +88,27 @@ def policy_of(data: bytes) -> bytes:
         raise ValueError(f"is no archive of Stable-Baselines3: {error}") from None
 
 
-def route_input(goal: tuple[float, float]) -> Floats:
-    """Return (22,) points of the straight line to the goal, offset from it, and its bearing.
+def route_input(points: Floats) -> tuple[Floats, float]:
+    """Return (22,) the route's part of the input, and the offset to the right of the route.
 
-    goal: distance in metres and bearing in radians.
+    points: (11, 2) as in `cosim.spec.goal.RoutePoints`.
     """
-    distance_m, bearing_rad = goal
-    along = np.minimum(FIRST_M + APART_M * np.arange(POINTS), distance_m)
-    points = np.stack([along * math.cos(bearing_rad), along * math.sin(bearing_rad)], axis=1)
+    ahead_m, left_m = (points[1] - points[0]).tolist()
+    heading_rad = math.atan2(left_m, ahead_m) if (ahead_m, left_m) != (0.0, 0.0) else 0.0
+    x, y = points[0].tolist()
+    offset_m = y * math.cos(heading_rad) - x * math.sin(heading_rad)
+    shown = points[FIRST_POINT:] * (1.0, -1.0) / POINT_UNIT_M
+    last = 2 * len(shown)
     given = np.zeros(_ROUTE)
-    given[: 2 * POINTS] = ((points / POINT_UNIT_M + 1.0) / 2.0).ravel()
-    given[2 * POINTS : 2 * POINTS + 2] = _MIDDLE, (bearing_rad / math.pi + 1.0) / 2.0
-    return given
+    given[:last] = (np.clip(shown, -1.0, 1.0).ravel() + 1.0) / 2.0
+    given[last] = _share(offset_m / OFFSET_MOST_M[1])
+    given[last + 1] = _share(heading_rad / math.pi)
+    return given, offset_m
+
+
+def _share(number: float) -> float:
+    """Return a number from [-1, 1] as a share of 1."""
+    return (min(max(number, -1.0), 1.0) + 1.0) / 2.0
 
 
 def scan_input(scan: Scan) -> Floats:
@@ -112,11 +117,12 @@ def scan_input(scan: Scan) -> Floats:
     return np.roll(np.minimum(nearest / RANGE_M, 1.0), -(RAYS // 2))
 
 
-def state(scan: Scan, goal: tuple[float, float], w_radps: float) -> NDArray[np.float32]:
-    """Return (271,) the input."""
+def state(scan: Scan, points: Floats, w_radps: float) -> NDArray[np.float32]:
+    """Return (271,) the input. Arguments are those of `route_input` and `scan_input`."""
+    route, offset_m = route_input(points)
     own = np.zeros(_STATE)
-    own[-2:] = min(abs(w_radps), 1.0), _MIDDLE
-    return np.concatenate([own, route_input(goal), scan_input(scan)]).astype(np.float32)
+    own[-2:] = min(abs(w_radps), 1.0), _share(offset_m / OFFSET_MOST_M[0])
+    return np.concatenate([own, route, scan_input(scan)]).astype(np.float32)
 
 
 def driven(steering: float, throttle: float, v_mps: float, robot: Robot) -> Command:
@@ -132,14 +138,14 @@ def driven(steering: float, throttle: float, v_mps: float, robot: Robot) -> Comm
 
 
 class MetaurbanPpo(NetworkPolicy):
-    """MetaUrban's PPO (Wu et al. 2025): a scan and a goal to steering and throttle."""
+    """MetaUrban's PPO (Wu et al. 2025): a scan and points of the route to steering and throttle."""
 
     manifest = Manifest(
         "metaurban-ppo",
         rate_hz=10.0,
         camera=None,
-        goal="route_point",
-        goals=POINT_GOALS,
+        goal="route_points",
+        goals=("route_points",),
         scan=ScanSpec(rays=RAYS, range_m=RANGE_M, height_m=0.6),
     )
     files = (
@@ -156,10 +162,10 @@ class MetaurbanPpo(NetworkPolicy):
         self.network = ppo_network(read_torch_file(policy_of(files[0])))
 
     def act(self, observation: Observation) -> Command:
-        if observation.scan is None:
-            raise ValueError("needs a lidar (manifest: scan)")
-        goal = goal_point(observation, math.inf)
-        given = state(observation.scan, goal, observation.w_radps)
+        scan, goal = observation.scan, observation.goal
+        if scan is None or not isinstance(goal, RoutePoints):
+            raise ValueError("needs a lidar, and points of the route")
+        given = state(scan, goal.points_m.astype(float), observation.w_radps)
         answer, _ = self.network.answer(given, ())
         steering, throttle = np.clip(answer, -1.0, 1.0).tolist()
         command = driven(steering, throttle, observation.v_mps, observation.robot)

@@ -86,7 +86,7 @@ def weights_in_words(policy: type[NetworkPolicy]) -> str:
             folders.append(weights_file("", file.name, file.facts, file.source).parent)
         except UsageError:
             missing.append(file.name)
-    return f"Weights missing ({', '.join(missing)})." if missing else f"Weights: {folders[0]}"
+    return f"weights missing ({', '.join(missing)})" if missing else f"weights {folders[0]}"
 
 
 def file_of(folder: str, name: str, source: str, size: int, sha256: str) -> NetworkFile:

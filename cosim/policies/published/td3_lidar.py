@@ -1,7 +1,8 @@
 """Lidar TD3: speed and turn from the nearest distance in 20 sectors, the goal and the last command.
 
 The network of R. Cimurs, I. H. Suh and J. H. Lee, "Goal-driven autonomous exploration through deep
-reinforcement learning", RA-L 2022, learned in a fork with moving obstacles.
+reinforcement learning", RA-L 2022, learned in a fork with moving obstacles. The wheels of its
+simulated robot have each other's names, so that a positive turn is to the right.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def sectors(scan: Scan) -> Floats:
 
 def state(scan: Scan, goal: tuple[float, float], last: Command) -> NDArray[np.float32]:
     """Return (24,) the input: sectors, distance and bearing of the goal, last command."""
-    return np.array([*sectors(scan), *goal, last.v_mps, last.w_radps], np.float32)
+    return np.array([*sectors(scan), *goal, last.v_mps, -last.w_radps], np.float32)
 
 
 class Td3Lidar(NetworkPolicy):
@@ -97,6 +98,6 @@ class Td3Lidar(NetworkPolicy):
             raise ValueError("needs a lidar (manifest: scan)")
         given = state(observation.scan, goal_point(observation, GOAL_MOST_M), self._last)
         (speed, turn), _ = self.network.answer(given, ())
-        command = Command((float(speed) + 1.0) / 2.0, float(turn))
+        command = Command((float(speed) + 1.0) / 2.0, -float(turn))
         self._last = clipped(command, observation.robot)
         return self._last
