@@ -98,23 +98,32 @@ class CadrlNetwork:
         return logits
 
 
-def states(observation: Observation) -> tuple[Floats, Floats]:
-    """Return host and others as in `CadrlNetwork.logits`."""
-    distance_m, bearing_rad = goal_point(observation, GOAL_MOST_M)
-    radius_m = radius(observation.robot)
-    host = np.array([distance_m, -bearing_rad, preferred_mps(observation.robot), radius_m])
-    people = nearest_tracks(observation.people, MOST_PEOPLE, MOST_M)[::-1]
+def states(
+    goal: tuple[float, float],
+    people: Floats,
+    radii_m: Floats,
+    radius_m: float,
+    preferred_mps: float,
+) -> tuple[Floats, Floats]:
+    """Return host and others as in `CadrlNetwork.logits`.
+
+    goal: distance in metres and bearing in radians.
+    people: (N, 4) positions in the robot's frame, and velocities; nearest first.
+    radii_m: (N,) of people.
+    radius_m, preferred_mps: of the robot.
+    """
+    distance_m, bearing_rad = goal
     velocity = np.where(lengths(people[:, 2:])[:, None] < STANDING_MPS, 0.0, people[:, 2:])
-    both_m = radius_m + PERSON_RADIUS_M
-    others = np.column_stack(
-        [
-            rotated(people[:, :2], bearing_rad),
-            rotated(velocity, bearing_rad),
-            np.full((len(people), 2), (PERSON_RADIUS_M, both_m)),
-            lengths(people[:, :2]) - both_m,
-        ]
-    )
-    return host, others
+    both_m = radius_m + radii_m
+    others = [
+        rotated(people[:, :2], bearing_rad),
+        rotated(velocity, bearing_rad),
+        radii_m,
+        both_m,
+        lengths(people[:, :2]) - both_m,
+    ]
+    host = np.array([distance_m, -bearing_rad, preferred_mps, radius_m])
+    return host, np.column_stack(others)[::-1]
 
 
 def radius(robot: Robot) -> float:
@@ -155,6 +164,11 @@ class Cadrl(NetworkPolicy):
         self.network = CadrlNetwork(read_checkpoint(*files))
 
     def act(self, observation: Observation) -> Command:
-        host, others = states(observation)
-        speed, turn_rad = ACTIONS[int(np.argmax(self.network.logits(host, others)))]
-        return clipped(Command(speed * host[2], GAIN_PER_S * turn_rad), observation.robot)
+        robot = observation.robot
+        preferred = preferred_mps(robot)
+        people = nearest_tracks(observation.people, MOST_PEOPLE, MOST_M)
+        radii_m = np.full(len(people), PERSON_RADIUS_M)
+        goal = goal_point(observation, GOAL_MOST_M)
+        logits = self.network.logits(*states(goal, people, radii_m, radius(robot), preferred))
+        speed, turn_rad = ACTIONS[int(np.argmax(logits))]
+        return clipped(Command(speed * preferred, GAIN_PER_S * turn_rad), robot)

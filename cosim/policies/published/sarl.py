@@ -34,7 +34,7 @@ from cosim.policies.published.network_policy import (
 )
 from cosim.spec.manifest import Manifest
 
-MOST_PEOPLE: Final = 5
+PEOPLE: Final = 5
 """Number of people in the input, as in training."""
 GOAL_MOST_M: Final = 8.0
 """Largest distance of the goal in metres, as in training."""
@@ -48,8 +48,10 @@ DISCOUNT: Final = 0.9
 """Discount of the value, per second at 1 m/s."""
 GAIN_PER_S: Final = 2.0
 """Gain of the turning rate on the bearing of the velocity in 1/s."""
-NOBODY: Final = np.array([[-10.0, 0.0, 0.0, 0.0]])
-"""Person in the input if nobody is seen: far behind. The network needs at least one."""
+PEOPLE_MOST_M: Final = 8.0
+"""Largest distance of people in the input in metres, about that of training."""
+EMPTY: Final = np.array([-3.0, 0.0, 0.0, 0.0])
+"""Person in an empty place of the input: standing 3 m behind. The network learned with five."""
 _SPEEDS: Final = 5
 _DIRECTIONS: Final = 16
 _DISCOMFORT_M: Final = 0.2
@@ -203,8 +205,10 @@ class Sarl(NetworkPolicy):
     def act(self, observation: Observation) -> Command:
         distance_m, bearing_rad = goal_point(observation, GOAL_MOST_M)
         goal = distance_m * np.array([math.cos(bearing_rad), math.sin(bearing_rad)])
-        people = nearest_tracks(observation.people, MOST_PEOPLE)
-        values = action_values(self.network, goal, people if len(people) else NOBODY)
+        people = np.tile(EMPTY, (PEOPLE, 1))
+        seen = nearest_tracks(observation.people, PEOPLE, PEOPLE_MOST_M)
+        people[: len(seen)] = seen
+        values = action_values(self.network, goal, people)
         velocity = VELOCITIES[int(np.argmax(values))].tolist()
         speed, off_rad = math.hypot(*velocity), math.atan2(velocity[1], velocity[0])
         ahead = Command(speed * max(math.cos(off_rad), 0.0), GAIN_PER_S * off_rad)
