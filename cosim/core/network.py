@@ -234,7 +234,7 @@ def _product(weight: Floats32, numbers: Floats32) -> Floats32:
     if numbers.ndim == 1:
         product: Floats32 = np.add.reduce(weight * numbers[:, None], axis=0)
         return product
-    products = numbers[:, :1] * weight[0]
+    products: Floats32 = numbers[:, :1] * weight[0]
     part = np.empty_like(products)
     for i in range(1, len(weight)):
         products += np.multiply(numbers[:, i : i + 1], weight[i], out=part)

@@ -94,8 +94,7 @@ class CadrlNetwork:
         for other in ((others - _OTHER_MEAN) / _OTHER_UNIT).astype(np.float32):
             output, cell = self._people.remember(other, output, cell)
         own = ((host - _HOST_MEAN) / _HOST_UNIT).astype(np.float32)
-        logits: NDArray[np.float32] = chained(self._layers, np.concatenate((own, output)))
-        return logits
+        return chained(self._layers, np.concatenate((own, output)))
 
 
 def states(

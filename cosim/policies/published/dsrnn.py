@@ -131,7 +131,7 @@ class DsrnnNetwork:
         edges = self._edges_in.answer(np.concatenate((motion, attended)))
         own = self._node_in.answer(self._robot.answer(robot.astype(narrow)))
         node = self._node.remember(np.concatenate((own, edges)), memory.node)
-        changes: NDArray[np.float32] = chained(self._actor, node)
+        changes = chained(self._actor, node)
         return changes, Memory(node, motion, crowd)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -138,8 +138,8 @@ def lengths(rows: Floats) -> Floats:
     return np.sqrt(rows[:, 0] * rows[:, 0] + rows[:, 1] * rows[:, 1])
 
 
-def chained(layers: Iterator[Dense] | tuple[Dense, ...], numbers: NDArray[np.float32]) -> Any:
-    """Return the outputs of fully connected layers in order."""
+def chained(layers: tuple[Dense, ...], numbers: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the outputs of fully connected layers in order, (outputs,) or (batch, outputs)."""
     for layer in layers:
         numbers = layer.answer(numbers)
     return numbers

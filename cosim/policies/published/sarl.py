@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.network import softmax
+from cosim.core.network import Dense, softmax
 from cosim.core.state import Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation
@@ -80,7 +80,7 @@ class SarlNetwork:
     def __init__(self, arrays: Arrays) -> None:
         published = PublishedArrays(arrays)
 
-        def mlp(name: str, last: int, last_relu: bool = False) -> tuple[torch_layer, ...]:
+        def mlp(name: str, last: int, last_relu: bool = False) -> tuple[Dense, ...]:
             return tuple(
                 torch_layer(published, f"{name}.{i}", "relu" if i < last or last_relu else "linear")
                 for i in range(0, last + 1, 2)
@@ -109,9 +109,7 @@ class SarlNetwork:
         ).reshape(count * people, -1)
         shares = softmax(chained(self._attention, attended).reshape(count, people))
         crowd = _sum_over_people(shares[:, :, None] * feature)
-        values: NDArray[np.float32] = chained(
-            self._value, np.concatenate((joint[:, 0, :6], crowd), axis=1)
-        )
+        values = chained(self._value, np.concatenate((joint[:, 0, :6], crowd), axis=1))
         return values[:, 0]
 
 
