@@ -47,6 +47,7 @@ _MOST_ANSWER_BYTES = 2 << 20
 """Largest answer in bytes; of a larger array, which is invalid, only the shape is sent."""
 _OWN_PACKAGES = {"cosim", "scenarios", "sumo_nets", "physics", "bridge"}
 _PICTURE = ("rgb", "depth", "labels")
+_TRACKS = ("ids", "positions_m", "velocities_mps")
 _NUMBERS = ("tick", "time_s", "v_mps", "w_radps", "reset")
 
 
@@ -61,11 +62,16 @@ class PackedArray(msgspec.Struct, frozen=True):
 
 
 class EpisodeConstants(msgspec.Struct, frozen=True):
-    """Constants of an episode. cameras: K (3 x 3), distortion (5), pose on the robot (4 x 4)."""
+    """Constants of an episode.
+
+    cameras: K (3 x 3), distortion (5), pose on the robot (4 x 4).
+    lidar: Fields of the manifest's `scan`, {} without one.
+    """
 
     robot: dict[str, Union[str, float]] = {}
     cameras: dict[str, tuple[list[list[float]], list[float], list[list[float]]]] = {}
     knowledge: bytes = b""
+    lidar: dict[str, Any] = {}
 
 
 class _EpisodeMessage(msgspec.Struct, frozen=True):
@@ -90,7 +96,9 @@ class ActRequest(_EpisodeMessage, frozen=True, tag="act"):
     """Request: an observation.
 
     step: Number of this request, from 0.
-    arrays: By names like "rgb", "goal.rgb" of a goal, "left/rgb" of a further camera.
+    arrays: By names like "rgb", "goal.rgb" of a goal, "left/rgb" of a further camera, "scan" of the
+        lidar, "people.ids" of tracked people.
+    imu: Angular speeds about x, y and z, then specific force.
     about: Only in the first request.
     knowledge: For a privileged policy in the shared renderer, encoded by cosim.
     """
@@ -103,6 +111,7 @@ class ActRequest(_EpisodeMessage, frozen=True, tag="act"):
     reset: bool = False
     goal: Optional[dict[str, Any]] = None
     odometry: Optional[tuple[float, float, Optional[float]]] = None
+    imu: Optional[tuple[float, float, float, float, float, float]] = None
     arrays: dict[str, PackedArray] = {}
     about: Optional[EpisodeConstants] = None
     knowledge: bytes = b""
@@ -249,6 +258,27 @@ class _PlainFields(SimpleNamespace):
         return np.array(array, dtype)
 
 
+class _PlainScan(SimpleNamespace):
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        return np.array(self.ranges_m, dtype)
+
+
+class _PlainImu(SimpleNamespace):
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        return np.array((*self.gyro_radps, *self.accel_mps2), dtype)
+
+
+class _PlainTracks(SimpleNamespace):
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        return np.array(np.hstack([self.positions_m, self.velocities_mps]), dtype)
+
+
+def _plain_lidar(**fields: Any) -> SimpleNamespace:
+    """Return the fields of a lidar with the bearings of its rays."""
+    rays = fields["rays"]
+    return SimpleNamespace(**fields, angles_rad=-np.pi + 2.0 * np.pi * np.arange(rays) / rays)
+
+
 class EpisodeDecoder:
     """Decodes observations of one episode to plain objects with the names of `cosim.Observation`.
 
@@ -259,6 +289,10 @@ class EpisodeDecoder:
         **dict.fromkeys(("camera", "picture", "odometry"), _PlainFields),
         **dict.fromkeys(("robot", "observation"), SimpleNamespace),
         "goal": lambda type, **fields: _PlainFields(**fields),
+        "lidar": _plain_lidar,
+        "scan": _PlainScan,
+        "imu": _PlainImu,
+        "people": _PlainTracks,
     }
 
     def __init__(self, episode: str, about: EpisodeConstants) -> None:
@@ -269,6 +303,7 @@ class EpisodeDecoder:
         for name, camera in about.cameras.items():
             parts = zip(("matrix", "distortion", "on_robot"), map(np.array, camera))
             self.cameras[name] = self.makes["camera"](**dict(parts))
+        self.lidar = self.makes["lidar"](**about.lidar) if about.lidar else None
 
     def decoded(self, one: ActRequest, arrays: dict[str, Any]) -> Any:
         """Return the observation in a request with these arrays."""
@@ -278,6 +313,8 @@ class EpisodeDecoder:
             parts = {kind: arrays.get(f"{name}/{kind}") for kind in _PICTURE}
             pictures[name] = makes["picture"](camera=self.cameras[name], **parts)
         goal = {name[5:]: one for name, one in arrays.items() if name.startswith("goal.")}
+        tracks = {name: arrays.get(f"people.{name}") for name in _TRACKS}
+        scan, imu = arrays.get("scan"), one.imu
         pose = dict(zip(("x_m", "y_m", "heading_rad"), one.odometry or ()))
         return makes["observation"](
             **{kind: arrays.get(kind) for kind in _PICTURE},
@@ -289,6 +326,9 @@ class EpisodeDecoder:
             odometry=makes["odometry"](**pose) if pose else None,
             camera=self.cameras.get(""),
             pictures=pictures,
+            scan=None if scan is None else makes["scan"](ranges_m=scan, spec=self.lidar),
+            imu=makes["imu"](gyro_radps=imu[:3], accel_mps2=imu[3:]) if imu else None,
+            people=None if tracks["ids"] is None else makes["people"](**tracks),
         )
 
     def privileged(self, knowledge: bytes) -> Any:
@@ -511,7 +551,7 @@ def unpack_array(array: PackedArray, memory: Any = None) -> Any:
     """Return a copy of an array of an observation. Raises ValueError if invalid."""
     if array.jpeg:
         return _from_jpeg(array.data).reshape(array.shape)
-    if array.dtype not in ("|u1", "<f4") or any(side < 0 for side in array.shape):
+    if array.dtype not in ("|u1", "<f4", "<i4") or any(side < 0 for side in array.shape):
         raise ValueError(f"an array of {array.dtype} {array.shape}")
     count = int(np.prod(array.shape, dtype=np.int64))
     if array.at < 0:
