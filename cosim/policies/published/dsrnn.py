@@ -160,9 +160,7 @@ class Places:
         here, heading_rad: (2,) position and heading of the robot.
         """
         rows = nearest_tracks(tracks, len(tracks.ids))
-        distances = np.asarray(tracks.positions_m, dtype=np.float64).reshape(-1, 2)
-        order = np.argsort(np.sqrt(distances[:, 0] ** 2 + distances[:, 1] ** 2), kind="stable")
-        ids = [int(tracks.ids[i]) for i in order]
+        ids = tracks.ids.tolist()
         found = {
             track: Place(track, here + position, velocity, now_s)
             for track, position, velocity in zip(
@@ -269,8 +267,8 @@ class Dsrnn(NetworkPolicy):
         towards = heading_rad + bearing_rad
         goal = here + distance_m * np.array([math.cos(towards), math.sin(towards)])
         self._arena = arena(self._arena, here, goal)
-        for i in self._places.update(tracks, here, heading_rad, observation.time_s):
-            self._memory.people[i] = 0.0
+        memories = self._memory.people.copy()
+        memories[self._places.update(tracks, here, heading_rad, observation.time_s)] = 0.0
         velocity = observation.v_mps * np.array([math.cos(heading_rad), math.sin(heading_rad)])
         centre = self._arena.centre
         robot = np.concatenate(
@@ -282,7 +280,8 @@ class Dsrnn(NetworkPolicy):
             ]
         )
         people = self._places.relative(here, centre, observation.time_s)
-        changes, self._memory = self.network.changes(robot, velocity, people, self._memory)
+        memory = self._memory._replace(people=memories)
+        changes, self._memory = self.network.changes(robot, velocity, people, memory)
         faster, turn_rad = np.clip(changes, -MOST_CHANGE, MOST_CHANGE).tolist()
         self._speed = min(max(self._speed + faster, 0.0), PREFERRED_MPS)
         return clipped(Command(self._speed, turn_rad / STEP_S), observation.robot)

@@ -114,16 +114,16 @@ def goal_point(observation: Observation, most_m: float) -> tuple[float, float]:
 
 
 def nearest_tracks(people: Tracks | None, most: int, most_m: float = math.inf) -> Floats:
-    """Return (N, 4): positions and velocities of the nearest tracks, nearest first.
+    """Return (N, 4): positions and velocities of the first tracks, which are the nearest.
+
+    most, most_m: largest number and distance.
 
     Raises ValueError without tracked people.
     """
     if people is None:
         raise ValueError("needs tracked people (manifest: people='seen')")
     rows = np.asarray(people, dtype=np.float64).reshape(-1, 4)
-    distances = np.sqrt(rows[:, 0] * rows[:, 0] + rows[:, 1] * rows[:, 1])
-    order = [i for i in np.argsort(distances, kind="stable").tolist() if distances[i] <= most_m]
-    return rows[order[:most]]
+    return rows[lengths(rows[:, :2]) <= most_m][:most]
 
 
 def rotated(rows: Floats, angle_rad: float) -> Floats:
