@@ -344,12 +344,12 @@ class RoutePoints(AnyGoal, frozen=True, tag="route_points"):
     def probes(self) -> Mapping[str, RoutePoints]:
         # Routes that turn by 45 degrees 6 m ahead.
         sides = {"ahead": 0.0, "left": 24.0, "right": -24.0}
-        return {
-            name: RoutePoints(
-                route_points_at(Pose(0.0, 0.0, 0.0), 0.0, Polyline([(0, 0), (6, 0), (30, side)]))
-            )
-            for name, side in sides.items()
+        routes = {name: Polyline([(0, 0), (6, 0), (30, side)]) for name, side in sides.items()}
+        turns = {
+            name: RoutePoints(route_points_at(Pose(0.0, 0.0, 0.0), 0.0, route))
+            for name, route in routes.items()
         }
+        return {**turns, "zero": RoutePoints(np.zeros_like(self.points_m))}
 
 
 Goal = PointGoal | ImageGoal | Instruction | RoutePatch | RoutePoints
