@@ -10,11 +10,12 @@ import sys
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import cosim as cosim  # before numpy is loaded: see cosim/rounding.py
+
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-import cosim as cosim  # before numpy is loaded: see cosim/rounding.py
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, Frame, RobotState, Street
 from cosim.policies.privileged.route import Route
