@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cosim.results.log import Log
     from cosim.results.record import Record
     from cosim.spec.camera import Calibration, CameraPicture, CameraSpec
-    from cosim.spec.goal import ImageGoal, Instruction, PointGoal, RoutePatch
+    from cosim.spec.goal import ImageGoal, Instruction, PointGoal, RoutePatch, RoutePoints
     from cosim.spec.manifest import Manifest, WaypointRule
     from cosim.spec.odometry import Odometry
     from cosim.spec.options import EpisodeOptions, PolicyHost
@@ -68,6 +68,7 @@ __all__ = [
     "Record",
     "Robot",
     "RoutePatch",
+    "RoutePoints",
     "Scan",
     "ScanSpec",
     "Scenario",
@@ -103,6 +104,7 @@ _HOMES = {
     "Record": "cosim.results.record",
     "Robot": "cosim.spec.robot",
     "RoutePatch": "cosim.spec.goal",
+    "RoutePoints": "cosim.spec.goal",
     "Scan": "cosim.spec.sensors",
     "ScanSpec": "cosim.spec.sensors",
     "Scenario": "cosim.spec.scenario",

@@ -19,7 +19,7 @@ from typer.main import get_command
 import cosim
 from cosim.cli.app import app
 from cosim.policies import POLICIES
-from cosim.policies.load import FOLLOW, shipped_bundles
+from cosim.policies.load import WEIGHTED_POLICIES, shipped_bundles
 from cosim.spec.connection import checked_endpoint
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.robot import ROBOTS
@@ -72,7 +72,7 @@ def ids_of(suite: str) -> set[str]:
 def unknown_names(parameters: dict[str, Any]) -> list[object]:
     """Names in parameters that are none: of policies, suites, scenarios, events, robots, goals,
     endpoints."""
-    policies = {*POLICIES, *shipped_bundles(), FOLLOW}
+    policies = {*POLICIES, *shipped_bundles(), *WEIGHTED_POLICIES}
     named: dict[str, set[str]] = {
         "policy": policies,
         "learner": policies,

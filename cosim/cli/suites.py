@@ -40,6 +40,8 @@ def print_names(out: Console) -> None:
     from cosim.policies.follow.networks import weights_in_words
     from cosim.policies.follow.policy import Follow
     from cosim.policies.load import bundle_in_words, shipped_bundles
+    from cosim.policies.published import NETWORK_POLICIES
+    from cosim.policies.published.network_policy import weights_in_words as network_weights
     from cosim.policies.schedule.cheats import CHEATS
     from cosim.results.table import policy_in_words
     from cosim.spec.goal import GOALS
@@ -69,6 +71,9 @@ def print_names(out: Console) -> None:
         out.print(f"policy  {name}  {bundle_in_words(folder)}", soft_wrap=True)
     about = (Follow.__doc__ or "").splitlines()[0]
     out.print(f"policy  {Follow.manifest.name}  {about} {weights_in_words()}", soft_wrap=True)
+    for name, policy in NETWORK_POLICIES.items():
+        about = (policy.__doc__ or "").splitlines()[0]
+        out.print(f"policy  {name}  {about} {network_weights(policy)}", soft_wrap=True)
     out.print(
         f"policy  schedule:NAME  Drives an open-loop schedule, blind: {', '.join(CHEATS)}",
         soft_wrap=True,

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol, cast
 
 import msgspec
@@ -26,6 +27,7 @@ from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer
 from cosim.policies import POLICIES
 from cosim.policies.onnx.manifest import MANIFEST_FILE, read_bundle_manifest
 from cosim.policies.onnx.weights import weights_file
+from cosim.policies.published import NETWORK_POLICIES
 from cosim.policies.schedule.policy import schedule_policy
 from cosim.policies.user_module import (
     importable_name,
@@ -112,9 +114,9 @@ def load_policy(
         bundles = shipped_bundles()
         if name in bundles:
             return _by_digest(name, _bundle(bundles[name], within_s), timer)
-        if name == FOLLOW:
-            return _by_digest(name, _follow, timer)
-        raise unknown("policy", name, [*POLICIES, *bundles, FOLLOW, *OTHER_NAMES])
+        if name in WEIGHTED_POLICIES:
+            return _by_digest(name, WEIGHTED_POLICIES[name], timer)
+        raise unknown("policy", name, [*POLICIES, *bundles, *WEIGHTED_POLICIES, *OTHER_NAMES])
     home = Path.cwd()
     with policy_call("loading", timer=timer, passes=(BaseException,)):
         try:
@@ -149,6 +151,12 @@ def _follow() -> _Digested:
     from cosim.policies.follow.policy import Follow
 
     return Follow()
+
+
+WEIGHTED_POLICIES: Mapping[str, Callable[[], _Digested]] = MappingProxyType(
+    {FOLLOW: _follow, **NETWORK_POLICIES}
+)
+"""Constructors of the bundled Python policies that read weights, by name."""
 
 
 def _by_digest(name: str, make: Callable[[], _Digested], timer: Timer | None) -> PolicyCaller:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import string
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, Protocol, Self, cast
 
@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import unknown
-from cosim.core.geometry import Floats, Polyline, Pose, wrap_angle
+from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.spec.camera import flipped
-from cosim.spec.scenario import RouteCrossing, Scenario
+from cosim.spec.manoeuvres import instruction_at, manoeuvres
+from cosim.spec.scenario import Scenario
 
 GoalProtocol = Literal[
     "none",
@@ -32,6 +33,7 @@ GoalProtocol = Literal[
     "random_image",
     "instruction",
     "route_patch",
+    "route_points",
 ]
 """Names of the rows of `GOALS`."""
 Turn = Literal["left", "straight", "right"]
@@ -43,6 +45,10 @@ PATCH_PX: Final = 80
 """Rows and columns of a route patch."""
 PATCH_M: Final = 0.5
 """Size of a route patch's pixel in metres. Pixels closer than this to the route are on it."""
+ROUTE_POINTS: Final = 11
+"""Number of points of the route in a goal."""
+ROUTE_STEP_M: Final = 2.0
+"""Distance between them along the route, in metres."""
 _GREY: Final = 128
 """Grey value of an example picture."""
 _FARTHEST_M: Final = 10_000.0
@@ -59,16 +65,6 @@ _REACHED_M: Final = 1.0
 """Distance at which a random point counts as reached, in metres."""
 _SLACK_M: Final = 1e-6
 """Tolerance for rounding in metres."""
-_ARM_M: Final = 6.0
-"""Length of the route before and after a place whose angle is its turn, in metres."""
-_BEND_RAD: Final = math.radians(35.0)
-"""Angle from which a bend is an instruction."""
-_TURN_RAD: Final = math.radians(60.0)
-"""Angle from which an instruction says "turn" instead of "bear"."""
-_ANNOUNCED_M: Final = 20.0
-"""Distance from which instructions announce a turn, in metres."""
-_DUE_M: Final = 2.5
-"""Distance from which instructions say that a turn is due, in metres."""
 _ANNOUNCEMENT: Final = re.compile(r"(?:In (\d+) m, )?(?:turn|bear) (left|right)", re.IGNORECASE)
 """Pattern of a turn in an instruction, with its distance if it is not due."""
 
@@ -318,7 +314,45 @@ class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
         return {**turns, "zero": RoutePatch(np.zeros_like(self.pixels))}
 
 
-Goal = PointGoal | ImageGoal | Instruction | RoutePatch
+class RoutePoints(AnyGoal, frozen=True, tag="route_points"):
+    """Points of the reference route in the robot's frame: (11, 2) float32 metres.
+
+    The first is the robot's place on the route, the next ones are 2 to 20 m along it. At the end of
+    the route the last point repeats.
+
+    >>> RoutePoints(np.zeros((11, 2), np.float32)).points_m.shape
+    (11, 2)
+    """
+
+    points_m: NDArray[np.float32]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return the points, (11, 2) float32."""
+        return np.array(self.points_m, dtype, copy=copy)
+
+    @classmethod
+    def space(cls, size: tuple[int, int]) -> ArraySpace:
+        return ArraySpace(-_FARTHEST_M, _FARTHEST_M, (ROUTE_POINTS, 2), np.float32)
+
+    @classmethod
+    def example(cls, size: tuple[int, int]) -> RoutePoints:
+        return RoutePoints(route_points_at(Pose(0.0, 0.0, 0.0), 0.0, Polyline([(0, 0), (30, 0)])))
+
+    def mirrored(self) -> RoutePoints:
+        return RoutePoints(self.points_m * np.array([1, -1], np.float32))
+
+    def probes(self) -> Mapping[str, RoutePoints]:
+        # Routes that turn by 45 degrees 6 m ahead.
+        sides = {"ahead": 0.0, "left": 24.0, "right": -24.0}
+        routes = {name: Polyline([(0, 0), (6, 0), (30, side)]) for name, side in sides.items()}
+        turns = {
+            name: RoutePoints(route_points_at(Pose(0.0, 0.0, 0.0), 0.0, route))
+            for name, route in routes.items()
+        }
+        return {**turns, "zero": RoutePoints(np.zeros_like(self.points_m))}
+
+
+Goal = PointGoal | ImageGoal | Instruction | RoutePatch | RoutePoints
 """Any goal of a policy."""
 
 
@@ -452,65 +486,6 @@ class _ImageGoals:
         """Nothing to discard: the sub-goals detect a reset themselves."""
 
 
-class Manoeuvre(NamedTuple):
-    """Part of the route with an instruction, as an interval of arc length."""
-
-    s_m: float
-    end_s_m: float
-    words: str
-
-
-def manoeuvres(route: Polyline, crossings: Sequence[RouteCrossing] = ()) -> tuple[Manoeuvre, ...]:
-    """Return the turns and crosswalks of a route in order.
-
-    Bends of less than 35 degrees within 12 m are ignored.
-
-    >>> [(one.s_m, one.words) for one in manoeuvres(Polyline([(0, 0), (20, 0), (20, 20)]))]
-    [(20.0, 'turn left')]
-    """
-    found = [
-        Manoeuvre(one.enter_s_m, one.leave_s_m, "cross the street at the crosswalk")
-        for one in crossings
-    ]
-    s_m = np.arange(1.0, route.length_m - 0.5)
-    turns = np.array([_turn_at(route, s) for s in s_m.tolist()])
-    bent = np.where(np.abs(turns) >= _BEND_RAD, np.sign(turns), 0.0)
-    starts = np.flatnonzero(np.diff(bent, prepend=0.0))
-    for first, last in zip(starts, [*starts, len(bent)][1:], strict=True):
-        if bent[first]:
-            peak = first + int(np.argmax(np.abs(turns[first:last])))
-            how = "turn" if abs(turns[peak]) >= _TURN_RAD else "bear"
-            side = "left" if turns[peak] > 0.0 else "right"
-            found.append(Manoeuvre(float(s_m[peak]), float(s_m[peak]) + 1.0, f"{how} {side}"))
-    return tuple(sorted(found))
-
-
-def _turn_at(route: Polyline, s_m: float) -> float:
-    """Return the angle of the route around a place, left positive, in radians."""
-    before, here, behind = (route.at(s).xy for s in (s_m - _ARM_M, s_m, s_m + _ARM_M))
-    (ax, ay) = (here - before).tolist()
-    (bx, by) = (behind - here).tolist()
-    return wrap_angle(math.atan2(by, bx) - math.atan2(ay, ax))
-
-
-def instruction_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
-    """Return the instruction at an arc length: due manoeuvres, then the next one within 20 m.
-
-    Distances are rounded to 5 m.
-
-    >>> ways = manoeuvres(Polyline([(0, 0), (40, 0), (40, 20)]))
-    >>> instruction_at(29.0, ways), instruction_at(39.0, ways)
-    ('Follow the sidewalk. In 10 m, turn left.', 'Turn left.')
-    """
-    due = [one.words for one in steps if one.s_m - _DUE_M <= route_s_m < one.end_s_m]
-    sentences = [f"{words.capitalize()}." for words in due] or ["Follow the sidewalk."]
-    coming = [one for one in steps if _DUE_M < one.s_m - route_s_m <= _ANNOUNCED_M]
-    if coming:
-        far_m = max(5 * round((coming[0].s_m - route_s_m) / 5.0), 5)
-        sentences.append(f"In {far_m} m, {coming[0].words}.")
-    return " ".join(sentences)
-
-
 def route_patch_at(pose: Pose, route: Floats) -> NDArray[np.uint8]:
     """Return a raster as in `RoutePatch`, (80, 80) uint8.
 
@@ -532,6 +507,18 @@ def route_patch_at(pose: Pose, route: Floats) -> NDArray[np.uint8]:
         off -= along[..., None] * step
         pixels[top:bottom, left:right][(off * off).sum(axis=-1) <= 1.0] = 255
     return pixels
+
+
+def route_points_at(pose: Pose, route_s_m: float, route: Polyline) -> NDArray[np.float32]:
+    """Return the points of `RoutePoints` for a robot at a pose and arc length, (11, 2) float32."""
+    places = (route_s_m + ROUTE_STEP_M * i for i in range(ROUTE_POINTS))
+    points = [in_robot_frame(pose, route.at(min(s_m, route.length_m))) for s_m in places]
+    return np.array([(point.x_m, point.y_m) for point in points], np.float32)
+
+
+def _along_route(source: GoalSource) -> Goals:
+    route = source.scenario.route_line
+    return _PositionGoals(lambda pose, s_m: RoutePoints(route_points_at(pose, s_m, route)))
 
 
 def _route_points(source: GoalSource) -> Goals:
@@ -621,6 +608,12 @@ _ROWS: Final = (
         "a raster of the reference route around the robot, 80 x 80 pixels of 0.5 m",
         RoutePatch,
         _route_patches,
+    ),
+    GoalKind(
+        "route_points",
+        "the reference route from the robot's place to 20 m ahead, as points 2 m apart",
+        RoutePoints,
+        _along_route,
     ),
 )
 """Rows of `GOALS`."""

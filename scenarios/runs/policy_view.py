@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from cosim.core.errors import UsageError
-from cosim.policies.load import FOLLOW, ONNX_SCHEME, shipped_bundles
+from cosim.policies.load import ONNX_SCHEME, WEIGHTED_POLICIES, shipped_bundles
 from cosim.policies.onnx.graph import PROVIDERS_VARIABLE
 from cosim.policies.onnx.weights import WEIGHTS_VARIABLE, weight_folders
 from cosim.spec.options import PolicyHost
@@ -99,7 +99,7 @@ def _own_folders(name: str) -> list[Path]:
     if name.startswith(ONNX_SCHEME):
         return [_narrow(name, Path(name_inside(name).removeprefix(ONNX_SCHEME))), *weight_folders()]
     if ":" not in name:
-        return weight_folders() if name == FOLLOW or name in shipped_bundles() else []
+        return weight_folders() if name in {*WEIGHTED_POLICIES, *shipped_bundles()} else []
     top = name.partition(":")[0].partition(".")[0]
     found = PathFinder.find_spec(top, ["", *sys.path])
     folders = _folders(found)

@@ -24,14 +24,14 @@ from cosim.spec.goal import (
     Instruction,
     PointGoal,
     RoutePatch,
+    RoutePoints,
     TurningGoal,
     decoded_goal,
     goals_for,
-    instruction_at,
-    manoeuvres,
     route_patch_at,
 )
 from cosim.spec.manifest import Manifest
+from cosim.spec.manoeuvres import instruction_at, manoeuvres
 from cosim.spec.robot import COURIER, Mount
 from cosim.spec.scenario import City, RouteCrossing, Scenario
 from scenarios.suites.catalog import load_suite
@@ -253,6 +253,19 @@ def test_a_route_patch_has_the_route_around_the_robot() -> None:
         Pose(30.0, 0.0, -NORTH), np.array(CORNER)
     )  # looking right: the corner is to the left
     assert (np.rot90(ahead.pixels, 1) == turned).all()
+
+
+def test_route_points_are_two_metres_apart_on_the_route() -> None:
+    """From the robot's place on it, in its frame; they go round a corner and end with the route."""
+    ahead = goals("route_points").at(Pose(30.0, 1.0, 0.0), 30.0)
+    assert isinstance(ahead, RoutePoints) and ahead.points_m.dtype == np.float32
+    straight = [(2.0 * i, -1.0) for i in range(6)]
+    corner = [(10.0, 2.0 * i - 1.0) for i in range(1, 6)]
+    assert ahead.points_m.tolist() == [list(one) for one in straight + corner]
+    assert ahead.mirrored().points_m[-1].tolist() == [10.0, -9.0]
+    turned = goals("route_points").at(Pose(40.0, 55.0, NORTH), 95.0)
+    assert isinstance(turned, RoutePoints)
+    assert turned.points_m[:, 0] == pytest.approx([0, 2, 4, *(8 * [5])], abs=1e-6)
 
 
 @pytest.mark.parametrize("protocol", sorted(GOALS))

@@ -18,6 +18,15 @@ from onnx import helper
 
 from cosim.core.errors import CosimError, EngineError, PolicyError, SpecError, UsageError
 from cosim.core.geometry import Pose
+from cosim.core.network import (
+    Dense,
+    Lstm,
+    Network,
+    elu,
+    exponential,
+    network_of,
+    tanh,
+)
 from cosim.core.state import Command
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.manifest import file_facts
@@ -29,15 +38,6 @@ from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
 from physics.dynamics.legs.gait_graph import network_of_graph
 from physics.dynamics.legs.leg_drive import LegDrive
-from physics.dynamics.legs.network import (
-    Dense,
-    Lstm,
-    Network,
-    elu,
-    exponential,
-    network_of,
-    tanh,
-)
 from physics.dynamics.legs.walker import WALKER_NETWORK, walker_network
 from physics.dynamics.world import BulletWorld
 from physics.robots import urdf_path

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Final
 
 from cosim.core.errors import SpecError, UsageError
+from cosim.core.network import Network, network_of
 from cosim.core.npz import read_open_npz
 from cosim.policies.onnx.weights import NetworkFile, read_file, weights_file
 from cosim.spec.options import ONNX_GAIT
 from cosim.spec.robot import ROBOTS, Legs, Robot
 from physics.dynamics.legs.gait_graph import network_of_graph
 from physics.dynamics.legs.gait_manifest import GaitManifest, read_gait_manifest
-from physics.dynamics.legs.network import Network, network_of
 from physics.dynamics.legs.network_gait import NetworkGait, NetworkSetup
 from physics.robots import gait_path
 from physics.robots.make_urdf import MODELS

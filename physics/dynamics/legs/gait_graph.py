@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.network import Activation, Dense, Layer, Lstm, Network
 from cosim.policies.onnx.graph_nodes import GraphNodes, Node, read_nodes
-from physics.dynamics.legs.network import Activation, Dense, Layer, Lstm, Network
 
 _SHAPERS: Final = ("Identity", "Squeeze", "Unsqueeze", "Flatten", "Reshape", "Dropout", "Cast")
 """Operators that change nothing but the shape of one vector."""

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from cosim.core.errors import PolicyError
+from cosim.core.network import Network
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import BodyNow
@@ -34,7 +35,6 @@ from physics.dynamics.legs.gait_manifest import (
     PastActions,
     Term,
 )
-from physics.dynamics.legs.network import Network
 from physics.dynamics.legs.pd import torques_nm
 from physics.robots import urdf_path
 from physics.robots.kinematics import inverse, link_tree, rotate, rows_of

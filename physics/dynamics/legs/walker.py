@@ -15,13 +15,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.network import Dense, Lstm, Network
 from cosim.policies.onnx.converting import Converter, PublishedArrays
 from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.policies.onnx.weights import NetworkFile
 from cosim.spec.robot import WALKER
 from physics.dynamics.legs.gait_manifest import read_gait_manifest
-from physics.dynamics.legs.network import Dense, Lstm, Network
 from physics.robots import gait_path
 
 _INPUTS: Final = 47

@@ -3,6 +3,9 @@
 Matrix products are sums in a fixed order, because those of BLAS depend on the processor. The
 exponential function consists of sums and products, because that of numpy depends on it, too. A
 decision of the walker takes about 0.05 ms.
+
+`Network` evaluates layers in order. Networks with other structures call the layers themselves:
+inputs of a layer have shape (inputs,) or (batch, inputs).
 """
 
 from __future__ import annotations
@@ -48,6 +51,10 @@ class Dense:
         inputs, outputs = self.weight.shape
         return inputs, outputs
 
+    def answer(self, numbers: Floats32) -> Floats32:
+        """Return the outputs, (outputs,) or (batch, outputs)."""
+        return _activated(self.activation, _product(self.weight, numbers) + self.bias)
+
 
 @dataclass(frozen=True, eq=False)
 class Lstm:
@@ -65,6 +72,45 @@ class Lstm:
         """Numbers of inputs and outputs."""
         outputs = self.weight.shape[1] // 4
         return self.weight.shape[0] - outputs, outputs
+
+    def remember(
+        self, numbers: Floats32, output: Floats32, cell: Floats32
+    ) -> tuple[Floats32, Floats32]:
+        """Return the next output and cell, (outputs,) each."""
+        size = self.sizes[1]
+        gates = _product(self.weight, np.concatenate((numbers, output))) + self.bias
+        half = np.float32(0.5)
+        gates[: 2 * size] *= half
+        gates[3 * size :] *= half
+        bent = tanh(gates)
+        shares = half * bent + half  # sigmoid(x) = tanh(x / 2) / 2 + 1 / 2
+        cell = shares[size : 2 * size] * cell + shares[:size] * bent[2 * size : 3 * size]
+        return shares[3 * size :] * tanh(cell), cell
+
+
+@dataclass(frozen=True, eq=False)
+class Gru:
+    """Gated recurrent unit of one layer, as PyTorch defines it; gates are reset, update and new.
+
+    weight: (inputs, 3 * outputs), of the inputs.
+    own_weight: (outputs, 3 * outputs), of the last output.
+    bias, own_bias: (3 * outputs,).
+    """
+
+    weight: Floats32
+    own_weight: Floats32
+    bias: Floats32
+    own_bias: Floats32
+
+    def remember(self, numbers: Floats32, output: Floats32) -> Floats32:
+        """Return the next output, (outputs,) or (batch, outputs)."""
+        size = self.own_weight.shape[0]
+        given = _product(self.weight, numbers) + self.bias
+        own = _product(self.own_weight, output) + self.own_bias
+        shares = sigmoid(given[..., : 2 * size] + own[..., : 2 * size])
+        reset, update = shares[..., :size], shares[..., size:]
+        new = tanh(given[..., 2 * size :] + reset * own[..., 2 * size :])
+        return new + update * (output - new)
 
 
 Layer = Dense | Lstm
@@ -107,10 +153,10 @@ class Network:
         numbers = given
         for layer in self.layers:
             if isinstance(layer, Lstm):
-                numbers, cell = _remember(layer, numbers, next(state), next(state))
+                numbers, cell = layer.remember(numbers, next(state), next(state))
                 after += numbers, cell
             else:
-                numbers = _activated(layer, _product(layer.weight, numbers) + layer.bias)
+                numbers = layer.answer(numbers)
         return numbers, tuple(after)
 
     def arrays(self) -> dict[str, Floats32]:
@@ -169,33 +215,38 @@ def elu(x: Floats32) -> Floats32:
     return np.where(x > 0.0, x, below.astype(np.float32))
 
 
+def sigmoid(x: Floats32) -> Floats32:
+    """Return the logistic function, rounded to float32."""
+    half = np.float32(0.5)
+    return half * tanh(half * x) + half
+
+
+def softmax(x: Floats32) -> Floats32:
+    """Return shares of sum 1 along the last axis, proportional to exp(x)."""
+    power = exponential((x - x.max(axis=-1, keepdims=True)).astype(np.float64))
+    total = sum(power[..., i] for i in range(power.shape[-1]))
+    shares: Floats32 = (power / np.asarray(total)[..., None]).astype(np.float32)
+    return shares
+
+
 def _product(weight: Floats32, numbers: Floats32) -> Floats32:
     """Return numbers @ weight, summed over the inputs in their order."""
-    product: Floats32 = np.add.reduce(weight * numbers[:, None], axis=0)
-    return product
+    if numbers.ndim == 1:
+        product: Floats32 = np.add.reduce(weight * numbers[:, None], axis=0)
+        return product
+    products: Floats32 = numbers[:, :1] * weight[0]
+    part = np.empty_like(products)
+    for i in range(1, len(weight)):
+        products += np.multiply(numbers[:, i : i + 1], weight[i], out=part)
+    return products
 
 
-def _activated(layer: Dense, numbers: Floats32) -> Floats32:
-    if layer.activation == "elu":
+def _activated(activation: Activation, numbers: Floats32) -> Floats32:
+    if activation == "elu":
         return elu(numbers)
-    if layer.activation == "tanh":
+    if activation == "tanh":
         return tanh(numbers)
-    return np.maximum(numbers, np.float32(0.0)) if layer.activation == "relu" else numbers
-
-
-def _remember(
-    layer: Lstm, numbers: Floats32, output: Floats32, cell: Floats32
-) -> tuple[Floats32, Floats32]:
-    """Return the next output and cell of a recurrent layer."""
-    size = layer.sizes[1]
-    gates = _product(layer.weight, np.concatenate((numbers, output))) + layer.bias
-    half = np.float32(0.5)
-    gates[: 2 * size] *= half
-    gates[3 * size :] *= half
-    bent = tanh(gates)
-    shares = half * bent + half  # sigmoid(x) = tanh(x / 2) / 2 + 1 / 2
-    cell = shares[size : 2 * size] * cell + shares[:size] * bent[2 * size : 3 * size]
-    return shares[3 * size :] * tanh(cell), cell
+    return np.maximum(numbers, np.float32(0.0)) if activation == "relu" else numbers
 
 
 def _check(index: int, layer: Layer) -> None:
