@@ -160,6 +160,23 @@ def test_runs_by_other_terms_are_called_neither_better_nor_worse(
     assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", said.stdout)
 
 
+def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path: Path) -> None:
+    """Runs of one suite by two robots are paired by scenario, named by robot, and no difference is
+    called better or worse."""
+    courier = run_of(tmp_path / "c", [HIT] * 20, "p", several(20))
+    dog = run_of(tmp_path / "d", [GOALS] * 20, "p", several(20), robot="dog")
+    told = compare_runs([courier, dog])
+    assert (told.before.label, told.others[0].label) == ("p, courier", "p, dog")
+    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    success = row(told, "success", after="p, dog")
+    assert (success["n"], success["difference"], success["verdict"]) == (20, 1.0, "differs")
+    assert any(
+        "No verdict of p, dog against p, courier" in note
+        and "robot courier (p, courier) and dog (p, dog)" in note
+        for note in told.notes
+    )
+
+
 def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:
     """A camera is the policy's own choice; a run without one is a blind baseline, of which nothing
     is said."""
@@ -424,7 +441,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "an edited suite": (
         lambda run: other_suite(run, "s"),
-        "run both on the same version of it (former suite, edited, robot, --crowd?)",
+        "run both on the same version of it (former suite, edited, --crowd?)",
     ),
     "no run": (
         lambda run: (run / "run.json").unlink(),
