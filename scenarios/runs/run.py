@@ -212,7 +212,7 @@ def execute_run(
         split_called(config.split),
         decoys=not config.no_decoys,
     )
-    of_run = [scenario.driven_by(config.robot) for scenario in of_run]
+    of_run = tuple(scenario.driven_by(config.robot) for scenario in of_run)
     plan = _planned(config, given, whole, of_run, ends)
     reporter.planned(plan)
     with ExitStack() as stack:
