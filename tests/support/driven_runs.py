@@ -14,7 +14,7 @@ from cosim.core.geometry import Pose
 from cosim.episode.loop import place_on_route
 from cosim.results.log import Log
 from cosim.results.metrics import EpisodeFacts, compute_metrics
-from cosim.results.record import Record
+from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import Failure
 from cosim.results.run_folder import RunFolder
 from cosim.results.walked import walked_m
@@ -106,7 +106,21 @@ def episode_of(
     failures = (failure_at(log, ticks - 1),) if how == HIT else ()
     ended = "goal" if how == "goal" else "failure"
     record = msgspec.structs.replace(
-        record, status="done", ended=ended, ticks=ticks, failures=failures
+        record,
+        status="done",
+        ended=ended,
+        ticks=ticks,
+        failures=failures,
+        events=tuple(
+            TriggeredEvent(
+                id=event.id,
+                kind=event.kind,
+                passed=False,
+                triggered_at_s=0.0 if how == "goal" else None,
+                seen=how == "goal",
+            )
+            for event in scenario.events
+        ),
     )
     return msgspec.structs.replace(
         record, measures=compute_metrics(EpisodeFacts.of(record, scenario, log))
