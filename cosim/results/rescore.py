@@ -98,12 +98,11 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
             }
             invalid = why_invalid(record, scenario)
             reason = invalid or why_bypassed(record, scenario)
-            computed = {"status": "invalid" if invalid else "done", "reason": reason}
-            found = [
-                (name, recorded, shown)
-                for name, shown in computed.items()
-                if (recorded := getattr(record, name)) != shown
-            ][:1]
+            status = "invalid" if invalid else "done"
+            if record.status != status:
+                found = [("status", record.status, status)]
+            elif record.reason != reason:
+                found = [("reason", record.reason, reason)]
     found = found or [
         (name, record.measures.get(name), measures.get(name))
         for name in dict.fromkeys([*measures, *record.measures])
