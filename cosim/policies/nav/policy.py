@@ -1,0 +1,96 @@
+"""`nav`: classical navigation by a lidar, a stand-in for Nav2.
+
+A rolling costmap of the scans, a local plan past obstacles along the route, and regulated pure
+pursuit. It has no camera: it sees neither signals nor gestures, and takes people for obstacles.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from cosim.core.geometry import Pose, wrap_angle
+from cosim.core.state import Command
+from cosim.episode.control import clipped
+from cosim.episode.interfaces import Observation
+from cosim.policies.nav.costmap import Costmap
+from cosim.policies.nav.local_plan import LocalPlan, local_plan
+from cosim.policies.nav.pursuit import point_at, pursue
+from cosim.policies.nav.route_path import path_to
+from cosim.spec.manifest import Manifest
+from cosim.spec.sensors import ScanSpec
+
+MARGIN_M: Final = 0.08
+"""Least planned distance from the robot's side to an obstacle, in metres."""
+TIGHT_M: Final = 0.02
+"""The same after PATIENCE_S without motion."""
+PATIENCE_S: Final = 3.0
+"""Time in seconds without motion after which the robot accepts smaller gaps."""
+RECOVER_S: Final = 6.0
+"""Time in seconds without motion after which the robot turns slowly towards the free side."""
+_TURN_RADPS: Final = 0.3
+"""Yaw rate of this turn in rad/s."""
+_STANDS_MPS: Final = 0.05
+"""Speed in m/s below which the robot counts as standing."""
+
+
+class Nav:
+    """Follows the route by a lidar, without a map, a camera or privileged knowledge."""
+
+    manifest = Manifest(
+        "nav",
+        rate_hz=10.0,
+        camera=None,
+        goal="route_patch",
+        odometry="wheel",
+        scan=ScanSpec(rays=360, range_m=12.0, height_m=0.3),
+        goals=("route_patch", "route_point", "final_point"),
+    )
+
+    def __init__(self) -> None:
+        self._costmap = Costmap()
+        self.reset("", 0)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self._begin(0.0, Pose(0.0, 0.0, 0.0))
+
+    def _begin(self, time_s: float, pose: Pose) -> None:
+        """Forget the past: the robot is at rest, and heads along the route."""
+        self._costmap.clear()
+        self._direction_rad = pose.heading_rad
+        self._moved_s = time_s
+
+    def act(self, observation: Observation) -> Command:
+        scan, odometry = observation.scan, observation.odometry
+        if scan is None or odometry is None or odometry.heading_rad is None:
+            raise ValueError("nav needs a lidar and odometry with a heading")
+        robot, time_s = observation.robot, observation.time_s
+        pose = Pose(odometry.x_m, odometry.y_m, odometry.heading_rad)
+        if observation.reset or observation.tick == 0:
+            self._begin(time_s, pose)
+        self._costmap.update(scan, pose)
+        path = path_to(observation.goal, wrap_angle(self._direction_rad - pose.heading_rad))
+        if len(path) > 2:
+            ahead = path[2] - path[0]
+            self._direction_rad = pose.heading_rad + math.atan2(ahead[1], ahead[0])
+        if observation.v_mps > _STANDS_MPS:
+            self._moved_s = time_s
+        stood_s = time_s - self._moved_s
+        margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
+        plan = local_plan(path, self._costmap, robot.width_m / 2, margin_m)
+        command = pursue(plan, self._costmap, robot, observation.v_mps, robot.cruise_mps)
+        if command.v_mps == 0.0 and command.w_radps == 0.0 and stood_s > RECOVER_S:
+            command = Command(0.0, self._free_turn(plan))
+        return clipped(command, robot)
+
+    def _free_turn(self, plan: LocalPlan) -> float:
+        """Return the yaw rate towards the side with more room."""
+        bearings = np.array([0.6, -0.6])
+        ends = 1.0 * np.column_stack([np.cos(bearings), np.sin(bearings)])
+        left, right = self._costmap.distances(ends).tolist()
+        if left == right:
+            left = float(point_at(plan.points, 1.0)[1])
+            right = -left
+        return _TURN_RADPS if left >= right else -_TURN_RADPS

@@ -1,0 +1,92 @@
+"""Regulated pure pursuit: from a way to speed and yaw rate.
+
+The rules are those of the controller of Nav2 with this name, and their values are scaled to a
+robot of 1.5 m/s: look-ahead by the speed, slower in curves and near obstacles, a turn on the spot
+towards a way that starts sideways, and a stop before a predicted collision.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from cosim.core.geometry import Floats
+from cosim.core.state import Command
+from cosim.policies.nav.costmap import Costmap
+from cosim.policies.nav.local_plan import LocalPlan
+from cosim.policies.privileged.rollout import BodyDisks
+from cosim.spec.robot import Robot
+
+LOOK_AHEAD_S: Final = 0.8
+"""Look-ahead time in seconds."""
+LOOK_AHEAD_M: Final = (0.7, 1.4)
+"""Smallest and largest look-ahead distance in metres."""
+TURN_FIRST_RAD: Final = 0.785
+"""Bearing of the look-ahead point in radians beyond which the robot turns on the spot."""
+MIN_RADIUS_M: Final = 1.5
+"""Radius in metres below which the speed falls with the radius."""
+SLOWEST_MPS: Final = 0.25
+"""Lowest speed in m/s that curves and near obstacles lead to."""
+SLOW_WITHIN_M: Final = 0.45
+"""Distance from the robot's outline to an obstacle below which the speed falls, in metres."""
+BRAKE_MPS2: Final = 1.2
+"""Deceleration in m/s^2 before an obstacle."""
+STOP_SHORT_M: Final = 0.45
+"""Distance in metres from the robot's front to an obstacle at which it stops."""
+COLLISION_S: Final = 1.2
+"""Time in seconds over which the arc is checked for a collision."""
+
+
+def pursue(
+    plan: LocalPlan, costmap: Costmap, robot: Robot, v_mps: float, most_mps: float
+) -> Command:
+    """Return the command that follows a plan.
+
+    v_mps: current speed.
+    most_mps: limit of the speed.
+    """
+    look_m = float(np.clip(LOOK_AHEAD_S * v_mps, *LOOK_AHEAD_M))
+    x, y = point_at(plan.points, look_m).tolist()
+    bearing_rad = math.atan2(y, x)
+    room_m = plan.free_m - STOP_SHORT_M - robot.length_m / 2 if plan.blocked else math.inf
+    if room_m <= 0.0:
+        return Command(0.0, 0.0)
+    most_mps = min(most_mps, robot.cruise_mps, math.sqrt(2.0 * BRAKE_MPS2 * min(room_m, 100.0)))
+    if abs(bearing_rad) > TURN_FIRST_RAD:
+        return Command(0.0, math.copysign(robot.w_max_radps, bearing_rad))
+    curvature = 2.0 * y / max(x * x + y * y, 1e-6)
+    slow = min(1.0, 1.0 / max(abs(curvature) * MIN_RADIUS_M, 1e-6))
+    around_m = BodyDisks.of(robot).around_m
+    ahead = plan.points[: max(2, round(look_m / 0.25))]
+    gap_m = float(costmap.distances(ahead).min()) - robot.width_m / 2
+    slow *= float(np.clip(gap_m / SLOW_WITHIN_M, 0.0, 1.0))
+    v = max(SLOWEST_MPS, robot.cruise_mps * slow)
+    v = min(v, most_mps, robot.w_max_radps / max(abs(curvature), 1e-6))
+    free_m = _free_on_arc_m(curvature, max(v, 0.3) * COLLISION_S + 0.2, costmap, robot)
+    if free_m is not None:
+        v = min(v, math.sqrt(2.0 * BRAKE_MPS2 * max(free_m - 0.15, 0.0)))
+    del around_m
+    return Command(v, v * curvature)
+
+
+def point_at(points: Floats, s_m: float) -> Floats:
+    """Return the (2,) point of a way at an arc length, or its last one."""
+    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    return np.array([np.interp(s_m, lengths, points[:, axis]) for axis in (0, 1)])
+
+
+def _free_on_arc_m(
+    curvature: float, length_m: float, costmap: Costmap, robot: Robot
+) -> float | None:
+    """Return the length of an arc until the robot touches something; None if it does not."""
+    disks = BodyDisks.of(robot)
+    s_m = np.arange(0.1, length_m + 0.1, 0.1)
+    turn = curvature * s_m
+    straight = abs(curvature) < 1e-4
+    x = s_m if straight else np.sin(turn) / curvature
+    y = np.zeros_like(s_m) if straight else (1.0 - np.cos(turn)) / curvature
+    nose = np.column_stack([x + disks.nose_m * np.cos(turn), y + disks.nose_m * np.sin(turn)])
+    hits = costmap.distances(nose) < disks.radius_m
+    return float(s_m[np.argmax(hits)]) if hits.any() else None

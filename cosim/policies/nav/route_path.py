@@ -1,0 +1,71 @@
+"""The route ahead as a path in the robot's frame, from a goal."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from cosim.core.geometry import Floats
+from cosim.spec.goal import PATCH_M, PATCH_PX, Goal, PointGoal, RoutePatch
+
+STEP_M: Final = 0.25
+"""Distance of a path's points in metres."""
+_AHEAD_M: Final = 9.0
+"""Length of a path in metres."""
+_MARCH_M: Final = 0.5
+"""Step in metres along the pixels of a route patch."""
+_AROUND_M: Final = 1.1
+"""Distance in metres of the pixels that determine a point of the path."""
+_FEWEST_PX: Final = 3
+"""Number of pixels around a point below which the route has ended."""
+_SMOOTH: Final = 0.6
+"""Weight of the last direction in the direction of the next step."""
+
+
+def path_to(goal: Goal | None, direction_rad: float) -> Floats:
+    """Return the route ahead, (N, 2) metres in the robot's frame, at distances of STEP_M.
+
+    direction_rad: direction of the route beside the robot, in its frame.
+    Raises ValueError for a goal that is neither a route patch nor a point.
+    """
+    if isinstance(goal, RoutePatch):
+        return _spaced(_along_patch(goal, direction_rad))
+    if isinstance(goal, PointGoal):
+        return _spaced(np.array([(0.0, 0.0), (goal.x_m, goal.y_m)]))
+    raise ValueError("nav needs a goal of a route patch or a point: --goal route_patch")
+
+
+def _along_patch(patch: RoutePatch, direction_rad: float) -> Floats:
+    """Return (N, 2) points on the route of a patch, from the one beside the robot on."""
+    rows, columns = np.nonzero(patch.pixels)
+    middle = 0.5 * (PATCH_PX - 1)
+    on_route = PATCH_M * np.column_stack([middle - rows, middle - columns])
+    if not len(on_route):
+        return np.zeros((1, 2))
+    nearest = on_route[np.argmin((on_route * on_route).sum(axis=1))]
+    at = on_route[np.hypot(*(on_route - nearest).T) <= _AROUND_M].mean(axis=0)
+    way = np.array([math.cos(direction_rad), math.sin(direction_rad)])
+    at = at - (at @ way) * way
+    points = [at]
+    for _ in range(round(_AHEAD_M / _MARCH_M)):
+        ahead = at + _MARCH_M * way
+        offset = on_route - ahead
+        near = offset[(offset * offset).sum(axis=1) <= _AROUND_M**2]
+        if len(near) < _FEWEST_PX or (near @ way).max() < 0.0:
+            break
+        left = np.array([-way[1], way[0]])
+        after = ahead + float(near.mean(axis=0) @ left) * left
+        way = _SMOOTH * way + (1.0 - _SMOOTH) * (after - at) / np.hypot(*(after - at))
+        way /= np.hypot(*way)
+        at = after
+        points.append(at)
+    return np.array(points)
+
+
+def _spaced(points: Floats) -> Floats:
+    """Return a polyline (M, 2) at distances of STEP_M."""
+    s_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    at_m = np.arange(0.0, min(s_m[-1], _AHEAD_M) + 1e-9, STEP_M)
+    return np.column_stack([np.interp(at_m, s_m, points[:, axis]) for axis in (0, 1)])
