@@ -12,7 +12,7 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from cosim.policies.nav.costmap import Costmap
-from cosim.policies.nav.route_path import STEP_M
+from cosim.policies.nav.route_path import AHEAD_M, STEP_M
 
 _OFFSET_M: Final = 0.1
 """Distance of neighbouring offsets in metres."""
@@ -22,12 +22,20 @@ _MOST_CHANGE: Final = 2
 """Largest change between two stations, in offsets: 0.8 m a metre."""
 _OFFSET_COST: Final = 0.25
 """Cost of an offset of 1 m at a station."""
-_CHANGE_COST: Final = 0.5
+_OTHER_SIDE: Final = 1.6
+"""Factor of this cost on the side that the last plan did not choose."""
+_CHANGE_COST: Final = 0.12
 """Cost of a change by one offset, squared."""
+_END_COST: Final = 8.0
+"""Cost of an offset of 1 m at the end of the route."""
+_SHORT_M: Final = 1.0
+"""Length of a path in metres below which its end is approached directly."""
 _NEAR_COST: Final = 4.0
 """Cost of an obstacle in contact with the robot; it falls to 0 at COST_M from its outline."""
 COST_M: Final = 0.5
 """Distance from the robot's side beyond which obstacles cost nothing, in metres."""
+_ASIDE_M: Final = 0.3
+"""Offset in metres from which a plan has a side."""
 _BLOCKED: Final = 1e6
 
 
@@ -35,22 +43,29 @@ class LocalPlan(NamedTuple):
     """Way to follow.
 
     points: (N, 2) metres in the robot's frame, from the robot on.
+    side: 1 if the way passes something on the left of the route, -1 on the right, else 0.
     free_m: length of the way until it is blocked; the length of the way if it is not.
     """
 
     points: Floats
     free_m: float
     blocked: bool
+    side: int = 0
 
 
-def local_plan(path: Floats, costmap: Costmap, half_width_m: float, margin_m: float) -> LocalPlan:
+def local_plan(
+    path: Floats, costmap: Costmap, half_width_m: float, margin_m: float, side: int = 0
+) -> LocalPlan:
     """Return the cheapest way along a path.
 
     path: (N, 2) metres in the robot's frame, at distances of STEP_M.
     half_width_m: half of the robot's width.
     margin_m: least distance from the robot's side to an obstacle.
+    side: side of the last plan, which is kept if both are about equal.
     """
-    tangents = np.gradient(path, axis=0) if len(path) > 1 else np.array([(1.0, 0.0)])
+    if len(path) <= _SHORT_M / STEP_M:
+        return LocalPlan(np.array([(0.0, 0.0), path[-1]]), float(np.hypot(*path[-1])), False)
+    tangents = np.gradient(path, axis=0)
     tangents /= np.maximum(np.hypot(*tangents.T), 1e-9)[:, None]
     normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
     count = round(WIDEST_M / _OFFSET_M)
@@ -58,7 +73,10 @@ def local_plan(path: Floats, costmap: Costmap, half_width_m: float, margin_m: fl
     nodes = path[:, None] + offsets[None, :, None] * normals[:, None]
     gap_m = costmap.distances(nodes) - half_width_m
     near = np.clip(1.0 - gap_m / COST_M, 0.0, 1.0)
-    cost = _OFFSET_COST * np.abs(offsets) + _NEAR_COST * near * near
+    aside = np.where(side * offsets < 0.0, _OTHER_SIDE, 1.0) * np.abs(offsets)
+    cost = _OFFSET_COST * aside + _NEAR_COST * near * near
+    if len(path) < AHEAD_M / STEP_M:
+        cost[-1] += _END_COST * np.abs(offsets)
     cost = np.where(gap_m < margin_m, _BLOCKED, cost)
     start = int(np.clip(np.rint(float(-path[0] @ normals[0]) / _OFFSET_M), -count, count)) + count
     chosen = _cheapest(cost, start)
@@ -69,7 +87,9 @@ def local_plan(path: Floats, costmap: Costmap, half_width_m: float, margin_m: fl
     points[0] = 0.0
     lengths = np.hypot(*np.diff(points, axis=0).T)
     free_m = float(lengths[: max(stations - 1, 0)].sum())
-    return LocalPlan(points, free_m, bool(stations < len(path)))
+    widest = offsets[chosen[np.argmax(np.abs(offsets[chosen]))]]
+    turned = int(np.sign(widest)) if abs(widest) >= _ASIDE_M else 0
+    return LocalPlan(points, free_m, bool(stations < len(path)), turned)
 
 
 def _cheapest(cost: Floats, start: int) -> np.ndarray:

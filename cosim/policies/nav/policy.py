@@ -61,6 +61,7 @@ class Nav:
         self._costmap.clear()
         self._direction_rad = pose.heading_rad
         self._moved_s = time_s
+        self._side = 0
 
     def act(self, observation: Observation) -> Command:
         scan, odometry = observation.scan, observation.odometry
@@ -79,7 +80,8 @@ class Nav:
             self._moved_s = time_s
         stood_s = time_s - self._moved_s
         margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
-        plan = local_plan(path, self._costmap, robot.width_m / 2, margin_m)
+        plan = local_plan(path, self._costmap, robot.width_m / 2, margin_m, self._side)
+        self._side = plan.side
         command = pursue(plan, self._costmap, robot, observation.v_mps, robot.cruise_mps)
         if command.v_mps == 0.0 and command.w_radps == 0.0 and stood_s > RECOVER_S:
             command = Command(0.0, self._free_turn(plan))

@@ -12,12 +12,14 @@ from cosim.spec.goal import PATCH_M, PATCH_PX, Goal, PointGoal, RoutePatch
 
 STEP_M: Final = 0.25
 """Distance of a path's points in metres."""
-_AHEAD_M: Final = 9.0
+AHEAD_M: Final = 9.0
 """Length of a path in metres."""
 _MARCH_M: Final = 0.5
 """Step in metres along the pixels of a route patch."""
 _AROUND_M: Final = 1.1
 """Distance in metres of the pixels that determine a point of the path."""
+_BESIDE_M: Final = 2.0
+"""Distance in metres of the pixels that determine the direction of the route beside the robot."""
 _FEWEST_PX: Final = 3
 """Number of pixels around a point below which the route has ended."""
 _SMOOTH: Final = 0.6
@@ -45,11 +47,14 @@ def _along_patch(patch: RoutePatch, direction_rad: float) -> Floats:
     if not len(on_route):
         return np.zeros((1, 2))
     nearest = on_route[np.argmin((on_route * on_route).sum(axis=1))]
-    at = on_route[np.hypot(*(on_route - nearest).T) <= _AROUND_M].mean(axis=0)
-    way = np.array([math.cos(direction_rad), math.sin(direction_rad)])
+    beside = on_route[np.hypot(*(on_route - nearest).T) <= _BESIDE_M]
+    at = beside.mean(axis=0)
+    way = np.linalg.eigh(np.cov((beside - at).T))[1][:, -1]
+    if way @ (math.cos(direction_rad), math.sin(direction_rad)) < 0.0:
+        way = -way
     at = at - (at @ way) * way
     points = [at]
-    for _ in range(round(_AHEAD_M / _MARCH_M)):
+    for _ in range(round(AHEAD_M / _MARCH_M)):
         ahead = at + _MARCH_M * way
         offset = on_route - ahead
         near = offset[(offset * offset).sum(axis=1) <= _AROUND_M**2]
@@ -67,5 +72,5 @@ def _along_patch(patch: RoutePatch, direction_rad: float) -> Floats:
 def _spaced(points: Floats) -> Floats:
     """Return a polyline (M, 2) at distances of STEP_M."""
     s_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    at_m = np.arange(0.0, min(s_m[-1], _AHEAD_M) + 1e-9, STEP_M)
+    at_m = np.arange(0.0, min(s_m[-1], AHEAD_M) + 1e-9, STEP_M)
     return np.column_stack([np.interp(at_m, s_m, points[:, axis]) for axis in (0, 1)])
