@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from cosim.core.geometry import Floats, Pose
+from cosim.policies.nav.tracking import NO_MOVERS, Movers
 from cosim.spec.sensors import Scan
 
 CELL_M: Final = 0.1
@@ -24,6 +25,8 @@ _CLEARED_M: Final = 0.2
 """Distance in metres before a hit up to which a ray clears cells."""
 _OWN_M: Final = 0.1
 """Distance in metres of returns that are ignored."""
+_MOVER_M: Final = 0.45
+"""Distance in metres from a moving body within which returns are its own."""
 FREE_M: Final = 2.0
 """Largest distance to an obstacle that a query returns, in metres."""
 
@@ -45,8 +48,11 @@ class Costmap:
         self._pose = Pose(0.0, 0.0, 0.0)
         self._distance = np.full((_CELLS, _CELLS), FREE_M)
 
-    def update(self, scan: Scan, pose: Pose) -> None:
-        """Move to a pose in the frame of the odometry, and take a scan from there."""
+    def update(self, scan: Scan, pose: Pose, movers: Movers = NO_MOVERS) -> None:
+        """Move to a pose in the frame of the odometry, and take a scan from there.
+
+        movers: bodies whose returns are not marked.
+        """
         self._move(pose)
         ranges = scan.ranges_m[0].astype(float)
         spec = scan.spec
@@ -56,6 +62,10 @@ class Costmap:
         passed = self._radius < (seen_m - _CLEARED_M)[ray]
         self._occupied &= ~passed
         hit = np.isfinite(ranges) & (ranges > _OWN_M)
+        for x_m, y_m in movers.at.tolist():
+            ahead = seen_m * np.cos(spec.angles_rad) - x_m
+            left = seen_m * np.sin(spec.angles_rad) - y_m
+            hit &= ahead * ahead + left * left > _MOVER_M**2
         heading = spec.angles_rad[hit] + pose.heading_rad
         x = ranges[hit] * np.cos(heading) + pose.x_m
         y = ranges[hit] * np.sin(heading) + pose.y_m

@@ -13,6 +13,7 @@ import numpy as np
 from cosim.core.geometry import Floats
 from cosim.policies.nav.costmap import Costmap
 from cosim.policies.nav.route_path import AHEAD_M, STEP_M
+from cosim.policies.nav.tracking import NO_MOVERS, Movers
 
 _OFFSET_M: Final = 0.1
 """Distance of neighbouring offsets in metres."""
@@ -22,6 +23,8 @@ _MOST_CHANGE: Final = 2
 """Largest change between two stations, in offsets: 0.8 m a metre."""
 _OFFSET_COST: Final = 0.25
 """Cost of an offset of 1 m at a station."""
+_FAR_COST: Final = 0.4
+"""Additional cost of an offset of 1 m, with its square: the sidewalk ends somewhere."""
 _OTHER_SIDE: Final = 1.6
 """Factor of this cost on the side that the last plan did not choose."""
 _CHANGE_COST: Final = 0.12
@@ -30,10 +33,16 @@ _END_COST: Final = 8.0
 """Cost of an offset of 1 m at the end of the route."""
 _SHORT_M: Final = 1.0
 """Length of a path in metres below which its end is approached directly."""
-_NEAR_COST: Final = 4.0
+_NEAR_COST: Final = 2.5
 """Cost of an obstacle in contact with the robot; it falls to 0 at COST_M from its outline."""
-COST_M: Final = 0.5
+COST_M: Final = 0.4
 """Distance from the robot's side beyond which obstacles cost nothing, in metres."""
+_FORESEEN_S: Final = 3.0
+"""Time in seconds for which moving bodies are predicted."""
+_MOVER_MARGIN_M: Final = 0.15
+"""Distance in metres to moving bodies in addition to that of others."""
+_SLOWEST_MPS: Final = 0.7
+"""Lowest speed in m/s of the robot for these predictions."""
 _ASIDE_M: Final = 0.3
 """Offset in metres from which a plan has a side."""
 _BLOCKED: Final = 1e6
@@ -54,7 +63,13 @@ class LocalPlan(NamedTuple):
 
 
 def local_plan(
-    path: Floats, costmap: Costmap, half_width_m: float, margin_m: float, side: int = 0
+    path: Floats,
+    costmap: Costmap,
+    half_width_m: float,
+    margin_m: float,
+    side: int = 0,
+    movers: Movers = NO_MOVERS,
+    v_mps: float = 1.0,
 ) -> LocalPlan:
     """Return the cheapest way along a path.
 
@@ -62,6 +77,8 @@ def local_plan(
     half_width_m: half of the robot's width.
     margin_m: least distance from the robot's side to an obstacle.
     side: side of the last plan, which is kept if both are about equal.
+    movers: moving bodies; each is where it will be when the robot arrives.
+    v_mps: speed of the robot.
     """
     if len(path) <= _SHORT_M / STEP_M:
         return LocalPlan(np.array([(0.0, 0.0), path[-1]]), float(np.hypot(*path[-1])), False)
@@ -72,9 +89,13 @@ def local_plan(
     offsets = _OFFSET_M * np.arange(-count, count + 1)
     nodes = path[:, None] + offsets[None, :, None] * normals[:, None]
     gap_m = costmap.distances(nodes) - half_width_m
+    times_s = STEP_M * np.arange(len(path)) / max(v_mps, _SLOWEST_MPS)
+    moving_m = movers.gaps_m(nodes, np.minimum(times_s, _FORESEEN_S)) - half_width_m
+    moving_m[times_s > _FORESEEN_S] = np.inf
+    gap_m = np.minimum(gap_m, np.maximum(moving_m - _MOVER_MARGIN_M, margin_m))
     near = np.clip(1.0 - gap_m / COST_M, 0.0, 1.0)
     aside = np.where(side * offsets < 0.0, _OTHER_SIDE, 1.0) * np.abs(offsets)
-    cost = _OFFSET_COST * aside + _NEAR_COST * near * near
+    cost = _OFFSET_COST * aside + _FAR_COST * offsets * offsets + _NEAR_COST * near * near
     if len(path) < AHEAD_M / STEP_M:
         cost[-1] += _END_COST * np.abs(offsets)
     cost = np.where(gap_m < margin_m, _BLOCKED, cost)
@@ -97,15 +118,17 @@ def _cheapest(cost: Floats, start: int) -> np.ndarray:
     stations, count = cost.shape
     changes = np.arange(-_MOST_CHANGE, _MOST_CHANGE + 1)
     change_cost = _CHANGE_COST * changes**2
-    best = np.full(count, np.inf)
+    padded = np.full(count + 2 * _MOST_CHANGE, np.inf)
+    best = padded[_MOST_CHANGE : _MOST_CHANGE + count]
     best[start] = 0.0
+    from_each = np.lib.stride_tricks.sliding_window_view(padded, len(changes))
+    total = np.empty(from_each.shape)
     came = np.zeros((stations, count), dtype=int)
+    rows = np.arange(count)
     for k in range(1, stations):
-        padded = np.pad(best, _MOST_CHANGE, constant_values=np.inf)
-        from_each = np.lib.stride_tricks.sliding_window_view(padded, 2 * _MOST_CHANGE + 1)
-        total = from_each + change_cost
-        came[k] = np.argmin(total, axis=1)
-        best = total[np.arange(count), came[k]] + cost[k]
+        np.add(from_each, change_cost, out=total)
+        total.argmin(axis=1, out=came[k])
+        best[:] = total[rows, came[k]] + cost[k]
     chosen = np.zeros(stations, dtype=int)
     chosen[-1] = int(np.argmin(best))
     for k in range(stations - 1, 0, -1):

@@ -17,14 +17,15 @@ from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation
 from cosim.policies.nav.costmap import Costmap
 from cosim.policies.nav.local_plan import LocalPlan, local_plan
-from cosim.policies.nav.pursuit import point_at, pursue
+from cosim.policies.nav.pursuit import point_at, pursue, safe_speed
 from cosim.policies.nav.route_path import path_to
+from cosim.policies.nav.tracking import Tracker
 from cosim.spec.manifest import Manifest
 from cosim.spec.sensors import ScanSpec
 
-MARGIN_M: Final = 0.08
+MARGIN_M: Final = 0.12
 """Least planned distance from the robot's side to an obstacle, in metres."""
-TIGHT_M: Final = 0.02
+TIGHT_M: Final = 0.05
 """The same after PATIENCE_S without motion."""
 PATIENCE_S: Final = 3.0
 """Time in seconds without motion after which the robot accepts smaller gaps."""
@@ -51,6 +52,7 @@ class Nav:
 
     def __init__(self) -> None:
         self._costmap = Costmap()
+        self._tracker = Tracker()
         self.reset("", 0)
 
     def reset(self, episode_id: str, seed: int) -> None:
@@ -59,6 +61,7 @@ class Nav:
     def _begin(self, time_s: float, pose: Pose) -> None:
         """Forget the past: the robot is at rest, and heads along the route."""
         self._costmap.clear()
+        self._tracker.clear()
         self._direction_rad = pose.heading_rad
         self._moved_s = time_s
         self._side = 0
@@ -71,7 +74,9 @@ class Nav:
         pose = Pose(odometry.x_m, odometry.y_m, odometry.heading_rad)
         if observation.reset or observation.tick == 0:
             self._begin(time_s, pose)
-        self._costmap.update(scan, pose)
+        self._tracker.update(scan, pose, time_s)
+        movers = self._tracker.movers(pose)
+        self._costmap.update(scan, pose, movers)
         path = path_to(observation.goal, wrap_angle(self._direction_rad - pose.heading_rad))
         if len(path) > 2:
             ahead = path[2] - path[0]
@@ -80,9 +85,13 @@ class Nav:
             self._moved_s = time_s
         stood_s = time_s - self._moved_s
         margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
-        plan = local_plan(path, self._costmap, robot.width_m / 2, margin_m, self._side)
+        v_mps = observation.v_mps
+        plan = local_plan(
+            path, self._costmap, robot.width_m / 2, margin_m, self._side, movers, v_mps
+        )
         self._side = plan.side
-        command = pursue(plan, self._costmap, robot, observation.v_mps, robot.cruise_mps)
+        safe_mps = safe_speed(plan, movers, robot, v_mps)
+        command = pursue(plan, self._costmap, robot, v_mps, safe_mps)
         if command.v_mps == 0.0 and command.w_radps == 0.0 and stood_s > RECOVER_S:
             command = Command(0.0, self._free_turn(plan))
         return clipped(command, robot)

@@ -16,6 +16,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import Command
 from cosim.policies.nav.costmap import Costmap
 from cosim.policies.nav.local_plan import LocalPlan
+from cosim.policies.nav.tracking import Movers
 from cosim.policies.privileged.rollout import BodyDisks
 from cosim.spec.robot import Robot
 
@@ -35,6 +36,12 @@ BRAKE_MPS2: Final = 1.2
 """Deceleration in m/s^2 before an obstacle."""
 STOP_SHORT_M: Final = 0.45
 """Distance in metres from the robot's front to an obstacle at which it stops."""
+FORESEEN_S: Final = 2.5
+"""Time in seconds for which moving bodies are predicted."""
+MOVER_GAP_M: Final = 0.2
+"""Least predicted distance in metres from the robot's disks to a moving body."""
+_SPEEDS: Final = np.array([1.0, 2.0 / 3.0, 1.0 / 3.0, 0.0])
+"""Speeds to compare, as shares of the travelling speed."""
 COLLISION_S: Final = 1.2
 """Time in seconds over which the arc is checked for a collision."""
 
@@ -58,7 +65,6 @@ def pursue(
         return Command(0.0, math.copysign(robot.w_max_radps, bearing_rad))
     curvature = 2.0 * y / max(x * x + y * y, 1e-6)
     slow = min(1.0, 1.0 / max(abs(curvature) * MIN_RADIUS_M, 1e-6))
-    around_m = BodyDisks.of(robot).around_m
     ahead = plan.points[: max(2, round(look_m / 0.25))]
     gap_m = float(costmap.distances(ahead).min()) - robot.width_m / 2
     slow *= float(np.clip(gap_m / SLOW_WITHIN_M, 0.0, 1.0))
@@ -67,14 +73,37 @@ def pursue(
     free_m = _free_on_arc_m(curvature, max(v, 0.3) * COLLISION_S + 0.2, costmap, robot)
     if free_m is not None:
         v = min(v, math.sqrt(2.0 * BRAKE_MPS2 * max(free_m - 0.15, 0.0)))
-    del around_m
     return Command(v, v * curvature)
+
+
+def safe_speed(plan: LocalPlan, movers: Movers, robot: Robot, v_mps: float) -> float:
+    """Return the highest of a few speeds at which no moving body is met; 0 if none is safe.
+
+    v_mps: current speed, from which the robot brakes or accelerates.
+    """
+    if not len(movers.at):
+        return robot.cruise_mps
+    speeds = robot.cruise_mps * _SPEEDS
+    times_s = np.arange(0.1, FORESEEN_S + 0.05, 0.1)
+    change_mps = np.clip(
+        speeds[:, None] - v_mps, -BRAKE_MPS2 * times_s, robot.acceleration_mps2 * times_s
+    )
+    driven_m = np.cumsum(v_mps + change_mps, axis=1) * 0.1
+    points = points_at(plan.points, driven_m.T)
+    gaps_m = movers.gaps_m(points, times_s) - BodyDisks.of(robot).radius_m
+    safe = gaps_m.min(axis=0) > MOVER_GAP_M
+    return float(speeds[np.argmax(safe)]) if safe.any() else 0.0
+
+
+def points_at(points: Floats, s_m: Floats) -> Floats:
+    """Return the (..., 2) points of a way at arc lengths; beyond its end straight on."""
+    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    return np.stack([np.interp(s_m, lengths, points[:, axis]) for axis in (0, 1)], axis=-1)
 
 
 def point_at(points: Floats, s_m: float) -> Floats:
     """Return the (2,) point of a way at an arc length, or its last one."""
-    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    return np.array([np.interp(s_m, lengths, points[:, axis]) for axis in (0, 1)])
+    return points_at(points, np.array(s_m))
 
 
 def _free_on_arc_m(
