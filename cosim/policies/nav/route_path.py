@@ -12,12 +12,16 @@ from cosim.spec.goal import PATCH_M, PATCH_PX, Goal, PointGoal, RoutePatch
 
 STEP_M: Final = 0.25
 """Distance of a path's points in metres."""
-AHEAD_M: Final = 9.0
+AHEAD_M: Final = 7.0
 """Length of a path in metres."""
 _MARCH_M: Final = 0.5
 """Step in metres along the pixels of a route patch."""
 _AROUND_M: Final = 1.1
 """Distance in metres of the pixels that determine a point of the path."""
+_TURN_M: Final = 1.8
+"""Distance in metres within which a route that ends ahead may go on aside."""
+_PASSED_M: Final = 0.75
+"""Distance in metres from the path within which pixels are those of the path so far."""
 _BESIDE_M: Final = 2.0
 """Distance in metres of the pixels that determine the direction of the route beside the robot."""
 _FEWEST_PX: Final = 3
@@ -59,7 +63,11 @@ def _along_patch(patch: RoutePatch, direction_rad: float) -> Floats:
         offset = on_route - ahead
         near = offset[(offset * offset).sum(axis=1) <= _AROUND_M**2]
         if len(near) < _FEWEST_PX or (near @ way).max() < 0.0:
-            break
+            turned = _turned(on_route, np.array(points))
+            if turned is None:
+                break
+            way = turned
+            continue
         left = np.array([-way[1], way[0]])
         after = ahead + float(near.mean(axis=0) @ left) * left
         way = _SMOOTH * way + (1.0 - _SMOOTH) * (after - at) / np.hypot(*(after - at))
@@ -67,6 +75,22 @@ def _along_patch(patch: RoutePatch, direction_rad: float) -> Floats:
         at = after
         points.append(at)
     return np.array(points)
+
+
+def _turned(on_route: Floats, points: Floats) -> Floats | None:
+    """Return the direction (2,) of a sharp turn at the last point; None at the end of the route.
+
+    on_route: (M, 2) pixels on the route.
+    points: (N, 2) points of the path so far.
+    """
+    to = on_route - points[-1]
+    there = on_route[np.hypot(*to.T) <= _TURN_M]
+    off = np.hypot(*np.moveaxis(there[:, None] - points, -1, 0)).min(axis=1, initial=np.inf)
+    new = there[off > _PASSED_M]
+    if len(new) < _FEWEST_PX:
+        return None
+    way: Floats = new.mean(axis=0) - points[-1]
+    return way / max(float(np.hypot(*way)), 1e-9)
 
 
 def _spaced(points: Floats) -> Floats:
