@@ -102,7 +102,7 @@ def test_the_path_follows_the_route_of_a_patch_to_its_end() -> None:
             np.where(in_map[:, 0] <= 3.3, np.abs(in_map[:, 1]), np.inf), np.abs(in_map[:, 0] - 3.0)
         )
         assert off.max() < 0.4 and np.hypot(*(in_map[-1] - route[-1])) < 0.6
-        assert np.hypot(*np.diff(path, axis=0).T) == pytest.approx(STEP_M, abs=0.03)
+        assert np.hypot(*np.diff(path, axis=0).T) == pytest.approx(STEP_M, abs=0.08)
 
 
 def test_a_point_is_approached_straight_and_other_goals_are_refused() -> None:

@@ -43,6 +43,8 @@ _MOVER_MARGIN_M: Final = 0.15
 """Distance in metres to moving bodies in addition to that of others."""
 _SLOWEST_MPS: Final = 0.7
 """Lowest speed in m/s of the robot for these predictions."""
+_LEAVES_M: Final = 0.05
+"""Distance in metres by which a robot may come nearer to an obstacle that it has to leave."""
 _ASIDE_M: Final = 0.3
 """Offset in metres from which a plan has a side."""
 _BLOCKED: Final = 1e6
@@ -75,7 +77,8 @@ def local_plan(
 
     path: (N, 2) metres in the robot's frame, at distances of STEP_M.
     half_width_m: half of the robot's width.
-    margin_m: least distance from the robot's side to an obstacle.
+    margin_m: least distance from the robot's side to an obstacle; where the robot is nearer, it may
+        stay as near as it is.
     side: side of the last plan, which is kept if both are about equal.
     movers: moving bodies; each is where it will be when the robot arrives.
     v_mps: speed of the robot.
@@ -89,6 +92,8 @@ def local_plan(
     offsets = _OFFSET_M * np.arange(-count, count + 1)
     nodes = path[:, None] + offsets[None, :, None] * normals[:, None]
     gap_m = costmap.distances(nodes) - half_width_m
+    own_m = float(costmap.distances(np.zeros(2))) - half_width_m
+    margin_m = min(margin_m, max(own_m - _LEAVES_M, 0.0))
     times_s = STEP_M * np.arange(len(path)) / max(v_mps, _SLOWEST_MPS)
     moving_m = movers.gaps_m(nodes, np.minimum(times_s, _FORESEEN_S)) - half_width_m
     moving_m[times_s > _FORESEEN_S] = np.inf

@@ -40,8 +40,12 @@ FORESEEN_S: Final = 2.5
 """Time in seconds for which moving bodies are predicted."""
 MOVER_GAP_M: Final = 0.2
 """Least predicted distance in metres from the robot's disks to a moving body."""
+_IMPATIENT: Final = 0.5
+"""Share of this time and distance that counts after waiting for long."""
 _SPEEDS: Final = np.array([1.0, 2.0 / 3.0, 1.0 / 3.0, 0.0])
 """Speeds to compare, as shares of the travelling speed."""
+_LEAVES_M: Final = 0.05
+"""Distance in metres by which a robot may come nearer to an obstacle that it has to leave."""
 COLLISION_S: Final = 1.2
 """Time in seconds over which the arc is checked for a collision."""
 
@@ -76,22 +80,24 @@ def pursue(
     return Command(v, v * curvature)
 
 
-def safe_speed(plan: LocalPlan, movers: Movers, robot: Robot, v_mps: float) -> float:
+def safe_speed(plan: LocalPlan, movers: Movers, robot: Robot, v_mps: float, patient: bool) -> float:
     """Return the highest of a few speeds at which no moving body is met; 0 if none is safe.
 
     v_mps: current speed, from which the robot brakes or accelerates.
+    patient: False after waiting for long: then less time and smaller gaps count.
     """
     if not len(movers.at):
         return robot.cruise_mps
     speeds = robot.cruise_mps * _SPEEDS
-    times_s = np.arange(0.1, FORESEEN_S + 0.05, 0.1)
+    share = 1.0 if patient else _IMPATIENT
+    times_s = np.arange(0.1, share * FORESEEN_S + 0.05, 0.1)
     change_mps = np.clip(
         speeds[:, None] - v_mps, -BRAKE_MPS2 * times_s, robot.acceleration_mps2 * times_s
     )
     driven_m = np.cumsum(v_mps + change_mps, axis=1) * 0.1
     points = points_at(plan.points, driven_m.T)
     gaps_m = movers.gaps_m(points, times_s) - BodyDisks.of(robot).radius_m
-    safe = gaps_m.min(axis=0) > MOVER_GAP_M
+    safe = gaps_m.min(axis=0) > share * MOVER_GAP_M
     return float(speeds[np.argmax(safe)]) if safe.any() else 0.0
 
 
@@ -116,6 +122,9 @@ def _free_on_arc_m(
     straight = abs(curvature) < 1e-4
     x = s_m if straight else np.sin(turn) / curvature
     y = np.zeros_like(s_m) if straight else (1.0 - np.cos(turn)) / curvature
-    nose = np.column_stack([x + disks.nose_m * np.cos(turn), y + disks.nose_m * np.sin(turn)])
-    hits = costmap.distances(nose) < disks.radius_m
+    ends = disks.nose_m * np.array([1.0, -1.0])
+    centres = np.stack([x + ends[:, None] * np.cos(turn), y + ends[:, None] * np.sin(turn)], -1)
+    now_m = costmap.distances(np.column_stack([ends, np.zeros(2)]))
+    least_m = np.minimum(disks.radius_m, now_m - _LEAVES_M)
+    hits = (costmap.distances(centres) < least_m[:, None]).any(axis=0)
     return float(s_m[np.argmax(hits)]) if hits.any() else None

@@ -26,15 +26,15 @@ _MATCH_M: Final = 0.5
 """Largest distance in metres between a track and its body in the next scan."""
 _GAIN_POSITION: Final = 0.5
 """Gain of the filter of a track on its position."""
-_GAIN_VELOCITY: Final = 0.25
+_GAIN_VELOCITY: Final = 0.35
 """Gain of the filter of a track on its velocity."""
-_SCANS: Final = 4
+_SCANS: Final = 3
 """Number of scans from which a track has a velocity."""
 _MISSED: Final = 3
 """Number of scans without its body after which a track ends."""
 _MOVES_MPS: Final = 0.35
 """Speed in m/s from which a body moves."""
-_MOVED_M: Final = 0.25
+_MOVED_M: Final = 0.15
 """Distance in metres from its first place from which a body moves."""
 _FASTEST_MPS: Final = 4.0
 """Largest speed of a track in m/s."""
@@ -168,8 +168,8 @@ def bodies_in(scan: Scan, pose: Pose) -> Floats:
     heading = scan.spec.angles_rad[rays] + pose.heading_rad
     unit = np.column_stack([np.cos(heading), np.sin(heading)])
     points = ranges[rays][:, None] * unit + pose.xy
-    starts = np.flatnonzero(np.hypot(*np.diff(points, axis=0).T) > _BREAK_M) + 1
-    starts = np.concatenate([[0], starts])
+    apart = (np.hypot(*np.diff(points, axis=0).T) > _BREAK_M) | (np.diff(rays) > 1)
+    starts = np.concatenate([[0], np.flatnonzero(apart) + 1])
     ends = np.concatenate([starts[1:], [len(rays)]])
     count = (ends - starts)[:, None]
     middle = np.add.reduceat(points + _SURFACE_M * unit, starts) / count
