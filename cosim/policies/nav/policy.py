@@ -29,8 +29,9 @@ TIGHT_M: Final = 0.05
 """The same after PATIENCE_S without motion."""
 PATIENCE_S: Final = 3.0
 """Time in seconds without motion after which the robot accepts smaller gaps."""
-RECOVER_S: Final = 4.5
-"""Time in seconds without motion after which the robot turns slowly towards the free side."""
+RECOVER_S: Final = 6.0
+"""Time in seconds without motion after which the robot turns slowly towards the free side, and
+accepts smaller gaps to moving bodies."""
 _TURN_RADPS: Final = 0.3
 """Yaw rate of this turn in rad/s."""
 _STANDS_MPS: Final = 0.05
@@ -84,14 +85,13 @@ class Nav:
         if observation.v_mps > _STANDS_MPS:
             self._moved_s = time_s
         stood_s = time_s - self._moved_s
-        patient = stood_s < PATIENCE_S
-        margin_m = MARGIN_M if patient else TIGHT_M
+        margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
         v_mps = observation.v_mps
         plan = local_plan(
             path, self._costmap, robot.width_m / 2, margin_m, self._side, movers, v_mps
         )
         self._side = plan.side
-        safe_mps = safe_speed(plan, movers, robot, v_mps, patient)
+        safe_mps = safe_speed(plan, movers, robot, v_mps, stood_s < RECOVER_S)
         command = pursue(plan, self._costmap, robot, v_mps, safe_mps)
         if command.v_mps == 0.0 and command.w_radps == 0.0 and stood_s > RECOVER_S:
             command = Command(0.0, self._free_turn(plan))
