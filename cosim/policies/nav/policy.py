@@ -25,17 +25,17 @@ from cosim.spec.sensors import ScanSpec
 
 MARGIN_M: Final = 0.12
 """Least planned distance from the robot's side to an obstacle, in metres."""
-TIGHT_M: Final = 0.05
+TIGHT_M: Final = 0.08
 """The same after PATIENCE_S without motion."""
 PATIENCE_S: Final = 3.0
 """Time in seconds without motion after which the robot accepts smaller gaps."""
-RECOVER_S: Final = 6.0
+RECOVER_S: Final = 7.5
 """Time in seconds without motion after which the robot turns slowly towards the free side, and
 accepts smaller gaps to moving bodies."""
 _TURN_RADPS: Final = 0.3
 """Yaw rate of this turn in rad/s."""
-_STANDS_MPS: Final = 0.05
-"""Speed in m/s below which the robot counts as standing."""
+_MOVED_M: Final = 0.5
+"""Distance in metres below which the robot counts as standing."""
 
 
 class Nav:
@@ -64,7 +64,7 @@ class Nav:
         self._costmap.clear()
         self._tracker.clear()
         self._direction_rad = pose.heading_rad
-        self._moved_s = time_s
+        self._held_at, self._held_s = pose.xy, time_s
         self._side = 0
 
     def act(self, observation: Observation) -> Command:
@@ -82,9 +82,9 @@ class Nav:
         if len(path) > 2:
             ahead = path[2] - path[0]
             self._direction_rad = pose.heading_rad + math.atan2(ahead[1], ahead[0])
-        if observation.v_mps > _STANDS_MPS:
-            self._moved_s = time_s
-        stood_s = time_s - self._moved_s
+        if math.hypot(*(pose.xy - self._held_at)) > _MOVED_M:
+            self._held_at, self._held_s = pose.xy, time_s
+        stood_s = time_s - self._held_s
         margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
         v_mps = observation.v_mps
         plan = local_plan(
