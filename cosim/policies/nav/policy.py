@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from cosim.core.geometry import Pose, wrap_angle
-from cosim.core.state import Command
+from cosim.core.geometry import Floats, Pose, wrap_angle
+from cosim.core.state import STILL, Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation
 from cosim.policies.nav.costmap import Costmap
@@ -32,6 +32,13 @@ PATIENCE_S: Final = 3.0
 RECOVER_S: Final = 7.5
 """Time in seconds without motion after which the robot turns slowly towards the free side, and
 accepts smaller gaps to moving bodies."""
+HOLD_S: Final = 4.5
+"""Time in seconds for which the robot stands still after it stopped for a person who is before it:
+turned on the spot, its corners would touch the person."""
+_BEFORE_M: Final = 1.7
+"""Distance in metres of a person who is before the robot."""
+_BEFORE_RAD: Final = 1.3
+"""Largest bearing in radians of such a person."""
 _TURN_RADPS: Final = 0.3
 """Yaw rate of this turn in rad/s."""
 _MOVED_M: Final = 0.5
@@ -66,6 +73,7 @@ class Nav:
         self._direction_rad = pose.heading_rad
         self._held_at, self._held_s = pose.xy, time_s
         self._side = 0
+        self._yielded_s = -math.inf
 
     def act(self, observation: Observation) -> Command:
         scan, odometry = observation.scan, observation.odometry
@@ -93,7 +101,11 @@ class Nav:
         self._side = plan.side
         safe_mps = safe_speed(plan, movers, robot, v_mps, stood_s < RECOVER_S)
         command = pursue(plan, self._costmap, robot, v_mps, safe_mps)
-        if command.v_mps == 0.0 and command.w_radps == 0.0 and stood_s > RECOVER_S:
+        if safe_mps == 0.0:
+            self._yielded_s = time_s
+        if time_s - self._yielded_s < HOLD_S and _before(self._tracker.walkers(pose)):
+            command = STILL
+        if command == STILL and stood_s > RECOVER_S:
             command = Command(0.0, self._free_turn(plan))
         return clipped(command, robot)
 
@@ -106,3 +118,9 @@ class Nav:
             left = float(point_at(plan.points, 1.0)[1])
             right = -left
         return _TURN_RADPS if left >= right else -_TURN_RADPS
+
+
+def _before(walkers: Floats) -> bool:
+    """Return whether one of (N, 2) people, metres in the robot's frame, is before the robot."""
+    near = np.hypot(*walkers.T) < _BEFORE_M
+    return bool((near & (np.abs(np.arctan2(walkers[:, 1], walkers[:, 0])) < _BEFORE_RAD)).any())

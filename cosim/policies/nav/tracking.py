@@ -36,6 +36,8 @@ _MOVES_MPS: Final = 0.35
 """Speed in m/s from which a body moves."""
 _MOVED_M: Final = 0.15
 """Distance in metres from its first place from which a body moves."""
+_WALKED_M: Final = 0.6
+"""Distance in metres from its first place from which a body has walked."""
 _FASTEST_MPS: Final = 4.0
 """Largest speed of a track in m/s."""
 
@@ -137,9 +139,20 @@ class Tracker:
         speed = np.hypot(*tracks.velocity.T)
         moves = (tracks.scans >= _SCANS) & (speed > _MOVES_MPS) & (speed < _FASTEST_MPS)
         moves &= np.hypot(*(tracks.at - tracks.first).T) > _MOVED_M
-        cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-        turn = np.array([[cos, -sin], [sin, cos]])
+        turn = _into_frame(pose)
         return Movers((tracks.at[moves] - pose.xy) @ turn, tracks.velocity[moves] @ turn)
+
+    def walkers(self, pose: Pose) -> Floats:
+        """Return the places (N, 2) of bodies that have walked, also of those that stand now."""
+        tracks = self._tracks
+        walked = np.hypot(*(tracks.at - tracks.first).T) > _WALKED_M
+        return (tracks.at[walked] - pose.xy) @ _into_frame(pose)
+
+
+def _into_frame(pose: Pose) -> Floats:
+    """Return the (2, 2) matrix that turns rows into the frame of a robot at a pose."""
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 def _matched(expected: Floats, bodies: Floats, scans: NDArray[np.int64]) -> NDArray[np.int64]:
