@@ -17,10 +17,11 @@ from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation
 from cosim.policies.nav.costmap import Costmap
 from cosim.policies.nav.local_plan import LocalPlan, local_plan
-from cosim.policies.nav.pursuit import point_at, pursue, safe_speed
+from cosim.policies.nav.pursuit import can_turn, point_at, pursue, safe_speed
 from cosim.policies.nav.route_path import path_to
 from cosim.policies.nav.tracking import Tracker
 from cosim.spec.manifest import Manifest
+from cosim.spec.robot import Robot
 from cosim.spec.sensors import ScanSpec
 
 MARGIN_M: Final = 0.12
@@ -106,18 +107,16 @@ class Nav:
         if time_s - self._yielded_s < HOLD_S and _before(self._tracker.walkers(pose)):
             command = STILL
         if command == STILL and stood_s > RECOVER_S:
-            command = Command(0.0, self._free_turn(plan))
+            command = self._free_turn(plan, robot)
         return clipped(command, robot)
 
-    def _free_turn(self, plan: LocalPlan) -> float:
-        """Return the yaw rate towards the side with more room."""
-        bearings = np.array([0.6, -0.6])
-        ends = 1.0 * np.column_stack([np.cos(bearings), np.sin(bearings)])
-        left, right = self._costmap.distances(ends).tolist()
-        if left == right:
-            left = float(point_at(plan.points, 1.0)[1])
-            right = -left
-        return _TURN_RADPS if left >= right else -_TURN_RADPS
+    def _free_turn(self, plan: LocalPlan, robot: Robot) -> Command:
+        """Return a slow turn towards the plan, or to the other side; none without room."""
+        first = math.copysign(_TURN_RADPS, float(point_at(plan.points, 1.0)[1]))
+        for w_radps in (first, -first):
+            if can_turn(self._costmap, robot, w_radps):
+                return Command(0.0, w_radps)
+        return STILL
 
 
 def _before(walkers: Floats) -> bool:

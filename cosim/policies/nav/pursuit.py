@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from cosim.core.geometry import Floats
-from cosim.core.state import Command
+from cosim.core.state import STILL, Command
 from cosim.policies.nav.costmap import Costmap
-from cosim.policies.nav.local_plan import LocalPlan
+from cosim.policies.nav.local_plan import LEAST_M, LocalPlan
 from cosim.policies.nav.tracking import Movers
 from cosim.policies.privileged.rollout import BodyDisks
 from cosim.spec.robot import Robot
@@ -40,12 +40,14 @@ FORESEEN_S: Final = 2.5
 """Time in seconds for which moving bodies are predicted."""
 MOVER_GAP_M: Final = 0.2
 """Least predicted distance in metres from the robot's disks to a moving body."""
+_TURN_RAD: Final = 0.15
+"""Step in radians at which turns on the spot are checked."""
+_CORNER_M: Final = 0.12
+"""Least distance in metres of a corner to an obstacle in such a turn."""
 _IMPATIENT: Final = 0.5
 """Share of this time and distance that counts after waiting for long."""
 _SPEEDS: Final = np.array([1.0, 2.0 / 3.0, 1.0 / 3.0, 0.0])
 """Speeds to compare, as shares of the travelling speed."""
-_LEAVES_M: Final = 0.05
-"""Distance in metres by which a robot may come nearer to an obstacle that it has to leave."""
 COLLISION_S: Final = 1.2
 """Time in seconds over which the arc is checked for a collision."""
 
@@ -63,10 +65,11 @@ def pursue(
     bearing_rad = math.atan2(y, x)
     room_m = plan.free_m - STOP_SHORT_M - robot.length_m / 2 if plan.blocked else math.inf
     if room_m <= 0.0:
-        return Command(0.0, 0.0)
+        return STILL
     most_mps = min(most_mps, robot.cruise_mps, math.sqrt(2.0 * BRAKE_MPS2 * min(room_m, 100.0)))
     if abs(bearing_rad) > TURN_FIRST_RAD:
-        return Command(0.0, math.copysign(robot.w_max_radps, bearing_rad))
+        w_radps = math.copysign(robot.w_max_radps, bearing_rad)
+        return Command(0.0, w_radps) if can_turn(costmap, robot, w_radps) else STILL
     curvature = 2.0 * y / max(x * x + y * y, 1e-6)
     slow = min(1.0, 1.0 / max(abs(curvature) * MIN_RADIUS_M, 1e-6))
     ahead = plan.points[: max(2, round(look_m / 0.25))]
@@ -78,6 +81,18 @@ def pursue(
     if free_m is not None:
         v = min(v, math.sqrt(2.0 * BRAKE_MPS2 * max(free_m - 0.15, 0.0)))
     return Command(v, v * curvature)
+
+
+def can_turn(costmap: Costmap, robot: Robot, w_radps: float) -> bool:
+    """Return whether the corners of the robot stay clear in a turn on the spot to this side."""
+    ahead, aside = robot.length_m / 2, robot.width_m / 2
+    corners = np.array([(ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside)])
+    turn_rad = math.copysign(_TURN_RAD, w_radps) * np.array([0.0, 1.0, 2.0])
+    cos, sin = np.cos(turn_rad)[:, None], np.sin(turn_rad)[:, None]
+    x, y = corners.T
+    turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    gaps_m = costmap.distances(turned)
+    return bool((gaps_m[1:] >= np.minimum(gaps_m[0], _CORNER_M)).all())
 
 
 def safe_speed(plan: LocalPlan, movers: Movers, robot: Robot, v_mps: float, patient: bool) -> float:
@@ -125,6 +140,6 @@ def _free_on_arc_m(
     ends = disks.nose_m * np.array([1.0, -1.0])
     centres = np.stack([x + ends[:, None] * np.cos(turn), y + ends[:, None] * np.sin(turn)], -1)
     now_m = costmap.distances(np.column_stack([ends, np.zeros(2)]))
-    least_m = np.minimum(disks.radius_m, now_m - _LEAVES_M)
+    least_m = np.clip(now_m, robot.width_m / 2 + LEAST_M, disks.radius_m)
     hits = (costmap.distances(centres) < least_m[:, None]).any(axis=0)
     return float(s_m[np.argmax(hits)]) if hits.any() else None
