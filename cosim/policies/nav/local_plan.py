@@ -19,8 +19,8 @@ _OFFSET_M: Final = 0.1
 """Distance of neighbouring offsets in metres."""
 WIDEST_M: Final = 1.6
 """Largest offset from the route in metres."""
-_MOST_CHANGE: Final = 2
-"""Largest change between two stations, in offsets: 0.8 m a metre."""
+_MOST_CHANGE: Final = 3
+"""Largest change between two stations, in offsets: 1.2 m a metre."""
 _OFFSET_COST: Final = 0.25
 """Cost of an offset of 1 m at a station."""
 _FAR_COST: Final = 0.4

@@ -16,8 +16,8 @@ from cosim.core.state import STILL, Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation
 from cosim.policies.nav.costmap import Costmap
-from cosim.policies.nav.local_plan import LocalPlan, local_plan
-from cosim.policies.nav.pursuit import can_turn, point_at, pursue, safe_speed
+from cosim.policies.nav.local_plan import local_plan
+from cosim.policies.nav.pursuit import can_turn, pursue, safe_speed
 from cosim.policies.nav.route_path import path_to
 from cosim.policies.nav.tracking import Tracker
 from cosim.spec.manifest import Manifest
@@ -30,9 +30,16 @@ TIGHT_M: Final = 0.08
 """The same after PATIENCE_S without motion."""
 PATIENCE_S: Final = 3.0
 """Time in seconds without motion after which the robot accepts smaller gaps."""
+TURN_S: Final = 2.0
+"""Time in seconds without motion after which the robot turns slowly towards the free side."""
 RECOVER_S: Final = 7.5
-"""Time in seconds without motion after which the robot turns slowly towards the free side, and
-accepts smaller gaps to moving bodies."""
+"""The same with people nearby, who may go away; then it also accepts smaller gaps to them."""
+_NEARBY_M: Final = 3.0
+"""Distance in metres of people nearby."""
+_LOOK_ASIDE_M: Final = 0.9
+"""Distance in metres at which the room on both sides is compared."""
+_ASIDE_RAD: Final = 0.8
+"""Bearing in radians of these places."""
 HOLD_S: Final = 4.5
 """Time in seconds for which the robot stands still after it stopped for a person who is before it:
 turned on the spot, its corners would touch the person."""
@@ -104,22 +111,27 @@ class Nav:
         command = pursue(plan, self._costmap, robot, v_mps, safe_mps)
         if safe_mps == 0.0:
             self._yielded_s = time_s
-        if time_s - self._yielded_s < HOLD_S and _before(self._tracker.walkers(pose)):
+        walkers = self._tracker.walkers(pose)
+        if time_s - self._yielded_s < HOLD_S and _within(walkers, _BEFORE_M, _BEFORE_RAD):
             command = STILL
-        if command == STILL and stood_s > RECOVER_S:
-            command = self._free_turn(plan, robot)
+        waits_s = RECOVER_S if _within(walkers, _NEARBY_M) else TURN_S
+        if command == STILL and stood_s > waits_s:
+            command = self._free_turn(robot)
         return clipped(command, robot)
 
-    def _free_turn(self, plan: LocalPlan, robot: Robot) -> Command:
-        """Return a slow turn towards the plan, or to the other side; none without room."""
-        first = math.copysign(_TURN_RADPS, float(point_at(plan.points, 1.0)[1]))
+    def _free_turn(self, robot: Robot) -> Command:
+        """Return a slow turn to the side with more room, or to the other one; none without room."""
+        sides = _LOOK_ASIDE_M * np.array([(math.cos(_ASIDE_RAD), math.sin(_ASIDE_RAD))] * 2)
+        sides[1, 1] *= -1.0
+        left_m, right_m = self._costmap.distances(sides).tolist()
+        first = _TURN_RADPS if left_m >= right_m else -_TURN_RADPS
         for w_radps in (first, -first):
             if can_turn(self._costmap, robot, w_radps):
                 return Command(0.0, w_radps)
         return STILL
 
 
-def _before(walkers: Floats) -> bool:
-    """Return whether one of (N, 2) people, metres in the robot's frame, is before the robot."""
-    near = np.hypot(*walkers.T) < _BEFORE_M
-    return bool((near & (np.abs(np.arctan2(walkers[:, 1], walkers[:, 0])) < _BEFORE_RAD)).any())
+def _within(people: Floats, range_m: float, bearing_rad: float = math.pi) -> bool:
+    """Return whether one of (N, 2) people, metres in the robot's frame, is within a sector."""
+    near = np.hypot(*people.T) < range_m
+    return bool((near & (np.abs(np.arctan2(people[:, 1], people[:, 0])) <= bearing_rad)).any())

@@ -22,7 +22,7 @@ from cosim.spec.robot import Robot
 
 LOOK_AHEAD_S: Final = 0.8
 """Look-ahead time in seconds."""
-LOOK_AHEAD_M: Final = (0.7, 1.4)
+LOOK_AHEAD_M: Final = (0.7, 1.2)
 """Smallest and largest look-ahead distance in metres."""
 TURN_FIRST_RAD: Final = 0.785
 """Bearing of the look-ahead point in radians beyond which the robot turns on the spot."""
