@@ -79,7 +79,7 @@ class Nav:
         self._costmap.clear()
         self._tracker.clear()
         self._direction_rad = pose.heading_rad
-        self._held_at, self._held_s = pose.xy, time_s
+        self._held_at, self._held_s, self._turn_radps = pose.xy, time_s, 0.0
         self._side = 0
         self._yielded_s = -math.inf
 
@@ -99,7 +99,7 @@ class Nav:
             ahead = path[2] - path[0]
             self._direction_rad = pose.heading_rad + math.atan2(ahead[1], ahead[0])
         if math.hypot(*(pose.xy - self._held_at)) > _MOVED_M:
-            self._held_at, self._held_s = pose.xy, time_s
+            self._held_at, self._held_s, self._turn_radps = pose.xy, time_s, 0.0
         stood_s = time_s - self._held_s
         margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
         v_mps = observation.v_mps
@@ -120,13 +120,17 @@ class Nav:
         return clipped(command, robot)
 
     def _free_turn(self, robot: Robot) -> Command:
-        """Return a slow turn to the side with more room, or to the other one; none without room."""
+        """Return a slow turn to the side with more room, or to the other one; none without room.
+
+        The side is kept until the robot has moved.
+        """
         sides = _LOOK_ASIDE_M * np.array([(math.cos(_ASIDE_RAD), math.sin(_ASIDE_RAD))] * 2)
         sides[1, 1] *= -1.0
         left_m, right_m = self._costmap.distances(sides).tolist()
-        first = _TURN_RADPS if left_m >= right_m else -_TURN_RADPS
+        first = self._turn_radps or (_TURN_RADPS if left_m >= right_m else -_TURN_RADPS)
         for w_radps in (first, -first):
             if can_turn(self._costmap, robot, w_radps):
+                self._turn_radps = w_radps
                 return Command(0.0, w_radps)
         return STILL
 
