@@ -19,7 +19,7 @@ from cosim.policies.nav.costmap import Costmap
 from cosim.policies.nav.local_plan import local_plan
 from cosim.policies.nav.pursuit import can_turn, pursue, safe_speed
 from cosim.policies.nav.route_path import path_to
-from cosim.policies.nav.tracking import Tracker
+from cosim.policies.nav.tracking import Movers, Tracker
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 from cosim.spec.sensors import ScanSpec
@@ -84,50 +84,59 @@ class Nav:
         self._yielded_s = -math.inf
 
     def act(self, observation: Observation) -> Command:
-        scan, odometry = observation.scan, observation.odometry
-        if scan is None or odometry is None or odometry.heading_rad is None:
+        odometry, time_s = observation.odometry, observation.time_s
+        if observation.scan is None or odometry is None or odometry.heading_rad is None:
             raise ValueError("nav needs a lidar and odometry with a heading")
-        robot, time_s = observation.robot, observation.time_s
         pose = Pose(odometry.x_m, odometry.y_m, odometry.heading_rad)
         if observation.reset or observation.tick == 0:
             self._begin(time_s, pose)
-        self._tracker.update(scan, pose, time_s)
+        self._tracker.update(observation.scan, pose, time_s)
         movers = self._tracker.movers(pose)
-        self._costmap.update(scan, pose, movers)
+        self._costmap.update(observation.scan, pose, movers)
+        if math.hypot(*(pose.xy - self._held_at)) > _MOVED_M:
+            self._held_at, self._held_s, self._turn_radps = pose.xy, time_s, 0.0
+        path = self._path(observation, pose)
+        command = self._followed(path, movers, observation)
+        walkers = self._tracker.walkers(pose)
+        if time_s - self._yielded_s < HOLD_S and _within(walkers, _BEFORE_M, _BEFORE_RAD):
+            command = STILL
+        waits_s = RECOVER_S if _within(walkers, _NEARBY_M) else TURN_S
+        if command == STILL and time_s - self._held_s > waits_s:
+            command = self._free_turn(observation.robot)
+        return clipped(command, observation.robot)
+
+    def _path(self, observation: Observation, pose: Pose) -> Floats:
+        """Return the route ahead, (N, 2) metres in the robot's frame, and keep its direction."""
         path = path_to(observation.goal, wrap_angle(self._direction_rad - pose.heading_rad))
         if len(path) > 2:
             ahead = path[2] - path[0]
             self._direction_rad = pose.heading_rad + math.atan2(ahead[1], ahead[0])
-        if math.hypot(*(pose.xy - self._held_at)) > _MOVED_M:
-            self._held_at, self._held_s, self._turn_radps = pose.xy, time_s, 0.0
-        stood_s = time_s - self._held_s
+        return path
+
+    def _followed(self, path: Floats, movers: Movers, observation: Observation) -> Command:
+        """Return the command along a path, past obstacles and after people."""
+        robot, v_mps = observation.robot, observation.v_mps
+        stood_s = observation.time_s - self._held_s
         margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
-        v_mps = observation.v_mps
         plan = local_plan(
             path, self._costmap, robot.width_m / 2, margin_m, self._side, movers, v_mps
         )
         self._side = plan.side
         safe_mps = safe_speed(plan, movers, robot, v_mps, stood_s < RECOVER_S)
-        command = pursue(plan, self._costmap, robot, v_mps, safe_mps)
         if safe_mps == 0.0:
-            self._yielded_s = time_s
-        walkers = self._tracker.walkers(pose)
-        if time_s - self._yielded_s < HOLD_S and _within(walkers, _BEFORE_M, _BEFORE_RAD):
-            command = STILL
-        waits_s = RECOVER_S if _within(walkers, _NEARBY_M) else TURN_S
-        if command == STILL and stood_s > waits_s:
-            command = self._free_turn(robot)
-        return clipped(command, robot)
+            self._yielded_s = observation.time_s
+        return pursue(plan, self._costmap, robot, v_mps, safe_mps)
 
     def _free_turn(self, robot: Robot) -> Command:
-        """Return a slow turn to the side with more room, or to the other one; none without room.
+        """Return a slow turn to the side of the plan, or to the other one; none without room.
 
-        The side is kept until the robot has moved.
+        Without a side it is the one with more room. It is kept until the robot has moved.
         """
         sides = _LOOK_ASIDE_M * np.array([(math.cos(_ASIDE_RAD), math.sin(_ASIDE_RAD))] * 2)
         sides[1, 1] *= -1.0
         left_m, right_m = self._costmap.distances(sides).tolist()
-        first = self._turn_radps or (_TURN_RADPS if left_m >= right_m else -_TURN_RADPS)
+        side = self._side or (1 if left_m >= right_m else -1)
+        first = self._turn_radps or side * _TURN_RADPS
         for w_radps in (first, -first):
             if can_turn(self._costmap, robot, w_radps):
                 self._turn_radps = w_radps

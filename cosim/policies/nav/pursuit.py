@@ -16,6 +16,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
 from cosim.policies.nav.costmap import Costmap
 from cosim.policies.nav.local_plan import LEAST_M, LocalPlan
+from cosim.policies.nav.route_path import STEP_M
 from cosim.policies.nav.tracking import Movers
 from cosim.policies.privileged.rollout import BodyDisks
 from cosim.spec.robot import Robot
@@ -40,6 +41,12 @@ FORESEEN_S: Final = 2.5
 """Time in seconds for which moving bodies are predicted."""
 MOVER_GAP_M: Final = 0.2
 """Least predicted distance in metres from the robot's disks to a moving body."""
+_TOUCH_M: Final = 0.06
+"""Distance in metres of a corner at which it may touch: half a cell of the costmap."""
+_STOPPING_M: Final = 0.15
+"""Distance in metres from a touch at which the robot stops on its arc."""
+_NEAR_M: Final = 0.45
+"""Distance in metres of the point to which the robot turns on the spot where its arc is closed."""
 _TURN_RAD: Final = 0.15
 """Step in radians at which turns on the spot are checked."""
 _CORNER_M: Final = 0.12
@@ -60,39 +67,58 @@ def pursue(
     v_mps: current speed.
     most_mps: limit of the speed.
     """
-    look_m = float(np.clip(LOOK_AHEAD_S * v_mps, *LOOK_AHEAD_M))
-    x, y = point_at(plan.points, look_m).tolist()
-    bearing_rad = math.atan2(y, x)
     room_m = plan.free_m - STOP_SHORT_M - robot.length_m / 2 if plan.blocked else math.inf
     if room_m <= 0.0:
         return STILL
-    most_mps = min(most_mps, robot.cruise_mps, math.sqrt(2.0 * BRAKE_MPS2 * min(room_m, 100.0)))
-    if abs(bearing_rad) > TURN_FIRST_RAD:
-        w_radps = math.copysign(robot.w_max_radps, bearing_rad)
-        return Command(0.0, w_radps) if can_turn(costmap, robot, w_radps) else STILL
+    look_m = float(np.clip(LOOK_AHEAD_S * v_mps, *LOOK_AHEAD_M))
+    x, y = point_at(plan.points, look_m).tolist()
+    if abs(math.atan2(y, x)) > TURN_FIRST_RAD:
+        return _turn_to(y, robot.w_max_radps, costmap, robot)
     curvature = 2.0 * y / max(x * x + y * y, 1e-6)
-    slow = min(1.0, 1.0 / max(abs(curvature) * MIN_RADIUS_M, 1e-6))
-    ahead = plan.points[: max(2, round(look_m / 0.25))]
-    gap_m = float(costmap.distances(ahead).min()) - robot.width_m / 2
-    slow *= float(np.clip(gap_m / SLOW_WITHIN_M, 0.0, 1.0))
-    v = max(SLOWEST_MPS, robot.cruise_mps * slow)
-    v = min(v, most_mps, robot.w_max_radps / max(abs(curvature), 1e-6))
+    most_mps = min(most_mps, robot.cruise_mps, _stopping_mps(room_m))
+    v = min(
+        _regulated_mps(curvature, plan.points[: max(2, round(look_m / STEP_M))], costmap, robot),
+        most_mps,
+        robot.w_max_radps / max(abs(curvature), 1e-6),
+    )
     free_m = _free_on_arc_m(curvature, max(v, 0.3) * COLLISION_S + 0.2, costmap, robot)
-    if free_m is not None:
-        v = min(v, math.sqrt(2.0 * BRAKE_MPS2 * max(free_m - 0.15, 0.0)))
+    v = min(v, _stopping_mps(free_m - _STOPPING_M))
+    if v < SLOWEST_MPS <= most_mps:
+        x, y = point_at(plan.points, _NEAR_M).tolist()
+        if abs(math.atan2(y, x)) > _TURN_RAD and can_turn(costmap, robot, y):
+            return _turn_to(y, robot.w_max_radps / 2, costmap, robot)
     return Command(v, v * curvature)
 
 
-def can_turn(costmap: Costmap, robot: Robot, w_radps: float) -> bool:
-    """Return whether the corners of the robot stay clear in a turn on the spot to this side."""
+def _regulated_mps(curvature: float, ahead: Floats, costmap: Costmap, robot: Robot) -> float:
+    """Return the speed in a curve and near obstacles. ahead: (N, 2) next points of the way."""
+    slow = min(1.0, 1.0 / max(abs(curvature) * MIN_RADIUS_M, 1e-6))
+    gap_m = float(costmap.distances(ahead).min()) - robot.width_m / 2
+    slow *= float(np.clip(gap_m / SLOW_WITHIN_M, 0.0, 1.0))
+    return max(SLOWEST_MPS, robot.cruise_mps * slow)
+
+
+def _stopping_mps(room_m: float) -> float:
+    """Return the speed from which the robot can stop within a distance."""
+    return math.sqrt(2.0 * BRAKE_MPS2 * max(room_m, 0.0))
+
+
+def _turn_to(side: float, w_radps: float, costmap: Costmap, robot: Robot) -> Command:
+    """Return a turn on the spot to a side, left positive; STILL without room."""
+    return Command(0.0, math.copysign(w_radps, side)) if can_turn(costmap, robot, side) else STILL
+
+
+def can_turn(costmap: Costmap, robot: Robot, side: float) -> bool:
+    """Return whether the robot's corners stay clear in a turn on the spot. side: left positive"""
     ahead, aside = robot.length_m / 2, robot.width_m / 2
     corners = np.array([(ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside)])
-    turn_rad = math.copysign(_TURN_RAD, w_radps) * np.array([0.0, 1.0, 2.0])
+    turn_rad = math.copysign(_TURN_RAD, side) * np.array([0.0, 1.0, 2.0])
     cos, sin = np.cos(turn_rad)[:, None], np.sin(turn_rad)[:, None]
     x, y = corners.T
     turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
     gaps_m = costmap.distances(turned)
-    return bool((gaps_m[1:] >= np.minimum(gaps_m[0], _CORNER_M)).all())
+    least_m = np.maximum(np.minimum(gaps_m[0], _CORNER_M), _TOUCH_M)
+    return bool((gaps_m[1:] >= least_m).all())
 
 
 def safe_speed(plan: LocalPlan, movers: Movers, robot: Robot, v_mps: float, patient: bool) -> float:
@@ -127,10 +153,8 @@ def point_at(points: Floats, s_m: float) -> Floats:
     return points_at(points, np.array(s_m))
 
 
-def _free_on_arc_m(
-    curvature: float, length_m: float, costmap: Costmap, robot: Robot
-) -> float | None:
-    """Return the length of an arc until the robot touches something; None if it does not."""
+def _free_on_arc_m(curvature: float, length_m: float, costmap: Costmap, robot: Robot) -> float:
+    """Return the length of an arc until the robot touches something; inf if it does not."""
     disks = BodyDisks.of(robot)
     s_m = np.arange(0.1, length_m + 0.1, 0.1)
     turn = curvature * s_m
@@ -142,4 +166,4 @@ def _free_on_arc_m(
     now_m = costmap.distances(np.column_stack([ends, np.zeros(2)]))
     least_m = np.clip(now_m, robot.width_m / 2 + LEAST_M, disks.radius_m)
     hits = (costmap.distances(centres) < least_m[:, None]).any(axis=0)
-    return float(s_m[np.argmax(hits)]) if hits.any() else None
+    return float(s_m[np.argmax(hits)]) if hits.any() else math.inf
