@@ -19,12 +19,11 @@ from cosim.policies.nav.tracking import Tracker
 from cosim.spec.goal import PointGoal, RoutePatch, route_patch_at
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER, ROBOTS, Robot
-from cosim.spec.sensors import Scan
+from cosim.spec.sensors import Scan, ScanSpec
 from scenarios.episodes.run_episode import run_episode
 from scenarios.suites.catalog import load_suite
 
-SPEC = Nav.manifest.scan
-assert SPEC is not None
+SPEC = Nav.manifest.scan or ScanSpec()
 START = Pose(0.0, 0.0, 0.0)
 ROUTE = np.array([(-5.0, 0.0), (12.0, 0.0)])
 

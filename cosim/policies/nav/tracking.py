@@ -88,11 +88,23 @@ class _Tracks(NamedTuple):
 
     def only(self, rows: NDArray[np.bool_]) -> _Tracks:
         """Return some tracks."""
-        return _Tracks(*(column[rows] for column in self))
+        return _Tracks(
+            self.first[rows],
+            self.at[rows],
+            self.velocity[rows],
+            self.scans[rows],
+            self.missed[rows],
+        )
 
     def joined(self, other: _Tracks) -> _Tracks:
         """Return the tracks of both."""
-        return _Tracks(*(np.concatenate(columns) for columns in zip(self, other, strict=True)))
+        return _Tracks(
+            np.concatenate([self.first, other.first]),
+            np.concatenate([self.at, other.at]),
+            np.concatenate([self.velocity, other.velocity]),
+            np.concatenate([self.scans, other.scans]),
+            np.concatenate([self.missed, other.missed]),
+        )
 
 
 def _new_tracks(bodies: Floats) -> _Tracks:
@@ -146,7 +158,8 @@ class Tracker:
         """Return the places (N, 2) of bodies that have walked, also of those that stand now."""
         tracks = self._tracks
         walked = np.hypot(*(tracks.at - tracks.first).T) > _WALKED_M
-        return (tracks.at[walked] - pose.xy) @ _into_frame(pose)
+        places: Floats = (tracks.at[walked] - pose.xy) @ _into_frame(pose)
+        return places
 
 
 def _into_frame(pose: Pose) -> Floats:
@@ -189,4 +202,5 @@ def bodies_in(scan: Scan, pose: Pose) -> Floats:
     width_m = np.hypot(*(points[ends - 1] - points[starts]).T)
     seen_rad = count[:, 0] * 2.0 * math.pi / scan.spec.rays
     wide = seen_rad * ranges[rays[starts]] >= _FEWEST * PERSON_RADIUS_M
-    return middle[(width_m <= _WIDEST_M) & wide]
+    bodies: Floats = middle[(width_m <= _WIDEST_M) & wide]
+    return bodies
