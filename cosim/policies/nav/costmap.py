@@ -81,19 +81,21 @@ class Costmap:
     def distances(self, points: Floats) -> Floats:
         """Return the distance of (..., 2) points to obstacles, metres, at most FREE_M.
 
+        It is interpolated between the middles of cells.
         points: metres in the robot's frame. Those outside the map are free.
         """
         cos, sin = math.cos(self._pose.heading_rad), math.sin(self._pose.heading_rad)
         x = cos * points[..., 0] - sin * points[..., 1] + self._pose.x_m
         y = sin * points[..., 0] + cos * points[..., 1] + self._pose.y_m
-        rows = np.floor(x / CELL_M).astype(int) - self._middle[0] + _HALF_CELLS
-        columns = np.floor(y / CELL_M).astype(int) - self._middle[1] + _HALF_CELLS
-        inside = (rows >= 0) & (rows < _CELLS) & (columns >= 0) & (columns < _CELLS)
-        found: Floats = np.where(
-            inside,
-            self._distance[np.clip(rows, 0, _CELLS - 1), np.clip(columns, 0, _CELLS - 1)],
-            FREE_M,
-        )
+        row = x / CELL_M - 0.5 - self._middle[0] + _HALF_CELLS
+        column = y / CELL_M - 0.5 - self._middle[1] + _HALF_CELLS
+        i, j = (np.clip(np.floor(at).astype(int), 0, _CELLS - 2) for at in (row, column))
+        down, right = row - i, column - j
+        field = self._distance
+        above = (1.0 - right) * field[i, j] + right * field[i, j + 1]
+        below = (1.0 - right) * field[i + 1, j] + right * field[i + 1, j + 1]
+        inside = (down >= 0.0) & (down <= 1.0) & (right >= 0.0) & (right <= 1.0)
+        found: Floats = np.where(inside, (1.0 - down) * above + down * below, FREE_M)
         return found
 
     def _move(self, pose: Pose) -> None:

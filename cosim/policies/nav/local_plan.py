@@ -43,8 +43,8 @@ _MOVER_MARGIN_M: Final = 0.15
 """Distance in metres to moving bodies in addition to that of others."""
 _SLOWEST_MPS: Final = 0.7
 """Lowest speed in m/s of the robot for these predictions."""
-LEAST_M: Final = 0.04
-"""Least distance in metres to an obstacle that the robot has to leave."""
+NEARER_M: Final = 0.04
+"""Distance in metres by which the costmap's cells may make an obstacle seem nearer."""
 _ASIDE_M: Final = 0.3
 """Offset in metres from which a plan has a side."""
 _BLOCKED: Final = 1e6
@@ -93,7 +93,7 @@ def local_plan(
     nodes = path[:, None] + offsets[None, :, None] * normals[:, None]
     gap_m = costmap.distances(nodes) - half_width_m
     own_m = float(costmap.distances(np.zeros(2))) - half_width_m
-    margin_m = min(margin_m, max(own_m, LEAST_M))
+    margin_m = min(margin_m, max(own_m - NEARER_M, min(own_m, 0.0)))
     times_s = STEP_M * np.arange(len(path)) / max(v_mps, _SLOWEST_MPS)
     moving_m = movers.gaps_m(nodes, np.minimum(times_s, _FORESEEN_S)) - half_width_m
     moving_m[times_s > _FORESEEN_S] = np.inf

@@ -15,7 +15,7 @@ import numpy as np
 from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
 from cosim.policies.nav.costmap import Costmap
-from cosim.policies.nav.local_plan import LEAST_M, LocalPlan
+from cosim.policies.nav.local_plan import NEARER_M, LocalPlan
 from cosim.policies.nav.route_path import STEP_M
 from cosim.policies.nav.tracking import Movers
 from cosim.policies.privileged.rollout import BodyDisks
@@ -164,6 +164,7 @@ def _free_on_arc_m(curvature: float, length_m: float, costmap: Costmap, robot: R
     ends = disks.nose_m * np.array([1.0, -1.0])
     centres = np.stack([x + ends[:, None] * np.cos(turn), y + ends[:, None] * np.sin(turn)], -1)
     now_m = costmap.distances(np.column_stack([ends, np.zeros(2)]))
-    least_m = np.clip(now_m, robot.width_m / 2 + LEAST_M, disks.radius_m)
+    least_m = np.maximum(now_m - NEARER_M, np.minimum(now_m, robot.width_m / 2))
+    least_m = np.minimum(least_m, disks.radius_m)
     hits = (costmap.distances(centres) < least_m[:, None]).any(axis=0)
     return float(s_m[np.argmax(hits)]) if hits.any() else math.inf
