@@ -256,7 +256,7 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
     from cosim.spec.robot import COURIER, robot_called
     from cosim.spec.scenario import split_called
     from cosim.spec.selection import select_scenarios
-    from scenarios.suites.catalog import load_suite, with_robot
+    from scenarios.suites.catalog import load_suite
     from scenarios.suites.new_scenarios import fresh, fresh_cities
 
     options = {
@@ -283,7 +283,7 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
                 config.suite, config.map, seed, config.episodes, 0.0, config.event, robot=robot
             )
     split = split_called(config.split)
-    whole = with_robot(load_suite(config.suite), config.robot)
+    whole = load_suite(config.suite)
     chosen = select_scenarios(
         whole, config.scenario, None, config.event, split, decoys=not config.no_decoys
     )

@@ -74,8 +74,10 @@ def compare(
         else:
             _write(path, FORMATS[path.suffix](comparison))
     print_comparison(out, comparison)
-    hashes = dict.fromkeys(comparison.before.table["suite_hash"])
-    for exploit in filter(None, map(exploit_of, hashes)):
+    table = comparison.before.table
+    for suite_hash in dict.fromkeys(table["suite_hash"]):
+        if (exploit := exploit_of(suite_hash, table["robot"])) is None:
+            continue
         out.print(exploit.in_words, soft_wrap=not out.is_terminal, highlight=False)
     for path, remark in instead.items():
         say(f"Written: {path}{remark}")

@@ -174,9 +174,11 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
     counts = f"scheduled {scheduled}, scored {scored}, of these crashed {len(parts['crashed'])}"
     decoys = f"; of all rows {is_decoy(table).sum()} are decoys" if has_decoys(table) else ""
     out.print(f"{counts}; invalid {len(parts['invalid'])}{decoys}")
-    for _, row in pd.concat([parts["crashed"], parts["invalid"]]).iterrows():
+    unsolved = parts["done"][parts["done"]["reason"].fillna("") != ""]
+    for _, row in pd.concat([parts["crashed"], parts["invalid"], unsolved]).iterrows():
+        status = "not solved" if row["status"] == "done" else row["status"]
         out.print(
-            f"{row['status']} {row['scenario']}: {row['reason']}",
+            f"{status} {row['scenario']}: {row['reason']}",
             soft_wrap=True,
             markup=False,
             highlight=False,

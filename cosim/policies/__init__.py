@@ -7,11 +7,19 @@ from types import MappingProxyType
 
 from cosim.episode.interfaces import Policy
 from cosim.policies.baselines import Stop, Straight
+from cosim.policies.nav.policy import Nav
 from cosim.policies.privileged.orca import Orca
 from cosim.policies.privileged.route import Route
 from cosim.policies.privileged.social_force import SocialForce
 
 POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
-    {"stop": Stop, "straight": Straight, "route": Route, "orca": Orca, "social_force": SocialForce}
+    {
+        "stop": Stop,
+        "straight": Straight,
+        "nav": Nav,
+        "route": Route,
+        "orca": Orca,
+        "social_force": SocialForce,
+    }
 )
 """Constructors of the bundled Python policies by name."""

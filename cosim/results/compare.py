@@ -31,6 +31,7 @@ from cosim.results.metrics import (
     RATE_NEEDS_M,
     UNKNOWN_WITH_CRASH,
 )
+from cosim.results.run_spec import names_by_robot
 from cosim.results.table import (
     crashed_in,
     injections_in_words,
@@ -382,7 +383,7 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
         what = (
             "the same suite"
             if spec.suite != other_spec.suite
-            else "the same version of it (former suite, edited, robot, --crowd?)"
+            else "the same version of it (former suite, edited, --crowd?)"
         )
         raise RunError(
             f"{other.path} is of suite '{other_spec.suite}' {other_spec.suite_version} "
@@ -397,8 +398,11 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
 
 
 def _labels(runs: Sequence[WholeRun]) -> list[str]:
-    """Return unique labels: policy names if they differ, else folder names, numbered if equal."""
-    names = [run.spec.manifest.name for run in runs]
+    """Return unique labels: policy names, with robots if there are several.
+
+    Folder names where these do not differ, numbered if equal.
+    """
+    names = names_by_robot([run.spec for run in runs])
     if len({*names}) < len(names):
         names = [run.path.absolute().name for run in runs]
     return [
@@ -490,6 +494,7 @@ def _terms(table: pd.DataFrame) -> dict[str, str]:
     """Return the settings that affect how hard a run is, independent of the policy."""
     first = table.iloc[0]
     return {
+        "robot": " and ".join(sorted({*table["robot"]})),
         "goal": first["goal_protocol"],
         "odometry": first["odometry"],
         _TRACK: first["track"],

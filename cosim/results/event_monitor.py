@@ -33,7 +33,7 @@ from cosim.results.go_on import (
     passing_of,
     rule_met,
 )
-from cosim.results.record import Record, TriggeredEvent
+from cosim.results.record import TriggeredEvent
 from cosim.results.referee import Ended
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event, EventKinds, EventState
@@ -88,6 +88,8 @@ class EventMonitor:
         self._route_s_m: list[float] = []
         self._v_mps: list[float] = []
         self._states: tuple[EventState, ...] = ()
+        self._can_begin = [begins_on_route(scenario, event, kinds) for event in scenario.events]
+        self._came_near = [False] * len(self._events)
         self._seen = [False] * len(self._events)
         self._went_between = [False] * len(self._events)
         self._furthest_m = 0.0
@@ -113,7 +115,10 @@ class EventMonitor:
             if state.phase not in ("acting", "over"):
                 continue
             bodies = np.array(list(places.values())).reshape(-1, 2)
-            self._seen[i] = self._seen[i] or self._sees(step.motion.robot, bodies)
+            if not self._seen[i]:
+                near = bodies[np.hypot(*(bodies - after.xy).T) <= SEEN_WITHIN_M]
+                self._came_near[i] |= len(near) > 0
+                self._seen[i] = self._sees(step.motion.robot, near)
             if state.phase == "acting" and self._passed_round[i]:
                 self._went_between[i] |= passed_between(before.xy, after.xy, bodies)
 
@@ -136,11 +141,11 @@ class EventMonitor:
             return not rule_met(self._events[i], passing, self._go_on_mps)
         return self._events[i].decoy and passing.stopped_s >= STOP_S
 
-    def _sees(self, robot: RobotState, bodies: Floats) -> bool:
-        """Return whether the camera sees one of the (N, 2) bodies."""
+    def _sees(self, robot: RobotState, near: Floats) -> bool:
+        """Return whether the camera sees one of the (N, 2) bodies within SEEN_WITHIN_M."""
         eye = camera_position(robot, self._mount)
         height_m = robot.z_m
-        for xy in bodies[np.hypot(*(bodies - robot.pose.xy).T) <= SEEN_WITHIN_M]:
+        for xy in near:
             points = body_points(eye, xy, height_m)
             inside = points[in_picture(robot.pose, self._mount, STANDARD_CAMERA, points - eye)]
             least = _VISIBLE_SHARE * len(points)
@@ -170,6 +175,7 @@ class EventMonitor:
             triggered_at_s=self._time_s(state.triggered_tick),
             trigger_distance_m=state.trigger_distance_m,
             seen=self._seen[i],
+            staged=self._can_begin[i] and (state.triggered_tick is None or self._came_near[i]),
             rule_met=all(rules) if rules else None,
             passed_at_s=self._time_s(end),
             passing_mps=None if passing is None else passing.mean_mps,
@@ -198,6 +204,13 @@ class EventMonitor:
 
     def _time_s(self, tick: int | None) -> float | None:
         return None if tick is None else tick * self._tick_ms / 1000
+
+
+def begins_on_route(scenario: Scenario, event: Event, kinds: EventKinds) -> bool:
+    """Return whether a robot that follows the route triggers an event before it is at the goal."""
+    trigger_m = kinds[event.kind].trigger_m_of(event)
+    first_m = event.route_s_m - (event.half_length_m if trigger_m is None else trigger_m)
+    return first_m <= scenario.route_line.length_m - scenario.goal_radius_m
 
 
 def camera_position(robot: RobotState, mount: Mount) -> Floats:
@@ -247,24 +260,3 @@ def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> bool:
 
 def _side(a: Floats, b: Floats, p: Floats) -> float:
     return float((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]))
-
-
-def why_invalid(record: Record, scenario: Scenario) -> str:
-    """Return why an episode about an event is inconclusive; "" if it is valid.
-
-    A failure before the event counts as a failure. Long ways are never invalid.
-    """
-    if not scenario.ends_on_failure or record.failures or record.ended not in ("goal", "stop"):
-        return ""
-    reasons = [
-        why_unseen(event, outcome)
-        for event, outcome in zip(scenario.events, record.events, strict=True)
-    ]
-    return "; ".join(filter(None, reasons))
-
-
-def why_unseen(event: Event, outcome: TriggeredEvent) -> str:
-    """Return why an event is inconclusive, in words; "" if it is valid."""
-    if outcome.triggered_at_s is None:
-        return f"event {event.id} ({event.kind}) never triggered"
-    return "" if outcome.seen else f"nobody of event {event.id} ({event.kind}) could be seen"

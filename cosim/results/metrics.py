@@ -18,6 +18,7 @@ from cosim.core.geometry import Floats
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.referee import Ended, Failure
+from cosim.results.validity import why_bypassed
 from cosim.spec.scenario import Scenario
 
 STALLED_MPS = 0.05
@@ -39,6 +40,7 @@ class EpisodeFacts:
 
     route_length_m: geodesic walkable length of the reference route
     rules_broken: number of events whose rule was broken
+    bypassed: whether the robot bypassed an event (`cosim.results.validity`)
     walked_into: contacts and falls at a person's fault
     period_ticks: ticks between two commands of the policy
     """
@@ -49,6 +51,7 @@ class EpisodeFacts:
     ended: Ended | None
     route_length_m: float
     rules_broken: int = 0
+    bypassed: bool = False
     walked_into: tuple[Failure, ...] = ()
     period_ticks: int = 5
 
@@ -63,6 +66,7 @@ class EpisodeFacts:
             ended=record.ended,
             route_length_m=scenario.route_line.length_m,
             rules_broken=sum(event.rule_met is False for event in record.events),
+            bypassed=why_bypassed(record, scenario) != "",
             walked_into=record.walked_into,
             period_ticks=clock.policy_ms // clock.tick_ms,
         )
@@ -98,14 +102,17 @@ def goal_reached(episode: EpisodeFacts) -> float:
 
 SUCCESS_IN_WORDS = (
     "success: the goal reached in time (of gesturing: the stop made) without a failure or a "
-    "broken rule (of conversing and queueing: pass round them; of decoys: go on)"
+    "broken rule (of conversing and queueing: pass round them; of decoys: go on), and no event "
+    "bypassed"
 )
 
 
 def success(episode: EpisodeFacts) -> float:
-    """Return 1 if the goal or required stop was reached in time, without failure or broken rule."""
+    """Return 1 if the goal or required stop was reached in time, without failure, broken rule or
+    bypassed event."""
     return float(
-        episode.ended in ("goal", "stop") and not episode.failures and not episode.rules_broken
+        episode.ended in ("goal", "stop")
+        and not (episode.failures or episode.rules_broken or episode.bypassed)
     )
 
 

@@ -46,6 +46,8 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 
     triggered_at_s, trigger_distance_m: None if the trigger never fired
     seen: whether the standard camera saw one of its people (`cosim.results.event_monitor`)
+    staged: False if the simulator owes the event: it cannot begin before the goal, or it began and
+        none of its people was ever near the robot
     rule_met: whether the robot obeyed the event's rules; None without a rule
     passed_at_s: end of the window of the go-on rule (`cosim.results.go_on`), which begins at the
         trigger; None if the robot did not pass, or in other events than decoys
@@ -58,6 +60,7 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
     triggered_at_s: float | None = None
     trigger_distance_m: float | None = None
     seen: bool = False
+    staged: bool = True
     rule_met: bool | None = None
     passed_at_s: float | None = None
     passing_mps: float | None = None
@@ -137,9 +140,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     nonstandard: what no camera mount of the robot allows, in words
     scan: how a scanned place looked to the policy's cameras; None without cameras or scan
     status: "crashed": the policy crashed, which counts as a failure. "invalid": the simulator is at
-        fault: no failure, but the event did not happen or could not be seen; or an engine failed
-        twice
-    reason: why the episode crashed or is invalid
+        fault: no failure, but the event could not begin or nobody came; or an engine failed twice
+    reason: why the episode crashed or is invalid, or how the robot bypassed its event
+        (`cosim.results.validity`)
     ended: None if the episode did not end; then there is neither trajectory nor measure, and ticks,
         state hash, failures and events are those before the crash
     walked_into: contacts with people who walked into the resting robot, and the falls that

@@ -67,6 +67,10 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
     if len(log) and log.legs.shape[1] != (width := legs_width(scenario.robot)):
         yield Contradiction("columns of legs", width, log.legs.shape[1])
         return
+    outcomes, events = ([one.id for one in of] for of in (record.events, scenario.events))
+    if outcomes != events:
+        yield Contradiction("events", outcomes, events)
+        return
     yield from _failures_as_driven(record, log)
     yield from _resets(record, log)
     yield from _red_light_entries(record, scenario, log)
@@ -280,10 +284,7 @@ def _passings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradi
     """
     outcomes = {outcome.id: outcome for outcome in record.events}
     for event in (event for event in scenario.events if is_measured(event, scenario)):
-        outcome = outcomes.get(event.id)
-        if outcome is None:
-            yield Contradiction(f"event {event.id}", None, "an event of the scenario")
-            continue
+        outcome = outcomes[event.id]
         triggered = outcome.triggered_at_s is not None
         if record.ended == "goal" and triggered and outcome.passed_at_s is None:
             yield Contradiction(f"passed_at_s of event {event.id}", None, "at the goal or before")

@@ -16,13 +16,13 @@ import msgspec
 
 from cosim.core.errors import RunError
 from cosim.core.progress import Progress, ignore
-from cosim.results.event_monitor import why_invalid
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, compute_metrics
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
 from cosim.results.run_folder import load_log
 from cosim.results.table import table_of
+from cosim.results.validity import why_bypassed, why_invalid
 from cosim.spec.scenario import Scenario
 
 _TABLE = "results.csv"
@@ -84,7 +84,7 @@ def score_run(path: Path, progress: Progress = ignore) -> ScoreResult:
 def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, list[Difference]]:
     """Return the recomputed record of an episode and its differences."""
     measures: dict[str, float | None] = {}
-    found = []
+    found: list[tuple[str, object, object]] = []
     if record.ended is not None:
         log = load_log(run.path, record.scenario.id)
         found = [
@@ -96,8 +96,13 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
             measures |= {
                 name: value for name, value in record.measures.items() if name in COUNTERFACTUAL
             }
-            status = "invalid" if why_invalid(record, scenario) else "done"
-            found = [("status", record.status, status)] if record.status != status else []
+            invalid = why_invalid(record, scenario)
+            reason = invalid or why_bypassed(record, scenario)
+            status = "invalid" if invalid else "done"
+            if record.status != status:
+                found = [("status", record.status, status)]
+            elif record.reason != reason:
+                found = [("reason", record.reason, reason)]
     found = found or [
         (name, record.measures.get(name), measures.get(name))
         for name in dict.fromkeys([*measures, *record.measures])

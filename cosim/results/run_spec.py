@@ -28,7 +28,7 @@ _ARITHMETIC_HINT = (
 
 _SUITE_FIELDS = ("suite_version", "suite_hash")
 _SUITE_HINT = (
-    " The suite was edited; or --robot, --crowd and the like differ; or, with --map, --seed, "
+    " The suite was edited; or --crowd and the like differ; or, with --map, --robot, --seed, "
     "--episodes or --event do."
 )
 
@@ -156,6 +156,22 @@ RUN_FILE = FlatFile(
     defaults={"camera": None, "renderer": "unknown"},
 )
 """Layout of run.json: flat, for compatibility with files written before `RunSpec` had parts."""
+
+
+def names_by_robot(specs: Sequence[RunSpec]) -> list[str]:
+    """Return the policy name of each run, with its robots if the policy drove others, too."""
+    robots = {spec.manifest.name: set[str]() for spec in specs}
+    for spec in specs:
+        robots[spec.manifest.name].add(_robots_in_words(spec))
+    return [
+        f"{name}, {_robots_in_words(spec)}" if len(robots[name]) > 1 else name
+        for spec in specs
+        for name in [spec.manifest.name]
+    ]
+
+
+def _robots_in_words(spec: RunSpec) -> str:
+    return " and ".join(sorted(spec.robots))
 
 
 def _choice_difference(

@@ -11,12 +11,13 @@ from cosim.core.errors import UsageError
 from cosim.episode.command_delay import CommandDelay, median_ms
 from cosim.episode.loop import Step
 from cosim.place.street_map import StreetMap, WalkableArea
-from cosim.results.event_monitor import EventMonitor, OcclusionTest, why_invalid
+from cosim.results.event_monitor import EventMonitor, OcclusionTest
 from cosim.results.log import Log
 from cosim.results.metrics import BRIEF, BRIEF_COLUMNS, METRICS, EpisodeFacts, compute_metrics
 from cosim.results.record import Record, Recorder, RedLightEntry, Status
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.traffic import TrafficMonitor
+from cosim.results.validity import why_bypassed, why_invalid
 from cosim.spec.events import EventKinds
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
@@ -116,6 +117,7 @@ class Scorer:
         driven = self.driven(begun)
         record = msgspec.structs.replace(driven, ended=self._verdict.ended, setup=setup)
         measures = compute_metrics(EpisodeFacts.of(record, scenario, log), self._measures)
-        reason = why_invalid(record, scenario)
-        status: Status = "invalid" if reason else "done"
+        invalid = why_invalid(record, scenario)
+        status: Status = "invalid" if invalid else "done"
+        reason = invalid or why_bypassed(record, scenario)
         return msgspec.structs.replace(record, status=status, reason=reason, measures=measures), log

@@ -37,8 +37,8 @@ from scenarios.runs.transport import HeldRun
 class PlannedRun(NamedTuple):
     """A run whose policy is loaded and whose seed is drawn.
 
-    whole: its suite.
-    of_run: the scenarios selected from the suite.
+    whole: its suite, before a robot is applied: so runs by several robots are of one suite.
+    of_run: the scenarios selected from the suite, with the robot of the run.
     shard: the part of them that is run here, None for all.
     policy: name of the policy.
     driver: the policy as loaded in this process.
@@ -140,8 +140,10 @@ def held_run(plan: PlannedRun, folder: Path) -> Iterator[HeldRun]:
 
 
 def _folder(plan: PlannedRun, folder: Path) -> RunFolder:
-    open_folder = RunFolder.resume if plan.config.resume else RunFolder.create
-    return open_folder(folder, plan.spec, plan.whole)
+    if plan.config.resume:
+        return RunFolder.resume(folder, plan.spec, plan.whole)
+    driven = msgspec.structs.replace(plan.whole, scenarios=tuple(plan.of_run))
+    return RunFolder.create(folder, plan.spec, driven)
 
 
 def run_spec(
@@ -155,6 +157,8 @@ def run_spec(
 ) -> RunSpec:
     """Build the identity of a run.
 
+    whole: the suite before a robot is applied.
+    picked: the scenarios of the run, with its robot.
     policy: name of the policy.
     shared: whether one renderer draws for all episodes.
     shard: the part of the run in the folder, None for all.

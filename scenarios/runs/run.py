@@ -36,7 +36,7 @@ from scenarios.runs.policy_host import host_of
 from scenarios.runs.pool import run_all
 from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import HeldRun, TransportFactory
-from scenarios.suites.catalog import load_suite, with_crowd, with_robot
+from scenarios.suites.catalog import load_suite, with_crowd
 from scenarios.suites.fits import LOOKING, check_places
 from scenarios.suites.sample import suite_on_map
 
@@ -212,6 +212,7 @@ def execute_run(
         split_called(config.split),
         decoys=not config.no_decoys,
     )
+    of_run = tuple(scenario.driven_by(config.robot) for scenario in of_run)
     plan = _planned(config, given, whole, of_run, ends)
     reporter.planned(plan)
     with ExitStack() as stack:
@@ -244,7 +245,7 @@ def _check_cluster(config: RunConfig, given: RunObjects | None) -> None:
 
 
 def _loaded(config: RunConfig, given: RunObjects | None, reporter: Reporter) -> Suite:
-    """Load the suite of a run, with its robot and crowd. Raises UsageError, SpecError, MapError."""
+    """Load the suite of a run, with its crowd. Raises UsageError, SpecError, MapError."""
     if given is not None and given.suite is not None:
         whole = given.suite
     elif config.map is not None:
@@ -262,7 +263,7 @@ def _loaded(config: RunConfig, given: RunObjects | None, reporter: Reporter) -> 
     else:
         whole = load_suite(config.suite)
     return with_crowd(
-        with_robot(whole, config.robot),
+        whole,
         persons=config.crowd,
         vehicles=None if config.crowd is None else round(_VEHICLES_SHARE * config.crowd),
         residents=config.residents,

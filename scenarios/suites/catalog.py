@@ -151,12 +151,13 @@ def with_crowd(whole: Suite, **asked: float | None) -> Suite:
 
 
 def with_robot(whole: Suite, robot: str) -> Suite:
-    """Return the suite with this robot in each scenario: another suite, with another version.
+    """Return the suite with this robot in each scenario.
 
-    The suite is returned unchanged if it has this robot, or if `robot` is "". Raises UsageError
-    with the valid names.
+    The robot belongs to a run, not to its suite: the identity of a run has the `content_hash` of
+    the suite without it. The suite is returned unchanged if it has this robot, or if `robot` is "".
+    Raises UsageError with the valid names.
     """
     scenarios = tuple(scenario.driven_by(robot) for scenario in whole.scenarios)
     if scenarios == whole.scenarios:
         return whole
-    return msgspec.structs.replace(whole, scenarios=scenarios, version=f"{whole.version}-{robot}")
+    return msgspec.structs.replace(whole, scenarios=scenarios)

@@ -352,6 +352,21 @@ def test_two_runs_of_one_policy_and_suite_are_told_apart_by_their_folders(tmp_pa
     assert [run.label for run in read_runs([first, second])] == ["first", "second"]
 
 
+def test_runs_of_one_suite_by_several_robots_share_a_table(tmp_path: Path) -> None:
+    """Rows of a policy that drove several robots have the robot in their name."""
+    runs = read_runs(
+        [
+            run_of(tmp_path / "one", ["goal"] * 3, "mine"),
+            run_of(tmp_path / "two", [HIT] * 3, "mine", robot="dog"),
+            run_of(tmp_path / "three", ["goal"] * 3, "other", robot="dog"),
+        ]
+    )
+    assert [run.label for run in runs] == ["mine, courier", "mine, dog", "other"]
+    (table,) = tables_of(runs)
+    names = ["mine, courier: straight", "mine, dog: straight", "other: straight"]
+    assert [row.name for row in table.rows] == names
+
+
 def _truncated(run: Path) -> str:
     file = run / "episodes/s-000/record.json"
     file.write_bytes(file.read_bytes()[:200])

@@ -24,6 +24,7 @@ def told(
 ) -> str:
     """The reason of an episode that this failure ended."""
     record, log = episode_of(scenario, "h", HIT)
+    record = msgspec.structs.replace(record, events=())
     record = msgspec.structs.replace(record, failures=(failure,), **fields)
     (mishap,) = mishaps_of(record)
     return reason_of(scenario, record, mishap, log, other)
@@ -144,7 +145,7 @@ def test_the_tracks_of_an_event_tell_who_came_from_where() -> None:
     rows = np.column_stack(
         [ticks, 0 * ticks, 0 * ticks, 4.3 + 0.0 * ticks, 0.05 * (ticks - 79) - 0.5]
     )
-    walked = msgspec.structs.replace(record, failures=(person(),))
+    walked = msgspec.structs.replace(record, failures=(person(),), events=())
     log = type(log)(**{**vars(log), "event_tracks": rows})  # type: ignore[type-var]
     reason = reason_of(WAY, walked, mishaps_of(walked)[0], log)
     assert reason == "drove into a person who came from the right at 1.0 m/s"

@@ -161,6 +161,23 @@ def test_runs_by_other_terms_are_called_neither_better_nor_worse(
     assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", said.stdout)
 
 
+def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path: Path) -> None:
+    """Runs of one suite by two robots are paired by scenario, named by robot, and no difference is
+    called better or worse."""
+    courier = run_of(tmp_path / "c", [HIT] * 20, "p", several(20))
+    dog = run_of(tmp_path / "d", [GOALS] * 20, "p", several(20), robot="dog")
+    told = compare_runs([courier, dog])
+    assert (told.before.label, told.others[0].label) == ("p, courier", "p, dog")
+    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    success = row(told, "success", after="p, dog")
+    assert (success["n"], success["difference"], success["verdict"]) == (20, 1.0, "differs")
+    assert any(
+        "No verdict of p, dog against p, courier" in note
+        and "robot courier (p, courier) and dog (p, dog)" in note
+        for note in told.notes
+    )
+
+
 @pytest.mark.parametrize("track", ["lidar", "people"])
 def test_runs_of_other_sensor_tracks_get_no_verdict_but_blind_ones_do(
     runs: Path, tmp_path: Path, track: str
@@ -448,7 +465,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "an edited suite": (
         lambda run: other_suite(run, "s"),
-        "run both on the same version of it (former suite, edited, robot, --crowd?)",
+        "run both on the same version of it (former suite, edited, --crowd?)",
     ),
     "no run": (
         lambda run: (run / "run.json").unlink(),

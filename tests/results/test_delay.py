@@ -16,9 +16,9 @@ from cosim.results.event_monitor import (
     camera_position,
     in_picture,
     passed_between,
-    why_unseen,
 )
 from cosim.results.record import TriggeredEvent
+from cosim.results.validity import why_unseen
 from cosim.spec.events import Event
 from cosim.spec.robot import COURIER
 
@@ -135,7 +135,7 @@ def test_an_event_that_nobody_saw_is_told_in_words() -> None:
     outcome = TriggeredEvent(id="e0", kind="frontal", passed=False)
     assert why_unseen(event, outcome) == "event e0 (frontal) never triggered"
     blind = TriggeredEvent(id="e0", kind="frontal", passed=True, triggered_at_s=1.0)
-    assert why_unseen(event, blind) == "nobody of event e0 (frontal) could be seen"
+    assert why_unseen(event, blind) == "nobody of event e0 (frontal) was seen"
     assert (
         why_unseen(
             event,

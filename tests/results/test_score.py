@@ -135,6 +135,10 @@ RECORD_EDITS: dict[str, tuple[Edit, str]] = {
         lambda r: r.update(walked_into=r["failures"], failures=[]),
         "ended in record.json",
     ),
+    "without its events": (
+        lambda r: r.update(events=[{"id": "e0", "kind": "frontal", "passed": True}]),
+        "events in record.json: recorded ['e0'], computed []",
+    ),
     "invalid": (
         lambda r: r.update(status="invalid", reason="so"),
         "status in record.json: recorded 'invalid'",

@@ -17,6 +17,7 @@ from shapely.geometry import LineString, box
 
 from cosim.core.errors import RunError, SpecError, UsageError
 from cosim.core.geometry import Polyline, Pose
+from cosim.core.progress import ignore
 from cosim.core.state import NO_PEOPLE, NO_VEHICLES, Command, People, RobotState, Signal, Street
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Observation, Privileged
@@ -30,6 +31,8 @@ from cosim.policies.privileged.route import best_lane, crossing_limit
 from cosim.policies.privileged.route_planner import DistanceField
 from cosim.policies.privileged.social_force import contact_distance_m
 from cosim.policies.privileged.standing_groups import lines
+from cosim.results.finished_run import read_whole_run
+from cosim.results.merge import merge_runs
 from cosim.results.run_folder import RunFolder
 from cosim.spec import robot as table
 from cosim.spec.camera import CameraSpec
@@ -49,6 +52,7 @@ from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
 from tests.run_specs import changed, spec_of
 from tests.spec.test_fits import barrier, crossroads, from_west_to_east
+from tests.support.driven_runs import run_of
 from tests.support.tiny_street import tiny_map
 
 BARROW = Robot(
@@ -261,16 +265,11 @@ def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> No
     ]
 
 
-def test_another_robot_is_another_suite_and_another_run(tmp_path: Path) -> None:
-    """Version and hashes tell; the suite's own robot changes nothing; a run is not resumed with
-    another robot."""
+def test_another_robot_is_another_run_of_the_same_suite(tmp_path: Path) -> None:
+    """The suite's own robot changes nothing; a run is not resumed or merged with another robot."""
     shipped = load_suite("long-horizon")
     whole = with_robot(shipped, "scout")
-    assert (whole.version, {s.robot for s in whole.scenarios}) == (
-        f"{shipped.version}-scout",
-        {"scout"},
-    )
-    assert whole.content_hash != shipped.content_hash
+    assert (whole.version, {s.robot for s in whole.scenarios}) == (shipped.version, {"scout"})
     assert content_hash(whole.scenarios[0]) != content_hash(shipped.scenarios[0])
     assert with_robot(shipped, "courier") is with_robot(shipped, "") is shipped
     none = Suite(name="s", version="1", scenarios=())
@@ -280,7 +279,27 @@ def test_another_robot_is_another_suite_and_another_run(tmp_path: Path) -> None:
     with pytest.raises(
         RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, now asked"
     ):
-        RunFolder.resume(tmp_path / "run", changed(spec, robots={"scout": "h"}, suite_hash="other"))
+        RunFolder.resume(tmp_path / "run", changed(spec, robots={"scout": "h"}))
+    parts = [run_of(tmp_path / name, ["goal"], robot=name) for name in ("courier", "scout")]
+    with pytest.raises(RunError, match="robots"):
+        merge_runs(parts, tmp_path / "merged", ignore)
+
+
+@pytest.mark.engine
+def test_runs_by_two_robots_have_the_suite_hash_of_the_shipped_scenarios(tmp_path: Path) -> None:
+    """Folder and records of both have the same suite hash, and scenarios with limits of their
+    robot."""
+    scenario = msgspec.structs.replace(small_scenario(), time_limit_s=1.0, ends_on_failure=True)
+    suite = Suite(name="s", version="1", scenarios=(scenario,))
+    for robot in ("", "scout"):
+        options = EpisodeOptions(robot=robot, seed=1)
+        run(suite, "straight", out=tmp_path / f"run{robot}", options=options)
+        whole = read_whole_run(tmp_path / f"run{robot}")
+        assert whole.spec.setup.suite_hash == suite.content_hash
+        assert whole.spec.suite_version == "1" and [*whole.spec.robots] == [robot or "courier"]
+        (record,) = whole.records.values()
+        assert record.setup.suite_hash == suite.content_hash
+        assert whole.scenarios[scenario.id] == scenario.driven_by(robot)
 
 
 def test_an_edited_robot_is_another_one(barrow: Robot, tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, Walkabl
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.spec.events import Event, EventQuery
+from cosim.spec.goal import PointGoal
+from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER, ROBOTS, Robot
 from cosim.spec.scenario import (
     Barrier,
@@ -37,6 +39,7 @@ from cosim.spec.scenario import (
     write_suite,
 )
 from cosim.spec.selection import select_scenarios
+from cosim.spec.sensors import Scan
 from scenarios.events import EVENT_KINDS, react
 from scenarios.places.nets import place
 from scenarios.suites import long_horizon, unit
@@ -471,7 +474,21 @@ def test_every_policy_answers_within_its_manifest(name: str, robot: Robot) -> No
             (),
             box(-1, -2, 51, 2),
         )
-        command = driver.act(Observation(tick, tick * 0.05, None, 1.0, 0.0, robot, known))
+        lidar = driver.manifest.scan
+        command = driver.act(
+            Observation(
+                tick,
+                tick * 0.05,
+                None,
+                1.0,
+                0.0,
+                robot,
+                known,
+                goal=PointGoal(10.0, 0.0),
+                odometry=Odometry(tick * 0.05, 0.0, 0.0),
+                scan=lidar and Scan(np.full((lidar.rings, lidar.rays), np.inf, np.float32), lidar),
+            )
+        )
         assert 0.0 <= command.v_mps <= robot.v_max_mps and abs(command.w_radps) <= robot.w_max_radps
 
 

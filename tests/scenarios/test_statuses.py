@@ -16,6 +16,7 @@ from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.policies import POLICIES
 from cosim.policies.load import load_policy
+from cosim.report.page.reasons import mishaps_of, reason_of
 from cosim.results.event_monitor import OcclusionTest
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
@@ -82,11 +83,11 @@ def test_who_fails_before_the_event_has_failed() -> None:
 
 
 @pytest.mark.engine
-def test_who_comes_by_an_event_that_nobody_could_see_has_done_nothing(
+def test_an_event_that_the_robot_alone_bypassed_is_not_solved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A goal reached without a failure, and something before the camera all the way: the simulator
-    owes the event."""
+    """A goal reached without a failure, with a camera that never saw the person nearby: the
+    episode is valid and not solved."""
     begin = Scorer.__init__
 
     def veiled(*given: object) -> None:
@@ -98,8 +99,25 @@ def test_who_comes_by_an_event_that_nobody_could_see_has_done_nothing(
     short = obstructing(20.0)
     near = msgspec.structs.replace(short, route=short.route[:6], goal=short.route[5], obstacles=())
     record = run_episode(near, Blind(1.5)).record
-    assert outcome(record) == ("invalid", "goal", 1.0, True)
-    assert record.reason == "nobody of event e0 (obstructing) could be seen"
+    assert outcome(record) == ("done", "goal", 0.0, True)
+    assert record.reason == "bypassed: nobody of event e0 (obstructing) was seen"
+    (mishap,) = mishaps_of(record)
+    assert mishap.cause == "bypassed the event"
+    assert reason_of(near, record, mishap, None) == record.reason
+
+
+@pytest.mark.engine
+def test_an_event_that_cannot_begin_before_the_goal_is_owed_by_the_simulator() -> None:
+    """Its trigger lies beyond the goal: whatever the robot does, the episode is invalid."""
+    short = obstructing(20.0)
+    (event,) = short.events
+    beyond = msgspec.structs.replace(event, trigger_m=0.0, route_s_m=event.route_s_m + 20.0)
+    near = msgspec.structs.replace(
+        short, route=short.route[:6], goal=short.route[5], obstacles=(), events=(beyond,)
+    )
+    record = run_episode(near, Blind(1.5)).record
+    assert (record.status, record.ended) == ("invalid", "goal")
+    assert record.reason == "event e0 (obstructing) never triggered"
 
 
 SMALL = City(seed=1, size_m=500.0)

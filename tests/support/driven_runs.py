@@ -14,13 +14,14 @@ from cosim.core.geometry import Pose
 from cosim.episode.loop import place_on_route
 from cosim.results.log import Log
 from cosim.results.metrics import EpisodeFacts, compute_metrics
-from cosim.results.record import Record
+from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import Failure
 from cosim.results.run_folder import RunFolder
 from cosim.results.walked import walked_m
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import City, Scenario, Suite
+from scenarios.suites.catalog import with_robot
 from tests.logs import log_with
 from tests.run_specs import record_of, spec_of
 
@@ -105,7 +106,21 @@ def episode_of(
     failures = (failure_at(log, ticks - 1),) if how == HIT else ()
     ended = "goal" if how == "goal" else "failure"
     record = msgspec.structs.replace(
-        record, status="done", ended=ended, ticks=ticks, failures=failures
+        record,
+        status="done",
+        ended=ended,
+        ticks=ticks,
+        failures=failures,
+        events=tuple(
+            TriggeredEvent(
+                id=event.id,
+                kind=event.kind,
+                passed=False,
+                triggered_at_s=0.0 if how == "goal" else None,
+                seen=how == "goal",
+            )
+            for event in scenario.events
+        ),
     )
     return msgspec.structs.replace(
         record, measures=compute_metrics(EpisodeFacts.of(record, scenario, log))
@@ -125,14 +140,21 @@ def with_decoys(*ways: Scenario) -> tuple[Scenario, ...]:
 
 
 def run_of(
-    path: Path, hows: Sequence[str], policy: str = "p", scenarios: Sequence[Scenario] = ()
+    path: Path,
+    hows: Sequence[str],
+    policy: str = "p",
+    scenarios: Sequence[Scenario] = (),
+    robot: str = "",
 ) -> Path:
     """A finished run of one short way after the other, each as `episode_of` says; s-000, s-001 and
-    so on."""
+    so on. robot: applied to the scenarios, as by `--robot`"""
     ways = tuple(scenarios) or tuple(short_way(f"s-{i:03d}") for i in range(len(hows)))
     suite = Suite(name=ways[0].suite, version="1", scenarios=ways)
-    with RunFolder.create(path, spec_of(suite, policy), suite) as folder:
-        for way, how in zip(ways, hows, strict=True):
+    of_run = with_robot(suite, robot)
+    robots = {way.robot: "h" for way in of_run.scenarios}
+    spec = msgspec.structs.replace(spec_of(suite, policy), robots=robots)
+    with RunFolder.create(path, spec, of_run) as folder:
+        for way, how in zip(of_run.scenarios, hows, strict=True):
             record, log = episode_of(way, suite.content_hash, how, policy)
             folder.keep(record, log.encoded() if log is not None else b"")
         folder.finish()

@@ -48,6 +48,7 @@ CAUSE_COLOURS: Final = dict(
             "#3f9c8f",
             "#8b97a3",
             "#c06aa0",
+            "#e3b7d2",
             "#333333",
             "#dddddd",
         ),

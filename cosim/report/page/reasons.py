@@ -13,6 +13,7 @@ from cosim.results.go_on import STOP_S
 from cosim.results.log import Log
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import FREEZE_MOVE_M, FREEZE_WINDOW_S, Failure
+from cosim.results.validity import BYPASSED
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario
 
@@ -31,6 +32,7 @@ CAUSES: Final = (
     "fell",
     "out of time",
     "broke the rule",
+    "bypassed the event",
     "policy crashed",
 )
 """Causes of failures, in display order."""
@@ -86,7 +88,10 @@ def mishaps_of(record: Record) -> list[Mishap]:
     found = [Mishap(failure.tick, cause_of(failure), failure) for failure in record.failures]
     if not found and not record.measures.get("success"):
         broke = record.ended in ("goal", "failure", "stop")
-        found.append(Mishap(max(record.ticks - 1, 0), "broke the rule" if broke else "out of time"))
+        cause = "broke the rule" if broke else "out of time"
+        if record.reason.startswith(BYPASSED):
+            cause = "bypassed the event"
+        found.append(Mishap(max(record.ticks - 1, 0), cause))
     return found
 
 
@@ -115,6 +120,8 @@ def reason_of(
     if mishap.cause == "policy crashed":
         return f"the policy crashed: {record.reason}"
     failure = mishap.failure
+    if mishap.cause == "bypassed the event":
+        return record.reason
     if failure is None:
         return _missed_goal(scenario, record)
     if failure.kind == "freezing":

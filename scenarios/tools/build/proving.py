@@ -96,6 +96,8 @@ def proved(scenario: Scenario, expert: str = EXPERT) -> Proof | Dropped:
     if record.status != "done":
         return Dropped(scenario.seed, record.status, record.reason[:300])
     if record.measures["success"] != 1.0:
+        if record.reason:
+            return Dropped(scenario.seed, "event bypassed", record.reason[:300])
         done = record.measures["route_completion"] or 0.0
         if any(event.rule_met is False for event in record.events):
             return Dropped(scenario.seed, "rule of its event not met", f"at {done:.2f} of the way")

@@ -278,8 +278,10 @@ class _Rounds:
             drawn = self.source.drawn(taken, count, self.jobs, self.progress)
             version = f"cities-{self.source.seeds[0]}-{self.source.seeds[-1]}"
             made = Suite(name=self.source.kind, version=version, scenarios=tuple(drawn))
-            return with_robot(made, self.options.robot)
-        return msgspec.structs.replace(self.source, scenarios=self.all[taken : taken + count])
+        else:
+            chosen = self.all[taken : taken + count]
+            made = msgspec.structs.replace(self.source, scenarios=chosen)
+        return with_robot(made, self.options.robot)
 
     def run(
         self, held: RunFolder, scenarios: Sequence[Scenario], hello: Hello, showing: _Showing

@@ -12,7 +12,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Split, Suite
 from cosim.spec.selection import select_scenarios
-from scenarios.suites.catalog import load_suite, with_robot
+from scenarios.suites.catalog import load_suite
 from scenarios.tools.gym.reward import Reward, usual_reward
 
 if TYPE_CHECKING:
@@ -69,8 +69,9 @@ def make_env(
         raise UsageError(
             "no episode of an environment is compared with its street: leave counterfactual out"
         )
-    whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
-    picked = select_scenarios(whole, scenarios, None, events, split)
+    whole = load_suite(suite) if isinstance(suite, str) else suite
+    selected = select_scenarios(whole, scenarios, None, events, split)
+    picked = [scenario.driven_by(options.robot) for scenario in selected]
     settled = with_goal(manifest, options.goal)
     for name in sorted({scenario.robot for scenario in picked}):
         check_camera(settled, robot_called(name), options.own_camera)

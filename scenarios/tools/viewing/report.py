@@ -135,7 +135,7 @@ def blind_rows(runs: Sequence[ReportedRun]) -> dict[str, dict[str, Estimate]]:
     """Return the success of the best blind schedules found, by suite of the runs and kind."""
     found = {}
     for run in runs:
-        exploit = exploit_of(run.spec.setup.suite_hash)
+        exploit = exploit_of(run.spec.setup.suite_hash, run.spec.robots)
         if exploit is not None:
             found[run.spec.suite] = {kind: share.estimate for kind, share in exploit.row().items()}
     return found

@@ -1,0 +1,1 @@
+"""`nav`: classical navigation by a lidar: costmap, local plan, regulated pure pursuit."""
