@@ -90,6 +90,22 @@ class LegState:
 
 
 @dataclass(frozen=True, slots=True)
+class Trunk:
+    """Attitude and motion of a robot's base link in the world frame.
+
+    rotation: rows of the matrix whose columns are the link's axes.
+    velocity_mps: of the link's centre of mass.
+    turn_radps: angular velocity.
+    """
+
+    rotation: tuple[
+        tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]
+    ]
+    velocity_mps: tuple[float, float, float]
+    turn_radps: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
 class RobotState:
     """State of the robot: pose of the base centre on the ground plane and motion of the base.
 
@@ -98,6 +114,7 @@ class RobotState:
     z_m: height of the base frame.
     tilt_rad: angle between the base's up axis and the vertical.
     legs: attitude and joints of a robot with legs; None for wheels.
+    trunk: attitude and motion of the base link, from a physics engine; not compared.
 
     The speeds of a robot with legs are means over its last gait cycle.
     """
@@ -108,6 +125,7 @@ class RobotState:
     z_m: float = 0.0
     tilt_rad: float = 0.0
     legs: LegState | None = None
+    trunk: Trunk | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

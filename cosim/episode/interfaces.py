@@ -186,6 +186,32 @@ class World(Protocol):
         """Advance one tick; people and vehicles move linearly from `before` to `after`."""
 
 
+class RangeSensor(Protocol):
+    """Casts rays from a robot against the collision shapes of the street."""
+
+    def distances(
+        self,
+        robot: RobotState,
+        street: Street,
+        height_m: float,
+        directions: NDArray[np.float64],
+        range_m: float,
+    ) -> NDArray[np.float64]:
+        """Return the (N,) distances in metres at which rays first hit; inf beyond the range.
+
+        height_m: height of the sensor above the ground under a level robot.
+        directions: (3, N) unit vectors in the frame of the robot's trunk.
+        """
+
+    def seen_people(
+        self, robot: RobotState, street: Street, height_m: float, range_m: float
+    ) -> NDArray[np.intp]:
+        """Return the rows of people within a range of whom a part is visible from a robot.
+
+        height_m: height of the eye above the ground under a level robot.
+        """
+
+
 class Camera(Protocol):
     """Renders the robot's view."""
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import Frame
-from cosim.episode.interfaces import Camera, Observation, Privileged
+from cosim.episode.interfaces import Camera, Observation, Privileged, RangeSensor
 from cosim.episode.loop import Moment, Step
 from cosim.episode.manifest_checks import calibration_of
+from cosim.episode.sensing import InertialSensor, Lidar, Tracker
 from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.episode_id import episode_id_of, seed_for
 from cosim.spec.goal import TakePicture, goals_for, in_robot_frame
@@ -128,6 +129,7 @@ class Observer:
     known: returns the simulator state at a moment.
     cameras: further cameras by name.
     look: takes pictures for picture goals.
+    rays: rays of lidar and tracked people, if the manifest requests one of them.
     """
 
     def __init__(
@@ -138,6 +140,7 @@ class Observer:
         known: Callable[[Moment], Privileged],
         cameras: Mapping[str, Camera],
         look: TakePicture | None = None,
+        rays: RangeSensor | None = None,
     ) -> None:
         def draws(purpose: str) -> np.random.Generator:
             return np.random.default_rng(seed_for(purpose, run_seed, scenario))
@@ -153,12 +156,27 @@ class Observer:
             manifest.odometry, scenario.start_pose, draws("odometry"), self._robot
         )
         self._calibration = None if spec is None else calibration_of(spec, self._robot)
+        self._lidar: Lidar | None = None
+        self._tracker: Tracker | None = None
+        self._imu: InertialSensor | None = None
+        if rays is not None and manifest.scan is not None:
+            self._lidar = Lidar(manifest.scan, rays, draws("lidar"))
+        if rays is not None and manifest.people != "none":
+            self._tracker = Tracker(self._robot, rays, draws("people"))
+        if manifest.imu != "none":
+            self._imu = InertialSensor(manifest.imu, draws("imu"))
 
     def moved(self, step: Step, put_back: bool) -> None:
         """Record a tick. `put_back` says that the robot is reset to another pose now."""
         self._odometer.moved(step.robot.pose, step.motion.robot.pose)
+        if self._imu is not None:
+            self._imu.moved(step.robot, step.motion.robot)
         if put_back:
             self._goals.put_back()
+            if self._tracker is not None:
+                self._tracker.put_back()
+            if self._imu is not None:
+                self._imu.put_back()
 
     def observed(
         self, now: Moment, time_s: float, camera: Camera | None, put_back: bool
@@ -192,6 +210,9 @@ class Observer:
                 name: self._picture(extra, self._manifest.cameras[name], now)
                 for name, extra in self._cameras.items()
             },
+            scan=None if self._lidar is None else self._lidar.read(robot, now.street),
+            imu=None if self._imu is None else self._imu.read(robot, time_s),
+            people=None if self._tracker is None else self._tracker.read(robot, now.street, time_s),
         )
         return observation, frame
 

@@ -186,6 +186,8 @@ class PolicyCaller:
                 for name, one in pictures.items()
             },
             goal=None if observation.goal is None else observation.goal.copied(),
+            scan=None if observation.scan is None else observation.scan.copied(),
+            people=None if observation.people is None else observation.people.copied(),
             privileged=self._copied_privileged(known)
             if known is not None and self.manifest.privileged
             else None,

@@ -230,9 +230,11 @@ RECORD_FILE = FlatFile(
     scenario=scenario.id scenario_hash=scenario.hash suite suite_hash seed=scenario.seed
     split structure decoy_of crowd_added run_seed=setup.seed episode robot policy=manifest.name
     policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
-    nonstandard goal_protocol=manifest.goal odometry privileged latency_ms real_time renderer
+    nonstandard goal_protocol=manifest.goal odometry lidar=manifest.scan
+    imu people privileged latency_ms real_time renderer
     gait gait_hash versions status reason ended ticks state_hash measures failures walked_into
     red_light_entries events injections metric_schema schema clock
+    scan=scan
     """,
     without="manifest.goals",
     defaults={"camera": None},

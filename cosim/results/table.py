@@ -60,6 +60,9 @@ _ORDER = (
     "nonstandard",
     "goal_protocol",
     "odometry",
+    "lidar",
+    "imu",
+    "people",
     "privileged",
     "latency_ms",
     "answer_ms",
@@ -110,6 +113,7 @@ def table_row(record: Record) -> dict[str, Any]:
         if spec
     ]
     row["camera"] = "; ".join(words) or "none"
+    row["lidar"] = "none" if record.manifest.scan is None else record.manifest.scan.in_words
     row["versions"] = msgspec.json.encode(record.setup.versions, order="deterministic").decode()
     counted: dict[str, Mapping[str, float | None]] = {
         "done": record.measures,

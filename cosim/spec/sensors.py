@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats
+from cosim.spec.validation import Ranged, Within
 
 ImuKind = Literal["none", "exact", "noisy"]
 """Names of the rows of `IMU`."""
@@ -35,7 +39,11 @@ PEOPLE: Final[Mapping[str, str]] = MappingProxyType(
 """Kinds of tracked people and their descriptions."""
 
 
-class ScanSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+MOST_RETURNS: Final = 2**17
+"""Largest number of distances in a scan."""
+
+
+class ScanSpec(Ranged, frozen=True, dict=True):
     """A lidar.
 
     rays: rays of a ring, at equal angles over the whole turn.
@@ -45,21 +53,69 @@ class ScanSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     elevation_deg: elevation of the lowest and the highest ring.
     noise_m: standard deviation of a distance.
 
+    Raises SpecError for a value out of its range.
+
     >>> ScanSpec(rays=180, range_m=10.0).angles_rad.shape
     (180,)
     """
 
-    rays: int = 360
-    range_m: float = 20.0
-    height_m: float = 0.3
-    rings: int = 1
+    rays: Annotated[int, Within(8, 4096)] = 360
+    range_m: Annotated[float, Within(0.5, 100)] = 20.0
+    height_m: Annotated[float, Within(0.05, 3)] = 0.3
+    rings: Annotated[int, Within(1, 64)] = 1
     elevation_deg: tuple[float, float] = (0.0, 0.0)
-    noise_m: float = 0.02
+    noise_m: Annotated[float, Within(0, 1)] = 0.02
+
+    @property
+    def called(self) -> str:
+        return "scan "
+
+    def contradictions(self) -> Iterator[str]:
+        for field in ("rays", "rings"):
+            if not isinstance(value := getattr(self, field), int):
+                yield f"scan {field} must be a whole number, not {value}"
+        low, high = self.elevation_deg
+        if not -80.0 <= low <= high <= 80.0:
+            yield (
+                f"scan elevation_deg must rise from the lowest to the highest ring within "
+                f"[-80, 80], not {low:g} to {high:g}"
+            )
+        elif self.rings == 1 and low != high:
+            yield (
+                f"scan elevation_deg is {low:g} to {high:g}, and one ring has one elevation: give "
+                "rings, or the same value twice"
+            )
+        if self.rings * self.rays > MOST_RETURNS:
+            yield (
+                f"scan rings x rays is {self.rings * self.rays}, and a scan has at most "
+                f"{MOST_RETURNS} distances"
+            )
 
     @property
     def angles_rad(self) -> NDArray[np.float64]:
         """(rays,) bearings from -pi, counter-clockwise; 0 is straight ahead."""
         return -math.pi + 2.0 * math.pi * np.arange(self.rays) / self.rays
+
+    @property
+    def elevations_rad(self) -> NDArray[np.float64]:
+        """(rings,) elevations, lowest first."""
+        return np.radians(np.linspace(*self.elevation_deg, self.rings))
+
+    @cached_property
+    def directions(self) -> Floats:
+        """(3, rings * rays) unit vectors in the frame of the robot's trunk, ring by ring."""
+        up, turn = np.meshgrid(self.elevations_rad, self.angles_rad, indexing="ij")
+        level = np.cos(up)
+        return np.stack([level * np.cos(turn), level * np.sin(turn), np.sin(up)]).reshape(3, -1)
+
+    @property
+    def in_words(self) -> str:
+        """Description for tables."""
+        rings = f" x {self.rings} rings" if self.rings > 1 else ""
+        return (
+            f"{self.rays} rays{rings}, {self.range_m:g} m, at {self.height_m:g} m, noise "
+            f"{self.noise_m:g} m"
+        )
 
 
 class Scan(msgspec.Struct, frozen=True, eq=False):
@@ -71,6 +127,10 @@ class Scan(msgspec.Struct, frozen=True, eq=False):
 
     ranges_m: NDArray[np.float32]
     spec: ScanSpec
+
+    def copied(self) -> Scan:
+        """Return the same scan with an array of its own."""
+        return Scan(self.ranges_m.copy(), self.spec)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return `ranges_m`."""
@@ -104,6 +164,47 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
     positions_m: NDArray[np.float32]
     velocities_mps: NDArray[np.float32]
 
+    def copied(self) -> Tracks:
+        """Return the same tracks with arrays of their own."""
+        return Tracks(self.ids.copy(), self.positions_m.copy(), self.velocities_mps.copy())
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return (N, 4): positions and velocities."""
         return np.array(np.hstack([self.positions_m, self.velocities_mps]), dtype)
+
+
+TRACKING_RANGE_M: Final = 15.0
+"""Horizontal range in metres within which people are tracked, in all directions."""
+
+
+class TrackNoise(NamedTuple):
+    """Errors of tracked people.
+
+    position_m, velocity_mps: standard deviations in x and in y, independent at each observation.
+    miss: probability that a visible person is missing from an observation.
+    switch_hz: mean rate at which a track changes its id, with that of a neighbour within
+        `swap_m` or for a new one.
+    forget_s: time out of sight after which a person gets a new id.
+    """
+
+    position_m: float = 0.1
+    velocity_mps: float = 0.15
+    miss: float = 0.05
+    switch_hz: float = 0.02
+    swap_m: float = 1.0
+    forget_s: float = 1.0
+
+
+class ImuNoise(NamedTuple):
+    """Standard deviations of an inertial sensor on each axis.
+
+    gyro_radps, accel_mps2: independent errors of each reading.
+    gyro_bias_radps, accel_bias_mps2: slow errors, Gauss-Markov processes.
+    bias_s: their time constant in seconds.
+    """
+
+    gyro_radps: float = 0.005
+    accel_mps2: float = 0.05
+    gyro_bias_radps: float = 0.003
+    accel_bias_mps2: float = 0.05
+    bias_s: float = 100.0

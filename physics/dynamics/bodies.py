@@ -10,15 +10,15 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import PERSON_RADIUS_M, LegState, RobotState
+from cosim.core.state import PERSON_RADIUS_M, LegState, RobotState, Trunk
 from cosim.spec.robot import Legs, Robot
 from cosim.spec.scenario import Barrier
 from physics.dynamics.bullet import p
+from physics.dynamics.client import UPRIGHT, BulletClient
 from physics.dynamics.drive import BodyNow, Motors, Vector
 from physics.dynamics.movers import Mover, TickPoses
-from physics.ground.mesh import Mesh, join, pybullet_lists
+from physics.ground.mesh import Mesh, join
 from physics.ground.tiles import CURB_M
 from physics.robots import urdf_path
 from physics.robots.kinematics import rotate, rows_of
@@ -42,7 +42,6 @@ _SEARCH_STEP_M: Final = 0.5
 """Distance in metres that the robot moves before nearby static bodies are searched again."""
 _NO_CHANGE: Final = (0.0, 0.0, 0.0)
 _UNKNOWN: Final = (math.inf, math.inf, math.inf)
-_UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _BODY_FRICTION: Final = 0.4
 """Friction coefficient of a robot's links that do not carry it."""
 _FOOT_FRICTION: Final = 1.0
@@ -61,11 +60,14 @@ or with the friction cone, skid turns are jerky.
 
 BodyKind = Literal["pedestrian", "vehicle", "wall", "object"]
 Moving = Literal["pedestrian", "vehicle"]
+Box = tuple[tuple[float, float, float], float, tuple[float, float, float]]
+"""Foot of an upright box's centre, its heading in radians, and length, width and height."""
+
 _Placement = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position of a body's centre, and its orientation as a quaternion."""
 
 
-class Bodies:
+class Bodies(BulletClient):
     """A running PyBullet client with all collision bodies of an episode.
 
     at_m: position of the robot's base frame
@@ -75,9 +77,7 @@ class Bodies:
     """
 
     def __init__(self, robot: Robot, substep_s: float) -> None:
-        self._client: int = p.connect(p.DIRECT)
-        if self._client < 0:
-            raise EngineError("PyBullet did not start")
+        super().__init__()
         self._com_height_m = robot.com_height_m
         self._legs = robot.drive if isinstance(robot.drive, Legs) else None
         self._identities: dict[int, tuple[BodyKind, str]] = {}
@@ -138,10 +138,6 @@ class Bodies:
             self._call("changeDynamics", self._robot, joint, jointDamping=0.0)
             self._call("setJointMotorControl2", self._robot, joint, p.VELOCITY_CONTROL, force=0.0)
 
-    def close(self) -> None:
-        """Disconnect the client."""
-        p.disconnect(self._client)
-
     def add_chunk(self, chunk: Chunk) -> list[int]:
         """Add the bodies of a tile; return their ids for `remove`."""
         self._searched_at_m = _UNKNOWN
@@ -150,35 +146,20 @@ class Bodies:
             of_friction.setdefault(patch.friction, []).append(patch.mesh)
         ground = [self._add_ground(join(meshes), value) for value, meshes in of_friction.items()]
         houses = [body for b in chunk.buildings for body in self._add_building(b)]
-        scanned = [self._add_concave(mesh) for mesh in chunk.standing]
+        scanned = [self.add_concave(mesh) for mesh in chunk.standing]
         self._identities |= dict.fromkeys(scanned, ("wall", "scan"))
         props = [self.add_prop(prop, z) for prop, z in chunk.props]
         return [*ground, *houses, *scanned, *props]
 
     def _add_ground(self, mesh: Mesh, value: float) -> int:
-        ground = self._add_concave(mesh)
+        ground = self.add_concave(mesh)
         self._call("changeDynamics", ground, -1, lateralFriction=value)
         return ground
 
-    def _add_concave(self, mesh: Mesh) -> int:
-        middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
-        flags = p.GEOM_FORCE_CONCAVE_TRIMESH
-        with pybullet_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
-            shape = self._call(
-                "createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags
-            )
-        return self._create_body(shape, middle)
-
     def _add_building(self, building: Building) -> list[int]:
-        height = building.size_m[2] + building.floor_m - building.base_m
-        boxes = [
-            ((building.x_m, building.y_m), building.heading_rad, (*building.size_m[:2], height))
-        ]
-        if building.outline is not None:
-            boxes = [_wall_box(wall, height) for wall in building.walls]
         bodies = []
-        for (x, y), heading, size in boxes:
-            bodies.append(self._add_box((x, y, building.base_m + CURB_M), heading, size))
+        for foot, heading, size in building_boxes(building):
+            bodies.append(self._add_box(foot, heading, size))
             self._identities[bodies[-1]] = ("wall", building.id)
         return bodies
 
@@ -223,7 +204,7 @@ class Bodies:
         """Remove bodies."""
         self._searched_at_m = _UNKNOWN
         for body in bodies:
-            self._call("removeBody", body)
+            self.remove_body(body)
             self._identities.pop(body, None)
 
     def show(self, kind: Moving, movers: Sequence[Mover]) -> None:
@@ -274,7 +255,7 @@ class Bodies:
 
     def _park(self, body: int) -> None:
         self._final_poses.pop(body, None)
-        p.resetBasePositionAndOrientation(body, (0.0, 0.0, PARKED_Z_M), _UPRIGHT, self._client)
+        p.resetBasePositionAndOrientation(body, (0.0, 0.0, PARKED_Z_M), UPRIGHT, self._client)
 
     def _acquire(self, pool: Any) -> int:
         waiting = self._idle.setdefault(pool, [])
@@ -293,17 +274,6 @@ class Bodies:
                 shape = self._call("createCollisionShape", p.GEOM_BOX, halfExtents=half)
             self._shapes[pool] = shape
         return self._create_body(self._shapes[pool], (0.0, 0.0, PARKED_Z_M))
-
-    def _create_body(self, shape: int, at: Any, turn: Any = _UPRIGHT) -> int:
-        body: int = self._call(
-            "createMultiBody",
-            baseMass=0.0,
-            baseCollisionShapeIndex=shape,
-            basePosition=[float(c) for c in at],
-            baseOrientation=turn,
-            useMaximalCoordinates=True,
-        )
-        return body
 
     def place_robot(
         self, xyz_m: tuple[float, float, float], roll_pitch_yaw: tuple[float, float, float]
@@ -400,7 +370,9 @@ class Bodies:
         m = self._rotation
         forward, turn = self.speeds()
         pose = Pose(x, y, math.atan2(m[3], m[0]))
-        state = RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
+        trunk = Trunk(rows_of(m), *self._velocity)
+        tilt = math.acos(min(max(m[8], -1.0), 1.0))
+        state = RobotState(pose, forward, turn, z, tilt, trunk=trunk)
         if self._legs is None:
             return state
         roll, pitch = math.atan2(m[7], m[8]), math.asin(min(max(-m[6], -1.0), 1.0))
@@ -446,14 +418,18 @@ class Bodies:
 
     def lines_blocked(self, begin_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
         """Return which of N lines, from (N, 3) to (N, 3) points in metres, hit a body."""
-        hits = self._call("rayTestBatch", begin_m.tolist(), end_m.tolist())
-        return np.array([hit[0] >= 0 for hit in hits], dtype=bool)
+        return np.isfinite(self.hit_shares(begin_m, end_m))
 
-    def _call(self, call: str, *args: Any, **options: Any) -> Any:
-        try:
-            return getattr(p, call)(*args, **options, physicsClientId=self._client)
-        except p.error as error:
-            raise EngineError(f"PyBullet: {call}: {error}") from error
+
+def building_boxes(building: Building) -> list[Box]:
+    """Return the boxes of a building: its walls if it is mapped."""
+    height = building.size_m[2] + building.floor_m - building.base_m
+    foot_m = building.base_m + CURB_M
+    if building.outline is None:
+        at = (building.x_m, building.y_m, foot_m)
+        return [(at, building.heading_rad, (*building.size_m[:2], height))]
+    boxes = [_wall_box(wall, height) for wall in building.walls]
+    return [((*at, foot_m), heading, size) for at, heading, size in boxes]
 
 
 def _wall_box(

@@ -22,6 +22,7 @@ from cosim.core.state import RobotState, Street
 from cosim.episode.interfaces import Camera, Director, Privileged, ViewCamera
 from cosim.episode.loop import EpisodeEngines, Moment
 from cosim.episode.observer import Observer
+from cosim.episode.sensing import sensing_range_m
 from cosim.people.yielding import StandingObstacles, standing_obstacles
 from cosim.place import overlay
 from cosim.place.barriers import without_barriers
@@ -42,6 +43,7 @@ from physics.dynamics.drive import SUBSTEP_S
 from physics.dynamics.drives import gait_drive
 from physics.dynamics.legs.gait_file import user_gait
 from physics.dynamics.world import BulletWorld
+from physics.sensors.caster import RayCaster
 from physics.street.furniture import Prop, footprints
 from physics.street.surface import Surface
 from scenarios.episodes.director import ObstacleAwareDirector, director_of
@@ -141,6 +143,11 @@ def staged(
             camera = stack.enter_context(eyes(manifest.camera))
             renderer = renderer_of(camera_of_choice(options.camera), options.appearance)
         cameras = {name: stack.enter_context(eyes(spec)) for name, spec in manifest.cameras.items()}
+        rays: RayCaster | None = None
+        if range_m := sensing_range_m(manifest):
+            rays = stack.enter_context(
+                RayCaster(street, scenario.barriers, scenario.obstacles, robot, range_m)
+            )
         look = None if camera is None else partial(draw_empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         if scenario.crowd.residents:
@@ -196,6 +203,7 @@ def staged(
                 lambda now: privileged_state(scenario, free(), waits_m(), now),
                 cameras,
                 look,
+                rays,
             ),
             eyes=eyes,
             injected=injected,
