@@ -132,4 +132,5 @@ def plan_in_robot_frame(payload: bytes, pose: Odometry) -> Floats | None:
     heading = pose.heading_rad or 0.0
     cos, sin = math.cos(heading), math.sin(heading)
     offset = points[chosen] - (pose.x_m, pose.y_m)
-    return offset @ np.array([[cos, -sin], [sin, cos]])
+    ahead_left: Floats = offset @ np.array([[cos, -sin], [sin, cos]])
+    return ahead_left
