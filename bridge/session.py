@@ -258,6 +258,7 @@ class Session:
             key,
             congestion_control=block,
             reliability=reliable,
+            express=True,  # as the others: a batch would arrive later than what follows it
             cache=zenoh.ext.CacheConfig(latched),
             publisher_detection=True,
             sample_miss_detection=zenoh.ext.MissDetectionConfig(

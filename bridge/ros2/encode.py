@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -20,13 +19,12 @@ from numpy.typing import NDArray
 from bridge.ros2.types import message
 from bridge.ros2.wire import Qos
 from cosim.core.clock import Clock
-from cosim.core.geometry import Floats
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import Calibration
 from cosim.spec.goal import Instruction, PointGoal
 from cosim.spec.odometry import Odometry
 from cosim.spec.ros2 import ORIGIN_S, SENT
-from cosim.spec.sensors import Imu, Scan, ScanSpec
+from cosim.spec.sensors import Imu, Scan
 
 _NS: Final = 1_000_000_000
 BASE: Final = "base_link"
@@ -234,8 +232,10 @@ def laser_scan(scan: Scan, time_ns: int) -> Any:
 def point_cloud(scan: Scan, time_ns: int) -> Any:
     """Return all rings of a lidar as a sensor_msgs/msg/PointCloud2 of x, y and z in metres, a row
     for each ring. Points without a return are infinite."""
-    points = scan.ranges_m[..., None] * _rays(scan.spec)
-    data = np.where(np.isfinite(scan.ranges_m)[..., None], points, np.inf).astype("<f4")
+    returned = np.isfinite(scan.ranges_m)
+    along = scan.spec.directions.reshape(3, *scan.ranges_m.shape)
+    points = np.where(returned, np.where(returned, scan.ranges_m, 0.0) * along, np.inf)
+    data = np.moveaxis(points, 0, -1).astype("<f4")
     fields = [
         message("sensor_msgs/msg/PointField", name, 4 * i, 7, 1) for i, name in enumerate("xyz")
     ]
@@ -252,16 +252,6 @@ def point_cloud(scan: Scan, time_ns: int) -> Any:
         data.reshape(-1).view(np.uint8),
         False,
     )
-
-
-@lru_cache(maxsize=4)
-def _rays(spec: ScanSpec) -> Floats:
-    """Return the (rings, rays, 3) unit vectors of a lidar's rays."""
-    up = np.radians(np.linspace(*spec.elevation_deg, spec.rings))[:, None]
-    around = spec.angles_rad[None]
-    flat = np.cos(up)
-    parts = (flat * np.cos(around), flat * np.sin(around), np.sin(up) + 0.0 * around)
-    return np.stack(parts, axis=-1)
 
 
 def image(rgb: NDArray[np.uint8], time_ns: int) -> Any:
@@ -335,6 +325,16 @@ def goal_pose(seen: Observation, time_ns: int) -> Any:
         header(time_ns, ODOM),
         message("geometry_msgs/msg/Pose", _point(*at), _yaw(towards)),
     )
+
+
+def relative_goal(seen: Observation, time_ns: int) -> Any:
+    """Return the point goal as a geometry_msgs/msg/PoseStamped in `base_link`; None without one."""
+    goal = seen.goal
+    if not isinstance(goal, PointGoal):
+        return None
+    towards = _yaw(math.atan2(goal.y_m, goal.x_m))
+    pose = message("geometry_msgs/msg/Pose", _point(goal.x_m, goal.y_m), towards)
+    return message("geometry_msgs/msg/PoseStamped", header(time_ns, BASE), pose)
 
 
 def episode_text(episode: str, seed: int, tick: int = 0, *, reset: bool = False) -> Any:
@@ -411,6 +411,7 @@ _ROWS: Final = (
     Topic(INITIAL, "estimated pose after the robot was put elsewhere"),
     Topic(GOAL, "point goal in `odom`, when it changes", qos=_LATCHED),
     Topic(INSTRUCTION, "instruction, when it changes", qos=_LATCHED),
+    Topic("/cosim/goal", "point goal in `base_link`", relative_goal),
     Topic("/tf", "odom -> base_link", tf),
     Topic("/odom", "estimated pose, and speeds", odometry),
     Topic("/imu", "angular speed and specific force (`--ros2-imu`)", _inertial),

@@ -25,7 +25,7 @@ from bridge.session import Session
 from cosim.spec.ros2 import Ros2Dialect, Ros2Distro
 
 NAME: Final = "cosim"
-"""Name of the node."""
+"""Name of the node of a run."""
 
 
 class Network(NamedTuple):
@@ -52,8 +52,9 @@ class Ros2Node:
     tokens_changed_s: Monotonic time of the last change of a token in this network.
     """
 
-    def __init__(self, session: Session, network: Network) -> None:
+    def __init__(self, session: Session, network: Network, name: str = NAME) -> None:
         self.network = network
+        self.name = name
         self.changed = threading.Condition()
         self._session = session
         self._dialect = DIALECTS[network.dialect]
@@ -63,7 +64,7 @@ class Ros2Node:
         self._by_gid: dict[bytes, Endpoint] = {}
         self._entities = 0
         self.tokens_changed_s = time.monotonic()
-        self._show(Endpoint("NN", network.domain, session.id, NAME, namespace=self._namespace))
+        self._show(Endpoint("NN", network.domain, session.id, name, namespace=self._namespace))
         session.watch(self._dialect.tokens, self._token)
 
     @property
@@ -148,7 +149,7 @@ class Ros2Node:
             kind,
             self.network.domain,
             self._session.id,
-            NAME,
+            self.name,
             (0, self._entities),
             self._namespace,
             full_topic(self.network.namespace, topic),

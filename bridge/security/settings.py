@@ -79,7 +79,7 @@ RIGHTS: Final[dict[Role, _Rights]] = {
     "injector": _Rights("inject pedestrians", ask=(f"{_ENV}/inject", f"{_ENV}/status")),
     "ros2": _Rights(
         "see sensors and drive, as a ROS 2 node",
-        ask=_ROS2_HISTORY,
+        ask=(*_ROS2_SENT, *_ROS2_HISTORY),
         hear=(*_ROS2_SENT, *_ROS2_HISTORY),
         show=(*_ROS2_TOKENS, *_ROS2_HISTORY),
         tell=_ROS2_TAKEN,

@@ -45,6 +45,7 @@ SENT: Final[Mapping[str, str]] = MappingProxyType(
         "/initialpose": "geometry_msgs/msg/PoseWithCovarianceStamped",
         "/goal_pose": "geometry_msgs/msg/PoseStamped",
         "/cosim/instruction": "std_msgs/msg/String",
+        "/cosim/goal": "geometry_msgs/msg/PoseStamped",
         "/tf": "tf2_msgs/msg/TFMessage",
         "/odom": "nav_msgs/msg/Odometry",
         "/imu": "sensor_msgs/msg/Imu",
