@@ -10,12 +10,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple, Self
 
 from bridge.ros2 import encode, types
 from bridge.ros2.commands import TWIST, TWIST_STAMPED, Received
 from bridge.ros2.node import Network, Ros2Node
-from bridge.session import open_session
+from bridge.session import Session, open_session
+from cosim.core.errors import EngineError
 from cosim.core.state import Command
 from cosim.spec.connection import Connection
 from cosim.spec.ros2 import CMD_VEL, SENT
@@ -58,6 +60,13 @@ def answers(peer: Peer, seen: Seen) -> None:
     peer.node.publish(CMD_VEL, twist(steer(seen)))
 
 
+def _opened(endpoint: str) -> Session:
+    """Return a session to a hub, which may not listen yet."""
+    while True:
+        with suppress(EngineError):
+            return open_session(Connection(role="worker", connect=endpoint))
+
+
 class Peer:
     """A node that calls `answer` for each /odom. seen: what it has received, by topic."""
 
@@ -69,7 +78,7 @@ class Peer:
         type_name: str = TWIST,
         name: str = "driver",
     ) -> None:
-        self.session = open_session(Connection(role="worker", connect=endpoint))
+        self.session = _opened(endpoint)
         self.node = Ros2Node(self.session, network, name)
         self.seen: dict[str, list[Any]] = {topic: [] for topic in SENT}
         self.goal: tuple[float, float] | None = None
