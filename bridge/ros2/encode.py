@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -447,3 +447,51 @@ def new_goal(seen: Observation, sent: SentGoal, time_ns: int) -> tuple[SentGoal,
     if at is not None and (sent.point is None or math.dist(at, sent.point) > GOAL_MOVED_M):
         return SentGoal(point=at), GOAL, goal_pose(seen, time_ns)
     return sent, "", None
+
+
+class EpisodeStream:
+    """Messages of an episode, in order: /clock of each tick before stamps of its time.
+
+    elapsed_s: Time of earlier episodes, for a clock that never goes back.
+    """
+
+    def __init__(self, episode: str, seed: int, elapsed_s: float = 0.0) -> None:
+        self._episode = episode, seed
+        self._elapsed_s = elapsed_s
+        self._sent = SentGoal()
+        self.tick = -1
+
+    def time_ns(self, tick: int) -> int:
+        """Return the time of a tick in nanoseconds."""
+        return stamp_ns(tick, self._elapsed_s)
+
+    def begun(self) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of the start."""
+        yield CLOCK, clock(self.time_ns(0))
+        yield EPISODE, episode_text(*self._episode)
+
+    def observed(
+        self, seen: Observation, wanted: Callable[[str], bool] = lambda _: True
+    ) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of an observation.
+
+        wanted: Whether a topic that is encoded only for a subscriber has one.
+        """
+        now_ns = self.time_ns(seen.tick)
+        for tick in range(max(self.tick + 1, 1), seen.tick + 1):
+            yield CLOCK, clock(self.time_ns(tick))
+        if self.tick < 0:
+            yield STATIC, static_tf(seen, now_ns)
+        self.tick = seen.tick
+        if seen.reset:
+            self._sent = SentGoal()
+            yield EPISODE, episode_text(*self._episode, seen.tick, reset=True)
+            yield INITIAL, initial_pose(seen, now_ns)
+        self._sent, topic, goal = new_goal(seen, self._sent, now_ns)
+        if topic:
+            yield topic, goal
+        for row in TOPICS.values():
+            if row.message is None or (row.lazy and not wanted(row.name)):
+                continue
+            if (sent := row.message(seen, now_ns)) is not None:
+                yield row.name, sent

@@ -120,7 +120,7 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True):
             )
         if not (math.isfinite(self.rate_hz) and self.rate_hz > 0.0):
             raise UsageError(f"--ros2-rate {self.rate_hz}: give a positive rate in Hz")
-        _camera(self.camera, self.depth)
+        camera_called(self.camera, "--ros2-camera", depth=self.depth)
         _scan(self.scan)
         parts = self.namespace.split("/")[1:]
         named = all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", part) for part in parts)
@@ -135,7 +135,7 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True):
         return Manifest(
             name,
             rate_hz=self.rate_hz,
-            camera=_camera(self.camera, self.depth),
+            camera=camera_called(self.camera, "--ros2-camera", depth=self.depth),
             waypoints=WaypointRule(index=0),
             goal="route_point",
             goals=("none", "route_point", "final_point", "random_point", "instruction"),
@@ -154,14 +154,14 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, domain=self.domain + number)
 
 
-def _camera(text: str, depth: bool) -> CameraSpec | None:
-    """Return the camera of an option's value. Raises UsageError."""
+def camera_called(text: str, option: str, *, depth: bool = False) -> CameraSpec | None:
+    """Return the front camera of an option's value. Raises UsageError."""
     if text == "none":
         if depth:
-            raise UsageError("--ros2-depth needs a camera: leave out --ros2-camera none")
+            raise UsageError(f"--ros2-depth needs a camera: leave out {option} none")
         return None
     if not (found := _CAMERA.fullmatch(text)):
-        raise UsageError(f"--ros2-camera '{text}': write it as 512x288, 512x288@75 or none")
+        raise UsageError(f"{option} '{text}': write it as 512x288, 512x288@75 or none")
     return CameraSpec(int(found[1]), int(found[2]), float(found[3] or 75.0), depth=depth)
 
 

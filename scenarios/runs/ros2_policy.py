@@ -32,7 +32,7 @@ from bridge.ros2.commands import (
     judged,
     plan_in_robot_frame,
 )
-from bridge.ros2.encode import TOPICS, SentGoal
+from bridge.ros2.encode import TOPICS
 from bridge.ros2.node import NAME, Network, Ros2Node
 from bridge.ros2.types import message_store
 from bridge.ros2.wire import Endpoint, full_topic, type_hash
@@ -81,29 +81,25 @@ class Ros2Policy:
         self._plan: Received | None = None
         self._remarks: dict[str, None] = {}
         self._controller: tuple[bytes, str] | None = None
-        self._episode = "", 0
-        self._tick = -1
+        self._stream: encode.EpisodeStream | None = None
         self._elapsed_s = 0.0
-        self._goal = SentGoal()
         self._last: tuple[Command, int] = STILL, 0
         self._heard_s = 0.0
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Wait for a node that publishes /cmd_vel, and announce the episode to it."""
         node = self._joined()
-        if self._tick >= 0 and self.settings.clock == "monotonic":
-            self._elapsed_s += Clock().time_s(self._tick + 1)
-        again = self._tick >= 0
-        self._episode = episode_id, seed
-        self._tick = -1
-        self._goal = SentGoal()
+        before = self._stream
+        if before is not None and self.settings.clock == "monotonic":
+            self._elapsed_s += Clock().time_s(before.tick + 1)
+        self._stream = encode.EpisodeStream(episode_id, seed, self._elapsed_s)
         self._controller = None
         self._last = STILL, 0
         self.took_ms = []
         self._await_controller(node)
-        node.publish(encode.CLOCK, encode.clock(self._time_ns(0)))
-        node.publish(encode.EPISODE, encode.episode_text(episode_id, seed))
-        if again:
+        for topic, sent in self._stream.begun():
+            node.publish(topic, sent)
+        if before is not None:
             time.sleep(SETTLE_S)
         self._queue.clear()
         self._plan = None
@@ -112,15 +108,18 @@ class Ros2Policy:
     def act(self, seen: Observation) -> Command:
         """Publish an observation and return the command that answers it."""
         began_s = time.perf_counter()
-        node = self._joined()
-        first = self._tick < 0
+        node, stream = self._joined(), self._stream
+        assert stream is not None, "reset comes first"
+        first = stream.tick < 0
         self._refuse_another(self._queue)
         self._queue.clear()
-        self._publish(node, seen, first)
-        self._tick = seen.tick
-        command = (
-            self._held(node, seen) if self.settings.wait == "rate" else self._next(node, first)
-        )
+        for topic, sent in stream.observed(seen, node.has_subscriber):
+            node.publish(topic, sent)
+        now_ns = stream.time_ns(seen.tick)
+        if self.settings.wait == "rate":
+            command = self._held(node, seen.tick, now_ns)
+        else:
+            command = self._next(node, now_ns, first)
         self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
         return self._with_plan(command, seen)
 
@@ -148,32 +147,7 @@ class Ros2Policy:
     def _take_plan(self, got: Received) -> None:
         self._plan = got
 
-    def _time_ns(self, tick: int) -> int:
-        return encode.stamp_ns(tick, self._elapsed_s)
-
-    def _publish(self, node: Ros2Node, seen: Observation, first: bool) -> None:
-        """Publish an observation: /clock of each tick first, the picture last."""
-        now_ns = self._time_ns(seen.tick)
-        for tick in range(self._tick + 1, seen.tick + 1):
-            if tick > 0:  # tick 0 was published when the episode was announced
-                node.publish(encode.CLOCK, encode.clock(self._time_ns(tick)))
-        if first:
-            node.publish(encode.STATIC, encode.static_tf(seen, now_ns))
-        if seen.reset:
-            self._goal = SentGoal()
-            text = encode.episode_text(*self._episode, seen.tick, reset=True)
-            node.publish(encode.EPISODE, text)
-            node.publish(encode.INITIAL, encode.initial_pose(seen, now_ns))
-        self._goal, topic, goal = encode.new_goal(seen, self._goal, now_ns)
-        if topic:
-            node.publish(topic, goal)
-        for row in TOPICS.values():
-            if row.message is None or (row.lazy and not node.has_subscriber(row.name)):
-                continue
-            if (sent := row.message(seen, now_ns)) is not None:
-                node.publish(row.name, sent)
-
-    def _next(self, node: Ros2Node, first: bool) -> Command:
+    def _next(self, node: Ros2Node, now_ns: int, first: bool) -> Command:
         """Wait for the command that answers the observation. Raises PolicyFault without one."""
         began_s = time.monotonic()
         allowed_s = self._allowed_s(first)
@@ -184,7 +158,7 @@ class Ros2Policy:
                 raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
             node.wait_for(lambda: self._queue, min(left_s, _LOOK_S))
             while self._queue:
-                if (command := self._accepted(self._queue.popleft())) is not None:
+                if (command := self._accepted(self._queue.popleft(), now_ns)) is not None:
                     return command
             if node.publishers_of(CMD_VEL):
                 seen_s = now_s
@@ -192,34 +166,34 @@ class Ros2Policy:
                 name = "the node" if self._controller is None else self._controller[1]
                 raise PolicyFault(f"is gone: {name} published {CMD_VEL}, and has left")
 
-    def _held(self, node: Ros2Node, seen: Observation) -> Command:
+    def _held(self, node: Ros2Node, at_tick: int, now_ns: int) -> Command:
         """Return a command if one comes within two periods, else the last one while it holds."""
         now_s = time.monotonic()
         until_s = now_s + _SILENT_PERIODS / self.settings.rate_hz
         while (left_s := until_s - time.monotonic()) > 0.0:
             node.wait_for(lambda: self._queue, left_s)
             while self._queue:
-                if (command := self._accepted(self._queue.popleft())) is not None:
-                    self._last = command, seen.tick
+                if (command := self._accepted(self._queue.popleft(), now_ns)) is not None:
+                    self._last = command, at_tick
                     self._heard_s = time.monotonic()
                     return command
         allowed_s = self._allowed_s(False)
         if time.monotonic() - self._heard_s > allowed_s:
             raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
         command, tick = self._last
-        return command if Clock().time_s(seen.tick - tick) <= HOLD_S else STILL
+        return command if Clock().time_s(at_tick - tick) <= HOLD_S else STILL
 
     def _allowed_s(self, first: bool) -> float:
         """Return the timeout of an answer, before that of the run."""
         whole_s = self.settings.start_s if first else self.settings.answer_s
         return max(whole_s - _EARLY_S, 0.5 * whole_s)
 
-    def _accepted(self, got: Received) -> Command | None:
+    def _accepted(self, got: Received, now_ns: int) -> Command | None:
         """Return the command of a message; None, with a remark, if it is refused."""
         found: Judged = judged(
             got,
             self.settings.wait,
-            self._time_ns(self._tick),
+            now_ns,
             type_hash(got.type, self.settings.distro) if got.type in COMMAND_TYPES else "",
             attached=self.settings.dialect == "rmw_zenoh",
         )
