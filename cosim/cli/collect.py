@@ -19,6 +19,7 @@ from cosim.cli.options import LEARN, camera_here, check_output, parse_size, repl
 from cosim.cli.progress import doing, stages_in_lines
 from cosim.cli.run_progress import ProgressDisplay
 from cosim.core.errors import INTERRUPTED, UsageError
+from cosim.spec.demo_options import DataFormat
 from cosim.spec.run_config import Option, RunConfig
 
 if TYPE_CHECKING:
@@ -131,6 +132,10 @@ class DemoConfig:
     unsolved: Annotated[
         bool, Option("Store unsolved episodes, too, up to where the robot is put back.")
     ] = False
+    format: Annotated[
+        DataFormat,
+        Option("A LeRobot data set, or a ROS 2 bag of each episode (package extra [ros2])."),
+    ] = "lerobot"
 
     @property
     def collecting(self) -> DemoOptions:
@@ -147,6 +152,7 @@ class DemoConfig:
             noise=self.noise,
             learner=self.learner,
             unsolved=self.unsolved,
+            format=self.format,
         )
 
 
@@ -229,6 +235,9 @@ def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
         )
     if found.spare:
         out.print(f"{found.spare} more were solved than requested, and left out", highlight=False)
+    if found.bags:
+        out.print(f"Bags: {folder / 'bags'}, one for each episode", highlight=False)
+        return
     if (back := found.back) is None:
         err.print("The data set was whole already: nothing is written.")
         return
@@ -290,7 +299,9 @@ def _show_board(
 
 
 def _size_mb(folder: Path) -> float:
-    parts = [path for name in ("meta", "data", "videos") for path in (folder / name).rglob("*")]
+    parts = [
+        path for name in ("meta", "data", "videos", "bags") for path in (folder / name).rglob("*")
+    ]
     return sum(path.stat().st_size for path in parts if path.is_file()) / 1e6
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 
@@ -24,6 +24,10 @@ _FASTEST_HZ: Final = 20.0
 """Maximum rate of pictures; a tick takes 0.05 s."""
 
 
+DataFormat = Literal["lerobot", "rosbag2"]
+"""Forms of a data set."""
+
+
 class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Options of recorded demonstrations.
 
@@ -34,6 +38,7 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     noise: share of the time in which another command than the expert's is driven, in bursts.
     learner: policy that drives in this time; "" for the expert's command, slowed and turned at
         random.
+    format: form of the data set: LeRobot, or a ROS 2 bag of each episode.
     unsolved: also record episodes that the expert fails, up to the first reset of the robot. Raises
         SpecError.
     """
@@ -45,6 +50,7 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     noise: float = 0.0
     learner: str = ""
     unsolved: bool = False
+    format: DataFormat = "lerobot"
 
     def __post_init__(self) -> None:
         if self.rate_hz not in (
