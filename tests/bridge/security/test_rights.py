@@ -41,6 +41,7 @@ MAY_ASK: dict[str, tuple[str, ...]] = {
     "policy": (),
     "coordinator": (f"{ENV}/director", POLICY),
     "director": (),
+    "ros2": (),
 }
 """At a coordinator's hub. A director has no business there: others connect to it."""
 
