@@ -523,10 +523,10 @@ class RunConfig:
     @property
     def _ros2_given(self) -> str:
         """First option of ROS 2 that is not at its default, "" if all are."""
-        names = [name for name in self.__dataclass_fields__ if name.startswith("ros2_")]
-        defaults = self.__dataclass_fields__
-        changed = (name for name in names if getattr(self, name) != defaults[name].default)
-        return "".join(f"--{name.replace('_', '-')}" for name in list(changed)[:1])
+        known = self.__dataclass_fields__
+        changed = (name for name in ROS2_OPTIONS if getattr(self, name) != known[name].default)
+        name = next(changed, "")
+        return f"--{name.replace('_', '-')}" if name else ""
 
     @property
     def ros2(self) -> Ros2Settings | None:
@@ -596,6 +596,10 @@ class RunConfig:
         return run_connections(
             self.live, self.director, self.policy_at, self.tls, self.insecure, ros2
         )
+
+
+ROS2_OPTIONS = tuple(name for name in RunConfig.__dataclass_fields__ if name.startswith("ros2_"))
+"""Fields of a policy that is a ROS 2 node."""
 
 
 def help_of(field: str) -> str:
