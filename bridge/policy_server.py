@@ -1,8 +1,7 @@
 """Serve a policy to `cosim run --policy zenoh:NAME --policy-at ENDPOINT`, from any Python >= 3.9.
 
-Copy this file next to a policy; it needs eclipse-zenoh, msgspec and numpy. cosim imports it, too,
-for isolated policies and the shared renderer. A request carries run, episode, attempt and step: a
-repeated one gets the cached reply.
+Copy this file next to a policy; it needs eclipse-zenoh, msgspec and numpy. cosim imports it, too.
+A request carries run, episode, attempt and step: a repeated one gets the cached reply.
 """
 
 from __future__ import annotations
@@ -61,11 +60,12 @@ class PackedArray(msgspec.Struct, frozen=True):
 
 
 class EpisodeConstants(msgspec.Struct, frozen=True):
-    """Constants of an episode. cameras: K (3 x 3), distortion (5), pose on the robot (4 x 4)."""
+    """Constants of an episode. cameras: K, distortion, place on the robot. lidar: its `scan`."""
 
     robot: dict[str, Union[str, float]] = {}
     cameras: dict[str, tuple[list[list[float]], list[float], list[list[float]]]] = {}
     knowledge: bytes = b""
+    lidar: dict[str, Any] = {}
 
 
 class _EpisodeMessage(msgspec.Struct, frozen=True):
@@ -90,9 +90,8 @@ class ActRequest(_EpisodeMessage, frozen=True, tag="act"):
     """Request: an observation.
 
     step: Number of this request, from 0.
-    arrays: By names like "rgb", "goal.rgb" of a goal, "left/rgb" of a further camera.
-    about: Only in the first request.
-    knowledge: For a privileged policy in the shared renderer, encoded by cosim.
+    arrays: By names like "rgb", "goal.rgb", "left/rgb" of a further camera, "scan", "people.ids".
+    about: Only in the first request. knowledge: For a privileged policy in the shared renderer.
     """
 
     step: int
@@ -103,6 +102,7 @@ class ActRequest(_EpisodeMessage, frozen=True, tag="act"):
     reset: bool = False
     goal: Optional[dict[str, Any]] = None
     odometry: Optional[tuple[float, float, Optional[float]]] = None
+    imu: Optional[tuple[float, float, float, float, float, float]] = None
     arrays: dict[str, PackedArray] = {}
     about: Optional[EpisodeConstants] = None
     knowledge: bytes = b""
@@ -236,14 +236,15 @@ def _line_of(error: BaseException) -> str:
 
 
 class _PlainFields(SimpleNamespace):
-    """Goal, pose or picture. As a numpy array: its picture or only array, else its numbers."""
+    """Goal, pose, picture or sensor. As a numpy array: its main array, else its numbers."""
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
         fields = {name: value for name, value in vars(self).items() if value is not None}
-        values = list(fields.values())
+        values = [v for one in fields.values() for v in (one if isinstance(one, tuple) else [one])]
         if all(isinstance(value, (int, float)) for value in values):
             return np.array(values, dtype)
-        array = values[0] if len(values) == 1 else fields.get("rgb")
+        array = values[0] if len(values) == 1 else fields.get("rgb", fields.get("ranges_m"))
+        array = np.hstack(values[1:]) if "ids" in fields else array
         if not isinstance(array, np.ndarray):
             raise TypeError(f"this is no array: read its {', '.join(fields)}")
         return np.array(array, dtype)
@@ -256,8 +257,8 @@ class EpisodeDecoder:
     """
 
     makes: ClassVar[dict[str, Any]] = {
-        **dict.fromkeys(("camera", "picture", "odometry"), _PlainFields),
-        **dict.fromkeys(("robot", "observation"), SimpleNamespace),
+        **dict.fromkeys(("camera", "picture", "odometry", "scan", "imu", "people"), _PlainFields),
+        **dict.fromkeys(("robot", "lidar", "observation"), SimpleNamespace),
         "goal": lambda type, **fields: _PlainFields(**fields),
     }
 
@@ -278,6 +279,8 @@ class EpisodeDecoder:
             parts = {kind: arrays.get(f"{name}/{kind}") for kind in _PICTURE}
             pictures[name] = makes["picture"](camera=self.cameras[name], **parts)
         goal = {name[5:]: one for name, one in arrays.items() if name.startswith("goal.")}
+        tracks = {k: arrays.get(f"people.{k}") for k in ("ids", "positions_m", "velocities_mps")}
+        lidar = makes["lidar"](**self.about.lidar) if "scan" in arrays else None
         pose = dict(zip(("x_m", "y_m", "heading_rad"), one.odometry or ()))
         return makes["observation"](
             **{kind: arrays.get(kind) for kind in _PICTURE},
@@ -289,6 +292,9 @@ class EpisodeDecoder:
             odometry=makes["odometry"](**pose) if pose else None,
             camera=self.cameras.get(""),
             pictures=pictures,
+            scan=makes["scan"](ranges_m=arrays["scan"], spec=lidar) if lidar else None,
+            imu=makes["imu"](gyro_radps=one.imu[:3], accel_mps2=one.imu[3:]) if one.imu else None,
+            people=None if tracks["ids"] is None else makes["people"](**tracks),
         )
 
     def privileged(self, knowledge: bytes) -> Any:
@@ -511,7 +517,7 @@ def unpack_array(array: PackedArray, memory: Any = None) -> Any:
     """Return a copy of an array of an observation. Raises ValueError if invalid."""
     if array.jpeg:
         return _from_jpeg(array.data).reshape(array.shape)
-    if array.dtype not in ("|u1", "<f4") or any(side < 0 for side in array.shape):
+    if array.dtype not in ("|u1", "<f4", "<i4") or any(side < 0 for side in array.shape):
         raise ValueError(f"an array of {array.dtype} {array.shape}")
     count = int(np.prod(array.shape, dtype=np.int64))
     if array.at < 0:
@@ -532,15 +538,12 @@ def _packed_answer(one: ActRequest, answer: Any) -> ActReply:
     if not all(isinstance(v, numbers) and not isinstance(v, bool) for v in speeds):
         shown = "Command(v_mps={!r}, w_radps={!r})".format(*speeds)[:LONGEST_MESSAGE]
         raise PolicyFault(f"answered {shown}: both must be finite numbers")
-    v_mps, w_radps = map(_float, speeds)
+    huge = (isinstance(v, int) and v.bit_length() > 1000 for v in speeds)
+    v_mps, w_radps = (np.inf if large else float(v) for v, large in zip(speeds, huge))
     plan = getattr(answer, "waypoints", None)
     if plan is None:
         return ActReply(*one.signature, one.step, v_mps, w_radps)
     return ActReply(*one.signature, one.step, v_mps, w_radps, _packed_waypoints(plan), planned=True)
-
-
-def _float(value: Any) -> float:
-    return np.inf if isinstance(value, int) and value.bit_length() > 1000 else float(value)
 
 
 def _packed_waypoints(answer: Any) -> PackedArray:
@@ -587,9 +590,7 @@ def serve(
     name = name or manifest["name"]
     server = secrets.token_hex(4)
     if not all(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", part) for part in (name, domain)):
-        raise ValueError(
-            f"'{name}' or '{domain}' cannot stand in a key: use 1 to 64 of A-Za-z0-9_-"
-        )
+        raise ValueError(f"'{name}' or '{domain}' cannot stand in a key: use 1-64 of A-Za-z0-9_-")
     below = policy_key(domain, name, server)
     source = source or _source_of(desk.policy)
     requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -659,8 +660,7 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
     if host != "localhost" and not insecure and not (tls and found[1] == "tls"):
         raise ValueError(
             f"{found[0]} is beyond this machine and unguarded: whoever can reach it may ask the "
-            "policy and read all that is sent. Use tls/... with tls=FOLDER (`cosim certs` makes "
-            "it), or say insecure"
+            "policy. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
         )
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from cosim.spec.options import EpisodeOptions, PolicyHost
     from cosim.spec.robot import Mount, Robot
     from cosim.spec.scenario import Scenario, Suite
+    from cosim.spec.sensors import Imu, Scan, ScanSpec, Tracks
     from scenarios.episodes.episode import Episode
     from scenarios.runs.run import run
     from scenarios.suites.catalog import load_suite
@@ -54,6 +55,7 @@ __all__ = [
     "Episode",
     "EpisodeOptions",
     "ImageGoal",
+    "Imu",
     "Instruction",
     "Log",
     "Manifest",
@@ -66,8 +68,11 @@ __all__ = [
     "Record",
     "Robot",
     "RoutePatch",
+    "Scan",
+    "ScanSpec",
     "Scenario",
     "Suite",
+    "Tracks",
     "WaypointRule",
     "load_policy",
     "load_suite",
@@ -85,6 +90,7 @@ _HOMES = {
     "Episode": "scenarios.episodes.episode",
     "EpisodeOptions": "cosim.spec.options",
     "ImageGoal": "cosim.spec.goal",
+    "Imu": "cosim.spec.sensors",
     "Instruction": "cosim.spec.goal",
     "Log": "cosim.results.log",
     "Manifest": "cosim.spec.manifest",
@@ -97,8 +103,11 @@ _HOMES = {
     "Record": "cosim.results.record",
     "Robot": "cosim.spec.robot",
     "RoutePatch": "cosim.spec.goal",
+    "Scan": "cosim.spec.sensors",
+    "ScanSpec": "cosim.spec.sensors",
     "Scenario": "cosim.spec.scenario",
     "Suite": "cosim.spec.scenario",
+    "Tracks": "cosim.spec.sensors",
     "WaypointRule": "cosim.spec.manifest",
     "load_policy": "cosim.policies.load",
     "load_suite": "scenarios.suites.catalog",

@@ -137,11 +137,18 @@ class DemoConfig:
         Option("A LeRobot data set, or a ROS 2 bag of each episode (package extra [ros2])."),
     ] = "lerobot"
 
+    lidar: Annotated[
+        int, Option("Rays of a lidar that is stored, too; 0 for none.", metavar="RAYS")
+    ] = 0
+    imu: Annotated[str, Option("Inertial sensor that is stored: none, exact, noisy.")] = "none"
+    people: Annotated[str, Option("Tracked people that are stored: none, seen.")] = "none"
+
     @property
     def collecting(self) -> DemoOptions:
         """Return the settings of the recorded data. Raises UsageError, SpecError."""
         from cosim.spec.camera import CameraSpec
         from cosim.spec.demo_options import DemoOptions
+        from cosim.spec.sensors import ScanSpec, imu_called, people_called
 
         wide, high = parse_size("--camera", self.size)
         return DemoOptions(
@@ -153,6 +160,9 @@ class DemoConfig:
             learner=self.learner,
             unsolved=self.unsolved,
             format=self.format,
+            scan=ScanSpec(rays=self.lidar) if self.lidar else None,
+            imu=imu_called(self.imu),
+            people=people_called(self.people),
         )
 
 

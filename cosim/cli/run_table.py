@@ -193,7 +193,11 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
     """
     named = [
         "policy",
+        "track",
         "camera",
+        "lidar",
+        "imu",
+        "people",
         "rate_hz",
         "goal_protocol",
         "odometry",
@@ -206,12 +210,29 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
     if not {*named} <= set(table.columns):
         return
     follows = folder is None or any(map(holds_waypoints, folder.glob("episodes/*/trajectory.npz")))
-    for policy, camera, rate_hz, goal, odometry, knows, waypoints, seed, odd, runs in (
-        table[named].drop_duplicates().itertuples(index=False)
-    ):
+    for (
+        policy,
+        track,
+        camera,
+        lidar,
+        imu,
+        people,
+        rate_hz,
+        goal,
+        odometry,
+        knows,
+        waypoints,
+        seed,
+        odd,
+        runs,
+    ) in table[named].drop_duplicates().itertuples(index=False):
         terms = [
             f"policy {policy_in_words(policy, knows)}",
+            f"sensor track {track}",
             f"at {rate_hz:g} Hz" if camera == "none" else f"camera {camera}, at {rate_hz:g} Hz",
+            *([f"lidar {lidar}"] if lidar != "none" else []),
+            *([f"imu {imu}"] if imu != "none" else []),
+            *([f"people {people}"] if people != "none" else []),
             f"goal {goal}",
             f"odometry {odometry}",
             *([f"policy {runs}"] if runs != "in-process" else []),

@@ -14,18 +14,26 @@ from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import ODOMETRY
 from cosim.spec.robot import Mount, Robot
+from cosim.spec.sensors import ScanSpec, imu_called, people_called
 
 
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
     """Return a manifest with the goal protocol of the run, if there is one.
 
-    Raises UsageError for an unknown goal protocol or odometry, and for goals that the policy does
-    not support. It also refuses picture goals and further cameras without a main camera.
+    Raises UsageError for an unknown goal protocol, odometry, inertial sensor or kind of tracked
+    people, and for goals that the policy does not support. It also refuses picture goals and
+    further cameras without a main camera.
     """
     settled = manifest if goal is None else replace(manifest, goal=goal)
     kind = GOALS[goal_called(settled.goal)]
     if settled.odometry not in ODOMETRY:
         raise unknown("odometry", settled.odometry, ODOMETRY)
+    imu_called(settled.imu)
+    people_called(settled.people)
+    if not isinstance(settled.scan, ScanSpec | None):
+        raise UsageError(
+            f"policy '{manifest.name}': scan must be a cosim.ScanSpec or None, not {settled.scan!r}"
+        )
     if settled.goals and settled.goal not in settled.goals:
         wanted = " or ".join(settled.goals)
         raise UsageError(

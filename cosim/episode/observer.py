@@ -8,12 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
+from cosim.core.errors import UsageError
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import Frame
 from cosim.episode.interfaces import Camera, Observation, Privileged, RangeSensor
 from cosim.episode.loop import Moment, Step
 from cosim.episode.manifest_checks import calibration_of
-from cosim.episode.sensing import InertialSensor, Lidar, Tracker
+from cosim.episode.sensing import InertialSensor, Lidar, Tracker, sensing_range_m
 from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.episode_id import episode_id_of, seed_for
 from cosim.spec.goal import TakePicture, goals_for, in_robot_frame
@@ -129,7 +130,7 @@ class Observer:
     known: returns the simulator state at a moment.
     cameras: further cameras by name.
     look: takes pictures for picture goals.
-    rays: rays of lidar and tracked people, if the manifest requests one of them.
+    rays: rays of lidar and tracked people; without them, a manifest with one raises UsageError.
     """
 
     def __init__(
@@ -159,6 +160,8 @@ class Observer:
         self._lidar: Lidar | None = None
         self._tracker: Tracker | None = None
         self._imu: InertialSensor | None = None
+        if rays is None and sensing_range_m(manifest):
+            raise UsageError(f"policy '{manifest.name}' has a lidar or tracked people: give rays")
         if rays is not None and manifest.scan is not None:
             self._lidar = Lidar(manifest.scan, rays, draws("lidar"))
         if rays is not None and manifest.people != "none":

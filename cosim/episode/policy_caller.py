@@ -19,7 +19,7 @@ from bridge.policy_server import PolicyFault, error_text, policy_call
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline
-from cosim.core.state import Command, RobotState, Signal, Vehicles
+from cosim.core.state import Command, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.spec.manifest import Manifest
@@ -201,9 +201,7 @@ class PolicyCaller:
         robot = known.robot
         vehicles = known.vehicles
         return Privileged(
-            robot=RobotState(
-                robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad, robot.legs
-            ),
+            robot=replace(robot),
             route=self._route[1],
             route_s_m=known.route_s_m,
             people=known.people.copied(),

@@ -42,6 +42,7 @@ from cosim.spec.scenario import Scenario
 
 MIN_CHANGED: Final = 6
 """Minimum number of changed pairs for a verdict."""
+_TRACK: Final = "sensor track"
 PairedVerdict = Literal["within noise", "too few", "better", "worse", "differs", ""]
 
 
@@ -465,9 +466,15 @@ def _looks_apart(one: WholeRun, other: WholeRun) -> str:
 
 
 def _differing_terms(before: ComparedRun, after: ComparedRun) -> str:
-    """Return in words the terms that differ between two runs; "" if none do."""
+    """Return in words the terms that differ between two runs; "" if none do.
+
+    A blind policy is a baseline of every sensor track but the privileged one.
+    """
     one, other = _terms(before.table), _terms(after.table)
     apart = [name for name in one if one[name] != other[name]]
+    tracks = {terms[_TRACK] for terms in (one, other)}
+    if "blind" in tracks and "privileged" not in tracks:
+        apart = [name for name in apart if name != _TRACK]
     return "; ".join(
         f"{name} {one[name]} ({before.label}) and {other[name]} ({after.label})" for name in apart
     )
@@ -485,7 +492,7 @@ def _terms(table: pd.DataFrame) -> dict[str, str]:
     return {
         "goal": first["goal_protocol"],
         "odometry": first["odometry"],
-        "knowledge": "privileged" if first["privileged"] else "of its own sensors",
+        _TRACK: first["track"],
         "latency": "real time" if first["real_time"] else f"{first['latency_ms']:g} ms",
     }
 

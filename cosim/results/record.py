@@ -231,7 +231,7 @@ RECORD_FILE = FlatFile(
     split structure decoy_of crowd_added run_seed=setup.seed episode robot policy=manifest.name
     policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
     nonstandard goal_protocol=manifest.goal odometry lidar=manifest.scan
-    imu people privileged latency_ms real_time renderer
+    imu=manifest.imu people=manifest.people privileged latency_ms real_time renderer
     gait gait_hash versions status reason ended ticks state_hash measures failures walked_into
     red_light_entries events injections metric_schema schema clock
     scan=scan

@@ -147,7 +147,8 @@ RUN_FILE = FlatFile(
     """
     suite robots suite_version suite_hash policy policy_name=manifest.name
     policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
-    goal_protocol=manifest.goal odometry lidar=manifest.scan imu people latency_ms real_time
+    goal_protocol=manifest.goal odometry lidar=manifest.scan imu=manifest.imu
+    people=manifest.people latency_ms real_time
     seed scenarios versions renderer gait gait_hash counterfactual shared_renderer metric_schema
     shard schema
     """,

@@ -54,6 +54,7 @@ _ORDER = (
     "policy",
     "policy_version",
     "policy_runs",
+    "track",
     "camera",
     "rate_hz",
     "waypoints",
@@ -88,8 +89,8 @@ _RECORD_ONLY = {
 }
 """Keys of record.json that are no column of results.csv."""
 COLUMNS = (*_ORDER, *(key for key in RECORD_FILE.keys if key not in {*_ORDER, *_RECORD_ONLY}))
-"""Columns of results.csv before the metrics: `answer_ms`, and keys of record.json without
-`_RECORD_ONLY`."""
+"""Columns of results.csv before the metrics: `answer_ms`, the sensor track, and keys of record.json
+without `_RECORD_ONLY`."""
 ORACLE = "orca"
 """Policy used to prove suites; it has privileged knowledge and does not compete."""
 MAX_INVALID_SHARE = 0.02
@@ -103,7 +104,10 @@ def table_row(record: Record) -> dict[str, Any]:
 
     It depends only on scenario, policy and versions; in real time also on measured answer times.
     """
-    flat = RECORD_FILE.flat(record) | {"answer_ms": record.answer_ms}
+    flat = RECORD_FILE.flat(record) | {
+        "answer_ms": record.answer_ms,
+        "track": record.manifest.track,
+    }
     row: dict[str, Any] = {key: flat[key] for key in COLUMNS}
     row["waypoints"] = record.manifest.waypoints.in_words
     cameras = {"": record.manifest.camera, **record.manifest.cameras}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import msgspec
 
@@ -13,6 +13,7 @@ from cosim.core.errors import SpecError, UsageError
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
+from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec
 
 RECORDING_CAMERA: Final = "collected"
 """Name of the recording camera when the expert has a camera of its own."""
@@ -39,8 +40,10 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     learner: policy that drives in this time; "" for the expert's command, slowed and turned at
         random.
     format: form of the data set: LeRobot, or a ROS 2 bag of each episode.
-    unsolved: also record episodes that the expert fails, up to the first reset of the robot. Raises
-        SpecError.
+    unsolved: also record episodes that the expert fails, up to the first reset of the robot.
+    scan, imu, people: sensors that are recorded beside the pictures, as in a manifest.
+
+    Raises SpecError.
     """
 
     camera: CameraSpec = CameraSpec(width=160, height=90)
@@ -51,6 +54,9 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     learner: str = ""
     unsolved: bool = False
     format: DataFormat = "lerobot"
+    scan: ScanSpec | None = None
+    imu: ImuKind = "none"
+    people: PeopleKind = "none"
 
     def __post_init__(self) -> None:
         if self.rate_hz not in (
@@ -109,9 +115,17 @@ def check_learner(
     camera = learner.camera
     if camera is None or learner.privileged or learner.cameras or learner.odometry != "none":
         raise UsageError(
-            f"learner '{learner.name}' is no policy that drives by one camera, speeds and a "
-            f"goal alone"
+            f"learner '{learner.name}' is no policy that drives by one camera, speeds, a goal and "
+            f"recorded sensors alone"
         )
+    recorded = recording_manifest(expert, collecting, goal)
+    for sensor, flag in (("scan", "--lidar"), ("imu", "--imu"), ("people", "--people")):
+        wanted, given = getattr(learner, sensor), getattr(recorded, sensor)
+        if wanted not in (None, "none", given):
+            raise UsageError(
+                f"learner '{learner.name}' is to sense what is collected: its {sensor} is "
+                f"{wanted}, collected is {given}: see {flag}"
+            )
     if (camera, learner.rate_hz) != (collecting.camera, collecting.rate_hz):
         seen = f"{camera.in_words}, {learner.rate_hz:g} Hz"
         kept = collecting.camera.in_words
@@ -140,6 +154,26 @@ def _matching_options(camera: CameraSpec, rate_hz: float) -> str:
     )
 
 
+def _sensors(expert: Manifest, collecting: DemoOptions) -> dict[str, Any]:
+    """Return the sensors of a recording: those of the expert and the recorded ones.
+
+    Raises UsageError for an expert with another sensor of a recorded kind.
+    """
+    found = {}
+    for sensor in ("scan", "imu", "people"):
+        own, recorded = getattr(expert, sensor), getattr(collecting, sensor)
+        if own in (None, "none"):
+            found[sensor] = recorded
+        elif recorded in (None, "none", own):
+            found[sensor] = own
+        else:
+            raise UsageError(
+                f"policy '{expert.name}' has a {sensor} of its own, {own}, and another one cannot "
+                f"be collected: {recorded}"
+            )
+    return found
+
+
 def recording_manifest(
     expert: Manifest, collecting: DemoOptions, goal: GoalProtocol | None = None
 ) -> Manifest:
@@ -164,7 +198,9 @@ def recording_manifest(
             f"{collecting.rate_hz:g}: give --rate {expert.rate_hz:g}"
         )
     name = f"{expert.name}-disturbed" if collecting.noise else expert.name
-    settled = replace(expert, name=name, rate_hz=collecting.rate_hz, goal=goal)
+    settled = replace(
+        expert, name=name, rate_hz=collecting.rate_hz, goal=goal, **_sensors(expert, collecting)
+    )
     if expert.camera is None:
         return replace(settled, camera=collecting.camera)
     return replace(settled, cameras={**expert.cameras, RECORDING_CAMERA: collecting.camera})

@@ -12,7 +12,7 @@ from cosim.core.errors import SpecError
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
-from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec
+from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec, SensorTrack
 
 WaypointRuleName = Literal["shipped", "atan2"]
 """Names of the rules that turn a waypoint into a command."""
@@ -96,6 +96,17 @@ class Manifest:
     scan: ScanSpec | None = None
     imu: ImuKind = "none"
     people: PeopleKind = "none"
+
+    @property
+    def track(self) -> SensorTrack:
+        """Sensor track: the strongest of the policy's sources of knowledge of the street."""
+        sources: dict[SensorTrack, bool] = {
+            "privileged": self.privileged,
+            "people": self.people != "none",
+            "lidar": self.scan is not None,
+            "picture": self.camera is not None,
+        }
+        return next((track for track, given in sources.items() if given), "blind")
 
     @property
     def picture_size(self) -> tuple[int, int]:

@@ -6,13 +6,15 @@ import math
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple, cast
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.errors import unknown
 from cosim.core.geometry import Floats
+from cosim.core.state import write_protect
 from cosim.spec.validation import Ranged, Within
 
 ImuKind = Literal["none", "exact", "noisy"]
@@ -20,6 +22,10 @@ ImuKind = Literal["none", "exact", "noisy"]
 
 PeopleKind = Literal["none", "seen"]
 """Names of the rows of `PEOPLE`."""
+
+SensorTrack = Literal["privileged", "people", "lidar", "picture", "blind"]
+"""Sensor tracks, the strongest first. A policy is in the track of its strongest source of knowledge
+of the street; results of different tracks are not compared."""
 
 IMU: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -41,6 +47,20 @@ PEOPLE: Final[Mapping[str, str]] = MappingProxyType(
 
 MOST_RETURNS: Final = 2**17
 """Largest number of distances in a scan."""
+
+
+def imu_called(name: str) -> ImuKind:
+    """Return a name as a row of `IMU`. Raises UsageError with the valid names."""
+    if name not in IMU:
+        raise unknown("inertial sensor (imu)", name, IMU)
+    return cast(ImuKind, name)
+
+
+def people_called(name: str) -> PeopleKind:
+    """Return a name as a row of `PEOPLE`. Raises UsageError with the valid names."""
+    if name not in PEOPLE:
+        raise unknown("kind of tracked people", name, PEOPLE)
+    return cast(PeopleKind, name)
 
 
 class ScanSpec(Ranged, frozen=True, dict=True):
@@ -106,7 +126,8 @@ class ScanSpec(Ranged, frozen=True, dict=True):
         """(3, rings * rays) unit vectors in the frame of the robot's trunk, ring by ring."""
         up, turn = np.meshgrid(self.elevations_rad, self.angles_rad, indexing="ij")
         level = np.cos(up)
-        return np.stack([level * np.cos(turn), level * np.sin(turn), np.sin(up)]).reshape(3, -1)
+        vectors = np.stack([level * np.cos(turn), level * np.sin(turn), np.sin(up)])
+        return write_protect(vectors.reshape(3, -1))
 
     @property
     def in_words(self) -> str:
@@ -123,6 +144,10 @@ class Scan(msgspec.Struct, frozen=True, eq=False):
 
     ranges_m: (rings, rays) float32 distances; `inf` without a return.
     spec: the lidar; `spec.angles_rad` has the bearings.
+
+    >>> scan = Scan(np.full((1, 8), 2.5, np.float32), ScanSpec(rays=8))
+    >>> float(np.asarray(scan).min()), scan.spec.angles_rad[4]
+    (2.5, np.float64(0.0))
     """
 
     ranges_m: NDArray[np.float32]
@@ -131,6 +156,10 @@ class Scan(msgspec.Struct, frozen=True, eq=False):
     def copied(self) -> Scan:
         """Return the same scan with an array of its own."""
         return Scan(self.ranges_m.copy(), self.spec)
+
+    def mirrored(self) -> Scan:
+        """Return the scan with left and right exchanged."""
+        return Scan(self.ranges_m[:, -np.arange(self.spec.rays)], self.spec)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return `ranges_m`."""
@@ -142,10 +171,18 @@ class Imu(msgspec.Struct, frozen=True):
 
     gyro_radps: angular speeds about x, y and z.
     accel_mps2: specific force; (0, 0, 9.81) for a robot at rest on level ground.
+
+    >>> np.asarray(Imu((0.0, 0.0, 0.5), (0.2, 0.0, 9.81))).tolist()
+    [0.0, 0.0, 0.5, 0.2, 0.0, 9.81]
     """
 
     gyro_radps: tuple[float, float, float]
     accel_mps2: tuple[float, float, float]
+
+    def mirrored(self) -> Imu:
+        """Return the reading with left and right exchanged."""
+        (roll, pitch, yaw), (x, y, z) = self.gyro_radps, self.accel_mps2
+        return Imu((-roll, pitch, -yaw), (x, -y, z))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return (6,) float64: angular speeds, then specific force."""
@@ -158,6 +195,10 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
     ids: (N,) int32 ids of tracks; a person may get another one.
     positions_m: (N, 2) float32 in the robot's frame: x forward, y left.
     velocities_mps: (N, 2) float32 velocities over the ground, in the axes of the robot's frame.
+
+    >>> one = np.array([[3.0, 1.0]], np.float32)
+    >>> np.asarray(Tracks(np.array([7], np.int32), one, -one)).tolist()
+    [[3.0, 1.0, -3.0, -1.0]]
     """
 
     ids: NDArray[np.int32]
@@ -168,6 +209,11 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
         """Return the same tracks with arrays of their own."""
         return Tracks(self.ids.copy(), self.positions_m.copy(), self.velocities_mps.copy())
 
+    def mirrored(self) -> Tracks:
+        """Return the tracks with left and right exchanged."""
+        swap = np.array([1.0, -1.0], dtype=np.float32)
+        return Tracks(self.ids, self.positions_m * swap, self.velocities_mps * swap)
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return (N, 4): positions and velocities."""
         return np.array(np.hstack([self.positions_m, self.velocities_mps]), dtype)
@@ -175,6 +221,9 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
 
 TRACKING_RANGE_M: Final = 15.0
 """Horizontal range in metres within which people are tracked, in all directions."""
+
+MOST_TRACKS: Final = 256
+"""Largest number of tracks in an observation; the farthest people are left out."""
 
 
 class TrackNoise(NamedTuple):
@@ -208,3 +257,35 @@ class ImuNoise(NamedTuple):
     gyro_bias_radps: float = 0.003
     accel_bias_mps2: float = 0.05
     bias_s: float = 100.0
+
+
+AT_REST: Final = Imu((0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+"""Reading of a robot at rest on level ground."""
+
+NO_TRACKS: Final = Tracks(
+    np.zeros(0, np.int32), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+)
+"""Tracks without a person."""
+
+
+def clear_scan(spec: ScanSpec) -> Scan:
+    """Return a scan without a return."""
+    return Scan(np.full((spec.rings, spec.rays), np.inf, np.float32), spec)
+
+
+PEOPLE_ROWS: Final = 32
+"""Number of tracked people in arrays of fixed size, the nearest ones."""
+
+
+def scan_row(scan: Scan) -> NDArray[np.float32]:
+    """Return the distances of a scan, (rings, rays); without a return the range."""
+    return np.minimum(scan.ranges_m, np.float32(scan.spec.range_m))
+
+
+def people_rows(tracks: Tracks) -> NDArray[np.float32]:
+    """Return the nearest people as (PEOPLE_ROWS, 5): 1, positions and velocities; else 0."""
+    rows = np.zeros((PEOPLE_ROWS, 5), np.float32)
+    numbers = np.asarray(tracks)[:PEOPLE_ROWS]
+    rows[: len(numbers), 0] = 1.0
+    rows[: len(numbers), 1:] = numbers
+    return rows

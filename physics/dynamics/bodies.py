@@ -253,6 +253,12 @@ class Bodies(BulletClient):
             ]
             self._paths[kind].append((body, placements))
 
+    def place_led(self, substep: int) -> None:
+        """Put the bodies of `lead` where they are after a substep."""
+        for led in self._paths.values():
+            for body, way in led:
+                p.resetBasePositionAndOrientation(body, *way[substep], self._client)
+
     def _park(self, body: int) -> None:
         self._final_poses.pop(body, None)
         p.resetBasePositionAndOrientation(body, (0.0, 0.0, PARKED_Z_M), UPRIGHT, self._client)
@@ -301,9 +307,7 @@ class Bodies(BulletClient):
         substep: index within the tick, from 0
         motors: values for the joints, in the order of the drive's joints
         """
-        for led in self._paths.values():
-            for body, way in led:
-                p.resetBasePositionAndOrientation(body, *way[substep], self._client)
+        self.place_led(substep)
         if motors.limits_nm is None:  # PyBullet forgets torques after a substep
             p.setJointMotorControlArray(
                 self._robot,

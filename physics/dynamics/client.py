@@ -46,7 +46,7 @@ class BulletClient:
 
         begin_m, end_m: (N, 3) ends of the lines.
         """
-        hits = self._call("rayTestBatch", begin_m.tolist(), end_m.tolist())
+        hits = self._call("rayTestBatch", begin_m.tolist(), end_m.tolist(), numThreads=1)
         return np.array([hit[2] if hit[0] >= 0 else np.inf for hit in hits], dtype=float)
 
     def _create_body(self, shape: int, at: Any, turn: Any = UPRIGHT) -> int:

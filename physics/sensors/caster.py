@@ -31,8 +31,6 @@ from physics.ground.mesh import join
 from physics.ground.tiles import Key, tile_distance, tiles_within
 from physics.robots.kinematics import Rotation, attitude, rotate
 from physics.sensors.shapes import (
-    Boxes,
-    Cylinders,
     Rays,
     Solids,
     boxes_of,
@@ -53,10 +51,9 @@ _MARGIN_M: Final = 0.1
 """Margin in metres around the heights of triangles for feet between their corners."""
 
 
-_POINTS: Final = np.array(
-    [(0.0, 0.3), (0.0, 0.8), (0.0, 1.2), (0.0, 1.5), (0.15, 1.0), (-0.15, 1.0)]
-)
+_POINTS: Final = np.array([(0.0, 0.4), (0.0, 1.0), (0.0, 1.5), (0.15, 1.1), (-0.15, 1.1)])
 """Points of a standing adult's body that are searched: across the line of sight, and up; metres."""
+_CHILD: Final = Age.CHILD.value
 _SHORT: Final = 0.7
 """Height of children and of sitting people as a share of a standing adult's."""
 
@@ -82,13 +79,18 @@ class _Near:
 
 
 class Moving:
-    """People and vehicles of a street snapshot, with the heights of their feet as needed."""
+    """People and vehicles of a street snapshot, with the heights of their feet as needed.
+
+    short: (N,) whether a person is a child or sits.
+    """
 
     def __init__(self, surface: Surface, street: Street) -> None:
         self._surface = surface
         self.street = street
         self._foot_m = np.full(len(street.people), np.nan)
         self.vehicles = _vehicle_boxes(surface, street.vehicles)
+        sitting = np.array([doing == "sit" for doing in street.people.doing], dtype=bool)
+        self.short: NDArray[np.bool_] = sitting | (street.people.age == _CHILD)
 
     def feet(self, rows: NDArray[np.intp]) -> Floats:
         """Return the (N,) heights in metres of the ground under the people in these rows."""
@@ -183,23 +185,23 @@ class RayCaster:
         moving = self._moved(street)
         feet = moving.feet(rows)
         to_x, to_y, off = to_x[rows], to_y[rows], np.maximum(off[rows], 1e-6)
-        short = np.array(
-            [people.doing[i] == "sit" or people.age[i] == Age.CHILD for i in rows.tolist()]
-        )
+        short = moving.short[rows]
         across, up = _POINTS[:, :1], _POINTS[:, 1:] * np.where(short, _SHORT, 1.0)
         x = (to_x - across * to_y / off).ravel()
         y = (to_y + across * to_x / off).ravel()
         z = (feet + up - origin[2]).ravel()
         far = np.sqrt(x * x + y * y + z * z)
         rays = Rays(origin, x / far, y / far, z / far)
-        solids = within(near.solids, robot.pose.x_m, robot.pose.y_m, range_m)
+        solids = near.solids
         bodies = Solids(moving.vehicles, _cylinders(people, rows, feet))
         hits = first_hits(rays, joined([solids, bodies]))
-        first_body = len(solids.boxes.x) + len(moving.vehicles.x) + len(solids.cylinders.x)
-        own = hits.index == first_body + np.tile(np.arange(len(rows)), len(_POINTS))
+        first_body = len(solids) + moving.vehicles.shape[1]
+        own = hits.solid == first_body + np.tile(np.arange(len(rows)), len(_POINTS))
         clear = np.where(own | (hits.distance >= far), far, 0.0)
         seen = self._with_triangles(rays, clear, near, range_m) >= far
-        return rows[seen.reshape(len(_POINTS), -1).any(axis=0)]
+        shown: NDArray[np.bool_] = seen.reshape(len(_POINTS), -1).any(axis=0)
+        found: NDArray[np.intp] = rows[shown]
+        return found
 
     def _rays(self, robot: RobotState, height_m: float, directions: Floats) -> Rays:
         """Return rays in the world frame."""
@@ -258,7 +260,7 @@ class RayCaster:
                 chunk = self._surface.chunk(key)
                 ground = join([patch.mesh for patch in chunk.ground])
                 meshes = [mesh for mesh in (ground, *chunk.standing) if len(mesh)]
-                heights = np.concatenate([mesh.vertices[:, 2] for mesh in meshes] or [[]])
+                heights = np.concatenate([np.zeros(0), *(mesh.vertices[:, 2] for mesh in meshes)])
                 self._meshes[key] = _Meshes(
                     tuple([client.add_concave(mesh) for mesh in meshes]),
                     float(heights.min(initial=math.inf)),
@@ -296,27 +298,19 @@ def _rows_within(people: People, robot: RobotState, range_m: float) -> NDArray[n
     return np.flatnonzero(off <= range_m + PERSON_RADIUS_M + 1.0)
 
 
-def _cylinders(people: People, rows: NDArray[np.intp], feet: Floats) -> Cylinders:
+def _cylinders(people: People, rows: NDArray[np.intp], feet: Floats) -> Floats:
     """Return the bodies of people. feet: (N,) heights of the ground under them."""
     xy = people.xy[rows]
     radius = np.full(len(rows), PERSON_RADIUS_M)
-    return Cylinders(xy[:, 0], xy[:, 1], radius, feet, feet + PERSON_HEIGHT_M)
+    return np.stack([xy[:, 0], xy[:, 1], radius, feet, feet + PERSON_HEIGHT_M])
 
 
-def _vehicle_boxes(surface: Surface, vehicles: Vehicles) -> Boxes:
+def _vehicle_boxes(surface: Surface, vehicles: Vehicles) -> Floats:
     """Return the bodies of vehicles."""
     xy, heading, half = vehicles.xy, vehicles.heading, 0.5 * vehicles.size
     foot = surface.road(xy, heading, vehicles.size)[:, 0]
-    return Boxes(
-        xy[:, 0],
-        xy[:, 1],
-        np.cos(heading),
-        np.sin(heading),
-        half[:, 0],
-        half[:, 1],
-        foot,
-        foot + VEHICLE_HEIGHT_M,
-    )
+    turn = np.cos(heading), np.sin(heading)
+    return np.stack([*xy.T, *turn, *half.T, foot, foot + VEHICLE_HEIGHT_M])
 
 
 def _barrier_row(surface: Surface, barrier: Barrier) -> tuple[float, ...]:
@@ -328,7 +322,7 @@ def _barrier_row(surface: Surface, barrier: Barrier) -> tuple[float, ...]:
 
 def _tile_solids(chunk: Chunk) -> Solids:
     """Return the buildings and props of a tile."""
-    rows = [
+    rows: list[tuple[float, ...]] = [
         (x, y, heading, length, width, z, z + height)
         for building in chunk.buildings
         for (x, y, z), heading, (length, width, height) in building_boxes(building)

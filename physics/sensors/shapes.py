@@ -18,40 +18,19 @@ _TINY: Final = 1e-290
 _CORNERS: Final = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])[:, :, None]
 
 
-class Boxes(NamedTuple):
-    """N upright boxes.
+class Solids(NamedTuple):
+    """Upright boxes and cylinders. Indices count the boxes first.
 
-    x, y: (N,) centres.
-    cos, sin: (N,) of the headings.
-    ahead, aside: (N,) half lengths and half widths.
-    bottom, top: (N,) heights.
+    boxes: (8, B) rows x, y of the centre, cosine and sine of the heading, half length, half width,
+        bottom, top.
+    cylinders: (5, C) rows x, y of the centre, radius, bottom, top.
     """
 
-    x: Floats
-    y: Floats
-    cos: Floats
-    sin: Floats
-    ahead: Floats
-    aside: Floats
-    bottom: Floats
-    top: Floats
+    boxes: Floats
+    cylinders: Floats
 
-
-class Cylinders(NamedTuple):
-    """N upright cylinders, columns as in `Boxes`."""
-
-    x: Floats
-    y: Floats
-    radius: Floats
-    bottom: Floats
-    top: Floats
-
-
-class Solids(NamedTuple):
-    """Boxes and cylinders. Indices count the boxes first."""
-
-    boxes: Boxes
-    cylinders: Cylinders
+    def __len__(self) -> int:
+        return int(self.boxes.shape[1] + self.cylinders.shape[1])
 
 
 class Rays(NamedTuple):
@@ -71,43 +50,38 @@ class Hits(NamedTuple):
     """First solid on each ray.
 
     distance: (N,) metres, inf without a hit.
-    index: (N,) index of the solid, -1 without a hit.
+    solid: (N,) index of the solid, -1 without a hit.
     """
 
     distance: Floats
-    index: NDArray[np.intp]
+    solid: NDArray[np.intp]
 
 
-def boxes_of(rows: list[tuple[float, ...]]) -> Boxes:
+def boxes_of(rows: list[tuple[float, ...]]) -> Floats:
     """Return boxes from rows of x, y, heading, length, width, bottom and top."""
     x, y, heading, length, width, bottom, top = np.array(rows, dtype=float).reshape(-1, 7).T
-    return Boxes(x, y, np.cos(heading), np.sin(heading), 0.5 * length, 0.5 * width, bottom, top)
+    return np.stack(
+        [x, y, np.cos(heading), np.sin(heading), 0.5 * length, 0.5 * width, bottom, top]
+    )
 
 
-def cylinders_of(rows: list[tuple[float, ...]]) -> Cylinders:
+def cylinders_of(rows: list[tuple[float, ...]]) -> Floats:
     """Return cylinders from rows of x, y, radius, bottom and top."""
-    return Cylinders(*np.array(rows, dtype=float).reshape(-1, 5).T)
+    return np.array(rows, dtype=float).reshape(-1, 5).T
 
 
 def joined(parts: list[Solids]) -> Solids:
     """Return the solids of all parts; boxes and cylinders are each in the order of the parts."""
-    return Solids(
-        Boxes(*map(np.concatenate, zip(*[part.boxes for part in parts], strict=True))),
-        Cylinders(*map(np.concatenate, zip(*[part.cylinders for part in parts], strict=True))),
-    )
+    boxes, cylinders = zip(*parts, strict=True)
+    return Solids(np.concatenate(boxes, axis=1), np.concatenate(cylinders, axis=1))
 
 
 def within(solids: Solids, x_m: float, y_m: float, range_m: float) -> Solids:
     """Return the solids with a part within a horizontal distance of a point."""
     boxes, cylinders = solids
-    far = np.hypot(boxes.x - x_m, boxes.y - y_m) - np.hypot(boxes.ahead, boxes.aside)
-    near = far <= range_m
-    off = np.hypot(cylinders.x - x_m, cylinders.y - y_m) - cylinders.radius
-    here = off <= range_m
-    return Solids(
-        Boxes(*[column[near] for column in boxes]),
-        Cylinders(*[column[here] for column in cylinders]),
-    )
+    far = np.hypot(boxes[0] - x_m, boxes[1] - y_m) - np.hypot(boxes[4], boxes[5])
+    off = np.hypot(cylinders[0] - x_m, cylinders[1] - y_m) - cylinders[2]
+    return Solids(boxes[:, far <= range_m], cylinders[:, off <= range_m])
 
 
 def first_hits(rays: Rays, solids: Solids) -> Hits:
@@ -124,7 +98,7 @@ def first_hits(rays: Rays, solids: Solids) -> Hits:
         one, first, t_one = _box_hits(rays, boxes, fan)
         two, second, t_two = _cylinder_hits(rays, cylinders, fan)
     ray = np.concatenate([one, two])
-    solid = np.concatenate([first, second + len(boxes.x)])
+    solid = np.concatenate([first, second + boxes.shape[1]])
     t = np.concatenate([t_one, t_two])
     distance = np.full(count, np.inf)
     np.minimum.at(distance, ray, t)
@@ -162,12 +136,12 @@ class _Fan:
 
 
 def _box_hits(
-    rays: Rays, boxes: Boxes, fan: _Fan
+    rays: Rays, boxes: Floats, fan: _Fan
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
     """Return the hits of rays and boxes: (P,) rays, boxes and distances."""
     x0, y0, z0 = rays.origin
-    cos, sin, ahead, aside = boxes.cos, boxes.sin, boxes.ahead, boxes.aside
-    x, y = boxes.x - x0, boxes.y - y0
+    x, y, cos, sin, ahead, aside, bottom, top = boxes
+    x, y = x - x0, y - y0
     u, v = x * cos + y * sin, y * cos - x * sin
     corner_u, corner_v = u + _CORNERS[:, 0] * ahead, v + _CORNERS[:, 1] * aside
     turn = np.arctan2(u * corner_v - v * corner_u, u * corner_u + v * corner_v)
@@ -179,7 +153,7 @@ def _box_hits(
     near, far = _slab(along * cos + across * sin, u[box], ahead[box])
     for component, middle, half in (
         (across * cos - along * sin, v[box], aside[box]),
-        (rays.z[ray], *_levels(boxes.bottom, boxes.top, z0, box)),
+        (rays.z[ray], *_levels(bottom, top, z0, box)),
     ):
         enter, leave = _slab(component, middle, half)
         np.maximum(near, enter, out=near)
@@ -189,11 +163,12 @@ def _box_hits(
 
 
 def _cylinder_hits(
-    rays: Rays, cylinders: Cylinders, fan: _Fan
+    rays: Rays, cylinders: Floats, fan: _Fan
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
     """Return the hits of rays and cylinders: (P,) rays, cylinders and distances."""
     x0, y0, z0 = rays.origin
-    x, y, radius = cylinders.x - x0, cylinders.y - y0, cylinders.radius
+    x, y, radius, bottom, top = cylinders
+    x, y = x - x0, y - y0
     off = np.hypot(x, y)
     around = off <= radius
     half = np.arcsin(np.minimum(radius / np.maximum(off, _TINY), 1.0))
@@ -205,7 +180,7 @@ def _cylinder_hits(
     miss = x * across - y * along
     root = np.sqrt(a * radius[which] ** 2 - miss * miss)
     near, far = (b - root) / a, (b + root) / a
-    enter, leave = _slab(rays.z[ray], *_levels(cylinders.bottom, cylinders.top, z0, which))
+    enter, leave = _slab(rays.z[ray], *_levels(bottom, top, z0, which))
     near, far = np.maximum(near, enter), np.minimum(far, leave)
     hit = (near <= far) & (near >= 0.0)
     return ray[hit], which[hit], near[hit]

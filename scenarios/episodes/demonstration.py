@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Final
 
 import cv2
@@ -29,6 +29,10 @@ def check_parquet() -> None:
         )
 
 
+def _nothing() -> NDArray[np.float32]:
+    return np.zeros((0, 0), np.float32)
+
+
 @dataclass(frozen=True)
 class Demonstration:
     """The demonstration of one episode, with n rows, one for each picture.
@@ -39,6 +43,8 @@ class Demonstration:
     glimpses (n, 6, 8, 3) uint8: thumbnails of the drawn pictures, to check the decoded ones.
     colours (3, 256) int64: histograms of red, green and blue.
     clip: the bytes of an .mp4 with n pictures.
+    scan (n, R), imu (n, 6), people (n, PEOPLE_ROWS, 5): recorded sensors, as in
+        `scan_row` and `people_rows` of `cosim.spec.sensors`; empty without them.
     """
 
     state: NDArray[np.float32]
@@ -51,9 +57,18 @@ class Demonstration:
     glimpses: NDArray[np.uint8]
     colours: NDArray[np.int64]
     clip: NDArray[np.uint8]
+    scan: NDArray[np.float32] = field(default_factory=_nothing)
+    imu: NDArray[np.float32] = field(default_factory=_nothing)
+    people: NDArray[np.float32] = field(default_factory=_nothing)
 
     def __len__(self) -> int:
         return len(self.state)
+
+    @property
+    def sensors(self) -> dict[str, NDArray[np.float32]]:
+        """Return the recorded sensors by name."""
+        rows = {"scan": self.scan, "imu": self.imu, "people": self.people}
+        return {name: readings for name, readings in rows.items() if readings.size}
 
     def encoded(self) -> bytes:
         """Return the .npz; equal demonstrations have equal bytes."""

@@ -23,6 +23,7 @@ from cosim.spec.demo_options import RECORDING_CAMERA, DemoOptions, check_learner
 from cosim.spec.goal import GoalProtocol, Instruction, PointGoal
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
+from cosim.spec.sensors import people_rows, scan_row
 from scenarios.episodes.clip import Clip
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
 
@@ -172,6 +173,7 @@ class _Rows:
         self._instructions: list[str] = []
         self._glimpses: list[NDArray[np.uint8]] = []
         self._colours = np.zeros((3, 256), np.int64)
+        self._sensors: dict[str, list[NDArray[np.float32]]] = {}
 
     def add(
         self, seen: Observation, rgb: NDArray[np.uint8], answer: Command, disturbed: bool
@@ -190,6 +192,8 @@ class _Rows:
         )
         self._instructions.append(goal.text if isinstance(goal, Instruction) else "")
         self._glimpses.append(glimpse(rgb))
+        for name, row in _sensor_rows(seen).items():
+            self._sensors.setdefault(name, []).append(row)
         self._colours += [
             np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
         ]
@@ -218,4 +222,17 @@ class _Rows:
             glimpses=np.stack(self._glimpses),
             colours=self._colours,
             clip=np.frombuffer(self._clip.finished(), np.uint8),
+            **{name: np.stack(rows) for name, rows in self._sensors.items()},
         )
+
+
+def _sensor_rows(seen: Observation) -> dict[str, NDArray[np.float32]]:
+    """Return the readings of an observation as arrays of fixed size."""
+    rows = {}
+    if seen.scan is not None:
+        rows["scan"] = scan_row(seen.scan).ravel()
+    if seen.imu is not None:
+        rows["imu"] = np.asarray(seen.imu, np.float32)
+    if seen.people is not None:
+        rows["people"] = people_rows(seen.people)
+    return rows

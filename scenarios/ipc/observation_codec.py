@@ -27,6 +27,7 @@ from cosim.spec.camera import Calibration, CameraPicture
 from cosim.spec.goal import decoded_goal
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import Robot, robot_called
+from cosim.spec.sensors import Imu, Scan, ScanSpec, Tracks
 
 Arrays = dict[str, NDArray[Any]]
 _ROBOT_FIELDS: Final = tuple(
@@ -77,7 +78,11 @@ def encoded_about(seen: Observation) -> EpisodeConstants:
         if known is None
         else _encode((known.route.points, shapely.to_wkb(known.free), known.waits_m))
     )
-    return EpisodeConstants(robot, calibrations, ground)
+    lidar: dict[str, Any] = {}
+    if seen.scan is not None:
+        spec = seen.scan.spec
+        lidar = msgspec.to_builtins(spec) | {"angles_rad": spec.angles_rad.tolist()}
+    return EpisodeConstants(robot, calibrations, ground, lidar)
 
 
 def encoded_fields(seen: Observation) -> tuple[dict[str, Any], Arrays]:
@@ -95,6 +100,14 @@ def encoded_fields(seen: Observation) -> tuple[dict[str, Any], Arrays]:
     fields["goal"] = goal
     if seen.odometry is not None:
         fields["odometry"] = msgspec.structs.astuple(seen.odometry)
+    if seen.scan is not None:
+        arrays["scan"] = seen.scan.ranges_m
+    if seen.imu is not None:
+        fields["imu"] = (*seen.imu.gyro_radps, *seen.imu.accel_mps2)
+    if seen.people is not None:
+        arrays |= {
+            f"people.{name}": one for name, one in msgspec.structs.asdict(seen.people).items()
+        }
     if (known := seen.privileged) is not None:
         fields["knowledge"] = _encode(
             (
@@ -123,6 +136,10 @@ class ObservationDecoder(EpisodeDecoder):
         "picture": CameraPicture,
         "goal": lambda **fields: decoded_goal(fields),
         "odometry": Odometry,
+        "lidar": lambda angles_rad, **fields: msgspec.convert(fields, ScanSpec),
+        "scan": Scan,
+        "imu": Imu,
+        "people": Tracks,
         "observation": Observation,
     }
     _ground: tuple[Polyline, Polygon | MultiPolygon, tuple[float, ...]] | None = None

@@ -18,6 +18,7 @@ import numpy as np
 from bridge.policy_server import PackedArray, unpack_array
 from cosim.spec.goal import most_goal_bytes
 from cosim.spec.manifest import Manifest
+from cosim.spec.sensors import MOST_TRACKS
 
 HEAD_BYTES: Final = 64
 """Bytes of the header."""
@@ -27,6 +28,8 @@ _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 """Seals that fix the size: a smaller file would crash the process that maps it."""
 _PER_PIXEL_BYTES: Final = 8
 """Bytes of a pixel's color, label and depth."""
+_PER_TRACK_BYTES: Final = 20
+"""Bytes of a tracked person's id, position and velocity."""
 
 
 class SharedMemory:
@@ -93,4 +96,9 @@ def room_for(manifest: Manifest | None) -> int:
     first = [] if manifest.camera is None else [manifest.camera]
     sizes = [math.prod(camera.size) for camera in (*first, *manifest.cameras.values())]
     goal = most_goal_bytes(manifest.picture_size)
-    return _PER_PIXEL_BYTES * sum(sizes) + goal + _ALIGNED_BYTES * (3 * len(sizes) + 1)
+    spec = manifest.scan
+    scan = 0 if spec is None else 4 * spec.rings * spec.rays
+    tracks = 0 if manifest.people == "none" else _PER_TRACK_BYTES * MOST_TRACKS
+    return (
+        _PER_PIXEL_BYTES * sum(sizes) + goal + scan + tracks + _ALIGNED_BYTES * (3 * len(sizes) + 5)
+    )

@@ -26,6 +26,7 @@ from cosim.spec.odometry import Odometry
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
+from cosim.spec.sensors import ScanSpec
 from scenarios.episodes.episode import Episode
 from scenarios.ipc.observation_codec import (
     ObservationDecoder,
@@ -41,11 +42,14 @@ ALL = Manifest(
     "all",
     camera=SPEC,
     odometry="wheel",
+    scan=ScanSpec(rays=24, rings=2, elevation_deg=(-5.0, 5.0)),
+    imu="noisy",
+    people="seen",
     privileged=True,
     cameras={"left": CameraSpec(16, 12, mount="left", depth=True, labels=True)},
 )
 CAMERA = calibration_of(SPEC, COURIER)
-WHOLE = ("Skid", "Mount", "Polyline", "Polygon", "MultiPolygon", "Pose", "Signal")
+WHOLE = ("Skid", "Mount", "ScanSpec", "Polyline", "Polygon", "MultiPolygon", "Pose", "Signal")
 """Types whose parts the table names in words, if at all."""
 
 
@@ -126,7 +130,7 @@ def held(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         below = f"{path}.{name}".removeprefix(".")
         part = getattr(value, name)
         yield below, part
-        if type(part).__name__ not in WHOLE:
+        if type(part).__name__ not in WHOLE and name != "spec":
             yield from held(part, "camera" if name == "camera" else below)
 
 
@@ -207,7 +211,17 @@ def test_who_asks_for_nothing_gets_none() -> None:
         "depth",
         "labels",
     }
-    assert absent == {"rgb", "camera", "depth", "labels", "odometry", "privileged"}
+    assert absent == {
+        "rgb",
+        "camera",
+        "depth",
+        "labels",
+        "odometry",
+        "scan",
+        "imu",
+        "people",
+        "privileged",
+    }
     assert all(fields[name] is None for name in absent - {"rgb"}) and fields["goal"] is None
 
 
@@ -229,10 +243,10 @@ def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Obs
         own = [
             line
             for line in untrue(plain, protocol)
-            if "namespace(" not in line and "_PlainFields(" not in line
+            if "namespace(" not in line and "_Plain" not in line
         ]
         assert {*untrue(afar, protocol), *own} == {"privileged is None, not `Privileged`"}
-        for name in ("odometry", "goal"):
+        for name in ("odometry", "scan", "imu", "people", "goal"):
             if name != "goal" or protocol not in ("none", "instruction"):
                 assert np.array_equal(getattr(plain, name), getattr(one, name))
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import msgspec
 import numpy as np
 import pytest
 import trimesh
@@ -14,7 +15,7 @@ from cosim.core.geometry import Floats, Pose
 from cosim.core.state import People, RobotState, Street, Trunk, Vehicles
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER
-from cosim.spec.scenario import Barrier, City, CityMap
+from cosim.spec.scenario import Barrier, City, CityMap, CrowdSpec
 from cosim.spec.sensors import ScanSpec
 from physics.dynamics.bodies import PERSON_HEIGHT_M, VEHICLE_HEIGHT_M, Bodies, building_boxes
 from physics.ground.tiles import tiles_within
@@ -25,8 +26,10 @@ from physics.street.scan_surface import ScanSurface
 from physics.street.street_surface import StreetSurface
 from physics.street.surface import Surface, grounded_obstacles
 from scenarios.places.nets import place, surface_of_place
+from scenarios.tools.verify.doctor import small_scenario
 from tests.physics.test_scan_surface import sloped_scan
 from tests.support.tiny_street import tiny_map
+from tests.support.tracked import reports
 
 pytestmark = pytest.mark.engine
 
@@ -208,3 +211,33 @@ def test_neither_the_robot_nor_what_is_out_of_range_has_returns() -> None:
         short = rays.distances(robot, Street(0, people), 0.6, ahead, 10.0)
     assert found == pytest.approx([17.7])
     assert np.isinf([*nothing, *short]).all()
+
+
+@pytest.mark.parametrize(
+    ("at", "seen"),
+    [((-12.0, 5.0), True), ((-12.0, 5.6), True), ((-20.0, 22.0), False), ((-4.0, 5.0), False)],
+    ids=["free", "aside", "behind a house", "out of range"],
+)
+def test_people_in_sight_and_in_range_are_seen(at: tuple[float, float], seen: bool) -> None:
+    """In all directions, but not through houses and not beyond 15 m; behind somebody else only if
+    a part shows."""
+    surface = StreetSurface(tiny_map(), seed=0)
+    with rays_on(surface) as rays:
+        robot = leaning(surface, np.random.default_rng(0), Pose(-20.0, 5.0, 2.0), 0.0)
+        here = [at, (-16.0, 5.0)]
+        people = People.of(("one", "near"), here, [0.0] * 2, [0.0] * 2, ("stand",) * 2)
+        alone = Street(0, people.only(np.array([0])))
+        assert rays.seen_people(robot, alone, 0.62, 15.0).tolist() == [0] * seen
+        both = rays.seen_people(robot, Street(0, people), 0.62, 15.0).tolist()
+        assert both == [0] * (seen and at[1] > 5.0) + [1]
+
+
+def test_no_reported_person_is_fully_occluded_in_pictures() -> None:
+    """In 15 frames of a drive through a crowd every reported person in the picture from the same
+    eye has pixels by labels and depth."""
+    scenario = small_scenario()
+    scenario = msgspec.structs.replace(
+        scenario, crowd=CrowdSpec(persons=40, radius_m=25.0, vehicles=0), events=()
+    )
+    shown = np.concatenate([one.shown for one in reports(scenario, 15)])
+    assert len(shown) > 10 and shown.all()

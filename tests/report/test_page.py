@@ -7,6 +7,7 @@ import json
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -86,7 +87,26 @@ def test_a_row_names_a_robot_other_than_the_default(tmp_path: Path) -> None:
     ways = [short_way("s-0"), short_way("s-1", robot="scout")]
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", "goal"], "mine", ways)])
     (table,) = tables_of([own])
-    assert [row.notes for row in table.rows] == ["2 episodes, robot scout"]
+    assert [row.notes for row in table.rows] == ["2 episodes, blind, robot scout"]
+
+
+def test_tables_hold_runs_of_one_sensor_track(tmp_path: Path) -> None:
+    """A run with tracked people and a blind one have tables of their own; a row names its track,
+    and so does the summary."""
+    runs = read_runs([run_of(tmp_path / name, ["goal", HIT], name) for name in ("a", "b")])
+    records = {
+        name: msgspec.structs.replace(one, manifest=replace(one.manifest, people="seen"))
+        for name, one in runs[1].whole.records.items()
+    }
+    both = [runs[0], ReportedRun("b", runs[1].whole._replace(records=records))]
+    tables = tables_of(both)
+    assert [(one.title.partition(", ")[2], [row.name for row in one.rows]) for one in tables] == [
+        ("sensor track people", ["b: straight"]),
+        ("sensor track blind", ["a: straight"]),
+    ]
+    assert tables[0].rows[0].notes == "2 episodes, people"
+    summary = summary_table(both, {"a": "#000000", "b": "#ffffff"})
+    assert [row.track for row in summary.rows] == ["blind", "people"]
 
 
 def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from cosim.core.errors import MachineError, UsageError
 from cosim.core.state import LABELS
 from cosim.results.log import Log
 from cosim.spec.scenario import Suite
+from cosim.spec.sensors import ScanSpec
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
 from tests.support.blind_policy import BEND, Blind
@@ -72,15 +74,21 @@ class Tape:
         return self._columns[entity, name]
 
 
+class Sensing(Blind):
+    """Drives as the blind policy, with every sensor but a camera."""
+
+    manifest = replace(Blind.manifest, scan=ScanSpec(rays=90), imu="noisy", people="seen")
+
+
 @pytest.mark.engine
 def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Cosim) -> None:
     """Read back: each tick's pose, people, velocities and plots, each picture with depth and
-    labels; waypoints from where the robot was when it was asked; and the ground. A record that was
+    labels; waypoints from where the robot was when it was asked; what it sensed then; and the ground. A record that was
     changed leaves no file."""
     pytest.importorskip("rerun")
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
     suite = Suite(name="brief", version="1", scenarios=(scenario,))
-    product.run(suite, Blind(), out=tmp_path / "run")
+    product.run(suite, Sensing(), out=tmp_path / "run")
     said = cosim("show", "run", "--episode", scenario.id, "--rerun", "e.rrd", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
     tape = Tape(tmp_path / "e.rrd")
@@ -105,6 +113,11 @@ def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Co
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
         assert np.allclose(dot, BEND @ [[cos, sin], [-sin, cos]] + (x_m, y_m), atol=1e-3)
     assert tape.column("/world/waypoints/points", "tick") == [21, 25, 29, 33, 37]
+    asked = [*range(0, len(log), 4)]
+    for entity in ("/world/robot/scan", "/world/robot/tracks", "/plots/imu/gyro_z"):
+        assert tape.column(entity, "tick") == asked, entity
+    returns = tape.column("/world/robot/scan", "Points3D:positions")
+    assert all(10 < len(one) <= 90 for one in returns)
     speeds = [speed for (speed,) in tape.column("/plots/speed/robot", "Scalars:scalars")]
     assert np.array_equal(speeds, log.speed[:, 0])
     people = tape.column("/world/people", "Capsules3D:translations")

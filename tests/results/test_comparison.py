@@ -21,8 +21,9 @@ from cosim.results.compare import (
     groups_of,
 )
 from cosim.results.metrics import METRICS, WORST
-from cosim.results.record import ScanLook
+from cosim.results.record import Record, ScanLook
 from cosim.results.run_folder import RunFolder, read_records, read_spec
+from cosim.results.table import table_row
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario, read_suite
@@ -136,7 +137,7 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
 def test_runs_by_other_terms_are_called_neither_better_nor_worse(
     runs: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Another goal protocol, odometry, knowledge or latency is named, and no verdict given; the
+    """Another goal protocol, odometry, sensor track or latency is named, and no verdict given; the
     differences stay."""
     run = rewritten(
         runs / "b",
@@ -152,12 +153,35 @@ def test_runs_by_other_terms_are_called_neither_better_nor_worse(
     (note,) = told.notes
     assert note == (
         "No verdict of b against a: they drove by other terms, goal none (a) and route_point (b); "
-        "odometry none (a) and exact (b); knowledge of its own sensors (a) and privileged (b); "
+        "odometry none (a) and exact (b); sensor track blind (a) and privileged (b); "
         "latency 0 ms (a) and 200 ms (b). What differs is called neither better nor worse"
     )
     said = cosim("compare", str(runs / "a"), str(run))
     assert said.returncode == 0 and note in said.stdout
     assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", said.stdout)
+
+
+@pytest.mark.parametrize("track", ["lidar", "people"])
+def test_runs_of_other_sensor_tracks_get_no_verdict_but_blind_ones_do(
+    runs: Path, tmp_path: Path, track: str
+) -> None:
+    """A policy with a lidar, or with tracked people, is not compared with one with a camera; a
+    blind baseline is. Records without these keys are read as before."""
+    sensors: dict[str, object] = {"lidar": {}} if track == "lidar" else {"people": "seen"}
+    sensing = rewritten(runs / "b", tmp_path / "sensing", **sensors)
+    seeing = rewritten(runs / "b", tmp_path / "seeing", camera={"width": 64, "height": 48})
+    (apart,) = compare_runs([seeing, sensing]).notes
+    assert f"sensor track picture (seeing) and {track} (sensing)" in apart
+    blind = compare_runs([runs / "a", sensing])
+    assert blind.notes == () and row(blind, "success")["verdict"] == "better"
+    assert {*blind.others[0].table["track"]} == {track}
+    path = next((runs / "a").glob("episodes/*/record.json"))
+    old = {
+        key: value
+        for key, value in json.loads(path.read_bytes()).items()
+        if key not in ("lidar", "imu", "people")
+    }
+    assert table_row(Record.decoded(json.dumps(old).encode(), path))["track"] == "blind"
 
 
 def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:

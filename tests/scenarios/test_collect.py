@@ -30,15 +30,23 @@ from cosim.spec.demo_options import DemoOptions
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
+from cosim.spec.sensors import ScanSpec
 from scenarios.episodes.demonstration import Demonstration
 from scenarios.episodes.demonstrator import Demonstrator
 from scenarios.episodes.run_episode import run_episode
 from scenarios.places.nets import place
 from scenarios.suites.unit import build_unit
+from scenarios.tools.dataset.read import read_data_set
 from tests.conftest import WIDE, Cosim
 
 pytestmark = pytest.mark.engine
-NOISY = DemoOptions(camera=CameraSpec(width=64, height=48), noise=0.3)
+NOISY = DemoOptions(
+    camera=CameraSpec(width=64, height=48),
+    noise=0.3,
+    scan=ScanSpec(rays=60),
+    imu="exact",
+    people="seen",
+)
 ASKED = (
     "collect",
     "ways.json",
@@ -48,6 +56,12 @@ ASKED = (
     "64x48",
     "--noise",
     "0.3",
+    "--lidar",
+    "60",
+    "--imu",
+    "exact",
+    "--people",
+    "seen",
     "--out",
     "demos",
 )
@@ -213,6 +227,17 @@ def test_another_data_set_is_refused_in_its_folder(
     assert words in said.stderr
     assert "Traceback" not in said.stderr
     assert before == sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
+
+
+def test_recorded_sensors_are_columns_of_the_data_set(desk: Desk) -> None:
+    """A row has the distances of the lidar, without a return its range, the inertial reading and
+    32 people."""
+    held = read_data_set(desk.folder / "demos")
+    scans, readings = held.rows["observation.scan"], held.rows["observation.imu"]
+    assert scans.shape == (len(held), 60) and scans.min() > 0.0 and scans.max() == 20.0
+    assert readings.shape == (len(held), 6) and abs(readings[:, 5].mean() - 9.81) < 0.2
+    assert held.rows["observation.people"].shape == (len(held), 160)
+    assert held.info["features"]["observation.imu"]["names"][2] == "gyro_z"
 
 
 def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(
@@ -425,7 +450,8 @@ def test_a_learner_that_would_see_something_else_is_refused() -> None:
     ):
         Demonstrator(expert, asked, None, learner)
     with pytest.raises(
-        UsageError, match="'stands' is no policy that drives by one camera, speeds and a goal alone"
+        UsageError,
+        match="'stands' is no policy that drives by one camera, speeds, a goal and recorded sensors alone",
     ):
         Demonstrator(expert, asked, None, PolicyCaller.of(Stands()))
     with pytest.raises(UsageError, match="expert 'sees' sees by a camera of its own"):

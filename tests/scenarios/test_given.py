@@ -19,6 +19,7 @@ from cosim.spec.goal import ImageGoal, PointGoal
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario, Suite
+from cosim.spec.sensors import ScanSpec
 from physics.cameras.view import robot_shot
 from scenarios.episodes.episode import Episode
 from scenarios.runs.run import run
@@ -34,6 +35,9 @@ ALL = Manifest(
     camera=SPEC,
     goal="image",
     odometry="wheel",
+    scan=ScanSpec(rays=90),
+    imu="noisy",
+    people="seen",
     cameras={"left": CameraSpec(48, 32, mount="left")},
 )
 SEED = EpisodeOptions(seed=11)

@@ -33,6 +33,7 @@ from cosim.spec.odometry import Odometry
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, SCOUT
 from cosim.spec.scenario import CrowdSpec
+from cosim.spec.sensors import AT_REST, ScanSpec, Tracks, clear_scan
 from scenarios.episodes.run_episode import run_episode
 from scenarios.suites.catalog import SUITES, load_suite
 from scenarios.tools.gym.learned import LearnedPolicy
@@ -94,8 +95,15 @@ def test_what_is_seen_lies_in_its_space(goal: str) -> None:
     names, and all of it is contained; numbers beyond the bounds are put at them."""
     wide = CameraSpec(32, 24, labels=True, depth=True)
     manifest = Manifest(
-        "all", camera=wide, cameras={"left": CameraSpec(8, 6)}, goal=goal, odometry="gps"
-    )  # type: ignore[arg-type]
+        "all",
+        camera=wide,
+        cameras={"left": CameraSpec(8, 6)},
+        goal=goal,  # type: ignore[arg-type]
+        odometry="gps",
+        scan=ScanSpec(rays=8),
+        imu="exact",
+        people="seen",
+    )
     space = seen_space(manifest, [COURIER, SCOUT])
     pixels = np.full((24, 32), 3, np.uint8)
     far = np.full((24, 32), np.inf, np.float32)
@@ -121,6 +129,9 @@ def test_what_is_seen_lies_in_its_space(goal: str) -> None:
             labels=pixels,
             pictures={"left": picture},
             odometry=Odometry(1.0, 2.0, None),
+            scan=clear_scan(ScanSpec(rays=8)),
+            imu=AT_REST,
+            people=Tracks(np.arange(40, dtype=np.int32), *np.ones((2, 40, 2), np.float32)),
         ),
         space,
     )
@@ -128,6 +139,8 @@ def test_what_is_seen_lies_in_its_space(goal: str) -> None:
         space.contains(seen) and seen["speeds"][0] == 5.0 and ("goal" in seen) == (goal != "none")
     )
     assert {"picture", "depth", "labels", "picture_left", "odometry"} <= {*seen}
+    assert (seen["scan"] == 20.0).all() and seen["imu"][5] == np.float32(9.81)
+    assert (seen["people"] == 1.0).all() and seen["people"].shape == (32, 5)
 
 
 def test_answers_are_commands_or_waypoints_of_the_manifest() -> None:

@@ -11,6 +11,7 @@ from cosim.episode.interfaces import Observation
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import PointGoal
 from cosim.spec.manifest import Manifest, WaypointRule
+from cosim.spec.sensors import Scan, ScanSpec, Tracks
 
 WEIGHTS = (0.1, 0.1, 0.2, 0.6)
 
@@ -23,6 +24,8 @@ class Right:
         rate_hz=4.0,
         camera=CameraSpec(96, 64, 60.0),
         goal="route_point",
+        scan=ScanSpec(rays=36),
+        people="seen",
         waypoints=WaypointRule(index=2, unit_m=0.25, dt_s=0.75),
     )
 
@@ -33,8 +36,12 @@ class Right:
         self.look(seen)
         frames = self.ordered(([self.past[0]] * len(WEIGHTS) + self.past)[-len(WEIGHTS) :])
         way = sum(w * self.open_rad(frame) for w, frame in zip(WEIGHTS, frames, strict=True))
-        turn = 0.5 * way + 0.5 * self.goal_rad(seen.goal)
-        speed = self.speed(seen) * (1.0 - min(20.0 * self.yellow(frames[-1]), 1.0))
+        turn = 0.5 * way + 0.5 * self.goal_rad(seen.goal) + self.clear_rad(seen.scan)
+        speed = (
+            self.speed(seen)
+            * self.slower(seen.people)
+            * (1.0 - min(20.0 * self.yellow(frames[-1]), 1.0))
+        )
         return self.waypoints(turn, speed)
 
     def look(self, seen: Observation) -> None:
@@ -60,6 +67,15 @@ class Right:
         middle = frame[:, wide // 3 : 2 * wide // 3]
         red_and_green = middle[..., :2].min(axis=2)
         return float((red_and_green > np.maximum(2.0 * middle[..., 2], 0.15)).mean())
+
+    def clear_rad(self, scan: Scan) -> float:
+        ranges = np.minimum(scan.ranges_m[0], 10.0)
+        right, left = float(ranges[1:18].mean()), float(ranges[19:].mean())
+        return 0.02 * (left - right) / (left + right)
+
+    def slower(self, people: Tracks) -> float:
+        x, y = people.positions_m.T
+        return 0.7 if ((x > 0.0) & (x < 5.0) & (np.abs(y) < 1.0)).any() else 1.0
 
     def goal_rad(self, goal: PointGoal) -> float:
         return max(min(goal.bearing_rad, 1.0), -1.0)
@@ -176,6 +192,9 @@ class PictureFlipped(Right):
 
 
 class SeesNobody(Right):
+    def slower(self, people: Tracks) -> float:
+        return 1.0
+
     def yellow(self, frame: np.ndarray) -> float:
         return 0.0
 
@@ -209,6 +228,16 @@ class GoalIgnored(Right):
         return 0.0
 
 
+class LidarIgnored(Right):
+    def clear_rad(self, scan: Scan) -> float:
+        return 0.0
+
+
+class TracksIgnored(Right):
+    def slower(self, people: Tracks) -> float:
+        return 1.0
+
+
 FAULTS = {
     "finite": (NanInTheDark,),
     "determinism": (ByChance,),
@@ -218,6 +247,7 @@ FAULTS = {
     "behind": (Backwards, AxesExchanged),
     "constant": (Constant,),
     "picture_ignored": (ScaledTwice,),
+    "lidar_ignored": (LidarIgnored,),
     "frame_order": (NewestFirst, OneBehind),
     "colour_order": (BlueForRed,),
     "mirror": (FromTheLeftEdge,),
@@ -228,5 +258,5 @@ FAULTS = {
     "goal_ignored": (GoalIgnored,),
 }
 """By the check that is to fail."""
-DOUBTS = {"put_back": GoesOnAfterReset, "person": SeesNobody}
+DOUBTS = {"put_back": GoesOnAfterReset, "person": SeesNobody, "people_ignored": TracksIgnored}
 """What may be right."""

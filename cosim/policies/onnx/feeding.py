@@ -19,14 +19,17 @@ from cosim.policies.onnx.inputs import (
     ConstantInput,
     GoalPictureInput,
     GoalPointInput,
+    ImuInput,
     JoinedInput,
     MaskInput,
     NoiseInput,
     PastInput,
     PastPositionsInput,
+    PeopleInput,
     PictureInput,
     PixelsInput,
     RoutePatchInput,
+    ScanInput,
     SpeedsInput,
     StateInput,
     TurnInput,
@@ -125,6 +128,10 @@ class Feeder:
             return np.atleast_1d(np.asarray(one.value, float))
         if isinstance(one, TurnInput):
             return np.asarray(_turn_values(one, seen.goal), float)
+        if isinstance(one, ScanInput | PeopleInput):
+            now = _scan_values(one, seen) if isinstance(one, ScanInput) else _people(one, seen)
+            past = self._past_of(one, now)
+            return np.array([np.zeros_like(now) if row is None else row for row in past])
         assert isinstance(one, VectorInput)
         if isinstance(one, PastPositionsInput):
             rows: list[NDArray[np.float64] | None] = _seen_from_now(
@@ -134,7 +141,7 @@ class Feeder:
             now = (
                 _goal_values(one, seen.goal)
                 if isinstance(one, GoalPointInput)
-                else _speeds(one, seen)
+                else _own_motion(one, seen)
             )
             rows = self._past_of(one, now)
         numbers = [
@@ -187,9 +194,39 @@ def _goal_values(one: GoalPointInput, goal: Goal | None) -> NDArray[np.float64]:
     return _chosen(one.values, known)
 
 
-def _speeds(one: VectorInput, seen: Observation) -> NDArray[np.float64]:
+def _own_motion(one: VectorInput, seen: Observation) -> NDArray[np.float64]:
+    """Return the values of speeds or of an inertial sensor."""
+    if isinstance(one, ImuInput):
+        assert seen.imu is not None, "the manifest asks for an inertial sensor"
+        gyro, accel = seen.imu.gyro_radps, seen.imu.accel_mps2
+        read = {f"gyro_{axis}": v for axis, v in zip("xyz", gyro, strict=True)}
+        read |= {f"accel_{axis}": v for axis, v in zip("xyz", accel, strict=True)}
+        return _chosen(one.values, read)
     assert isinstance(one, SpeedsInput)
     return _chosen(one.values, {"v": seen.v_mps, "w": seen.w_radps})
+
+
+def _scan_values(one: ScanInput, seen: Observation) -> NDArray[np.float64]:
+    """Return the (rings, rays or sectors) distances of a scan in the input's units."""
+    scan = seen.scan
+    assert scan is not None, "the manifest asks for a lidar"
+    most_m = scan.spec.range_m if one.most_m is None else one.most_m
+    ranges = np.minimum(np.asarray(scan.ranges_m, np.float64), most_m)
+    if one.sectors:
+        ranges = ranges.reshape(len(ranges), one.sectors, -1).min(axis=2)
+    return (ranges[:, ::-1] if one.clockwise else ranges) / one.unit_m
+
+
+def _people(one: PeopleInput, seen: Observation) -> NDArray[np.float64]:
+    """Return the (rows, values) numbers of tracked people."""
+    tracks = seen.people
+    assert tracks is not None, "the manifest asks for tracked people"
+    rows = np.full((one.rows, len(one.values)), one.absent)
+    numbers = np.asarray(tracks, np.float64)[: one.rows]
+    for row, (x, y, vx, vy) in zip(rows, numbers.tolist(), strict=False):
+        known = {"x": x, "y": y, "vx": vx, "vy": vy, "present": 1.0, "distance": math.hypot(x, y)}
+        row[:] = _chosen(one.values, known)
+    return rows
 
 
 def _chosen(names: tuple[str, ...], known: Mapping[str, float]) -> NDArray[np.float64]:

@@ -259,6 +259,46 @@ class PastPositionsInput(
     unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
 
 
+class ScanInput(PastInput, frozen=True, kw_only=True, tag="scan", tag_field="what"):
+    """Distances of the lidar in units of `unit_m`, ring by ring, counter-clockwise from behind.
+
+    sectors: Number of equal sectors of a ring, of which the smallest distance is taken; 0 for all
+        rays.
+    clockwise: Whether bearings fall.
+    most_m: Upper bound of a distance in metres, and its value without a return; None: the range.
+    """
+
+    sectors: Annotated[int, Within(0, 4096)] = 0
+    clockwise: bool = False
+    unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
+    most_m: Annotated[float | None, Within(0, 1e6, above=True)] = None
+
+
+class ImuInput(VectorInput, frozen=True, kw_only=True, tag="imu", tag_field="what"):
+    """Reading of the inertial sensor: angular speeds in rad/s, specific force in m/s2."""
+
+    values: Annotated[
+        tuple[Literal["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"], ...],
+        ItemCount(1, 8),
+    ] = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
+
+
+class PeopleInput(PastInput, frozen=True, kw_only=True, tag="people", tag_field="what"):
+    """Tracked people in the robot's frame, a row each, nearest first.
+
+    rows: Number of rows; farther people are left out.
+    values: Positions and distances in m, velocities in m/s, and 1 for a person.
+    absent: Fills rows without a person.
+    """
+
+    rows: Annotated[int, Within(1, 256)]
+    values: Annotated[
+        tuple[Literal["x", "-x", "y", "-y", "distance", "vx", "-vx", "vy", "-vy", "present"], ...],
+        ItemCount(1, 8),
+    ] = ("x", "y", "vx", "vy")
+    absent: Annotated[float, _NUMBER] = 0.0
+
+
 class MaskInput(AnyInput, frozen=True, kw_only=True, tag="mask", tag_field="what"):
     """Number that says whether there is a goal that another input uses."""
 
@@ -288,7 +328,16 @@ class StateInput(AnyInput, frozen=True, kw_only=True, tag="state", tag_field="wh
     begin: Annotated[float, _NUMBER] = 0.0
 
 
-_Part = GoalPointInput | SpeedsInput | PastPositionsInput | TurnInput | ConstantInput
+_Part = (
+    GoalPointInput
+    | SpeedsInput
+    | PastPositionsInput
+    | TurnInput
+    | ConstantInput
+    | ScanInput
+    | ImuInput
+    | PeopleInput
+)
 
 
 class JoinedInput(AnyInput, frozen=True, kw_only=True, tag="joined", tag_field="what"):
@@ -316,6 +365,9 @@ GraphInput = (
     | TurnInput
     | SpeedsInput
     | PastPositionsInput
+    | ScanInput
+    | ImuInput
+    | PeopleInput
     | MaskInput
     | ConstantInput
     | NoiseInput

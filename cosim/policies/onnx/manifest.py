@@ -19,9 +19,12 @@ import msgspec
 from cosim.core.errors import SpecError
 from cosim.policies.onnx.inputs import (
     GraphInput,
+    ImuInput,
     JoinedInput,
     PastPositionsInput,
+    PeopleInput,
     PictureInput,
+    ScanInput,
     common_goals,
 )
 from cosim.policies.onnx.outputs import GraphOutput, WaypointsOutput
@@ -29,6 +32,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.odometry import OdometryKind
+from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec
 from cosim.spec.spec_file import read_spec_file
 from cosim.spec.validation import PathName, Ranged, Text, Within, shown
 
@@ -145,6 +149,9 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Within(0, 20, above=True)] = 4.0
     goal: GoalProtocol = "none"
     odometry: OdometryKind = "none"
+    scan: ScanSpec | None = None
+    imu: ImuKind = "none"
+    people: PeopleKind = "none"
     camera: BundleCamera | None = None
     cameras: dict[str, BundleCamera] = msgspec.field(default_factory=dict)
     inputs: dict[str, GraphInput]
@@ -175,6 +182,9 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
             waypoints=waypoints,
             goal=self.goal,
             odometry=self.odometry,
+            scan=self.scan,
+            imu=self.imu,
+            people=self.people,
             cameras={name: one.spec for name, one in self.cameras.items()},
             goals=self.goals,
         )
@@ -203,6 +213,7 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
                     )
                     yield f"inputs.{name} is a picture, and {which}"
             parts = one.parts if isinstance(one, JoinedInput) else (one,)
+            yield from (self._sensor_fault(name, part) for part in parts)
             if self.odometry in ("none", "gps") and any(
                 isinstance(part, PastPositionsInput) for part in parts
             ):
@@ -210,6 +221,22 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
                     f"inputs.{name} holds past positions, and odometry is {self.odometry!r}: say "
                     f"exact or wheel"
                 )
+
+    def _sensor_fault(self, name: str, one: object) -> str:
+        """Return why an input cannot be made of the sensors; "" if it can."""
+        if isinstance(one, ScanInput):
+            if self.scan is None:
+                return f"inputs.{name} is a scan, and scan is null or missing: say which lidar"
+            if one.sectors and self.scan.rays % one.sectors:
+                return (
+                    f"inputs.{name} has {one.sectors} sectors, which do not divide the "
+                    f"{self.scan.rays} rays of the scan"
+                )
+        if isinstance(one, ImuInput) and self.imu == "none":
+            return f"inputs.{name} is of an inertial sensor, and imu is 'none': say exact or noisy"
+        if isinstance(one, PeopleInput) and self.people == "none":
+            return f"inputs.{name} is of tracked people, and people is 'none': say seen"
+        return ""
 
 
 def read_bundle_manifest(folder: Path) -> BundleManifest:

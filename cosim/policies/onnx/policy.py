@@ -44,6 +44,7 @@ from cosim.spec.goal import GOALS
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER
+from cosim.spec.sensors import AT_REST, NO_TRACKS, clear_scan
 
 
 @dataclass(frozen=True)
@@ -285,6 +286,9 @@ def example_observation(manifest: Manifest) -> Observation:
         robot=COURIER,
         goal=None if goals is None else goals.example(manifest.picture_size),
         odometry=None if manifest.odometry == "none" else Odometry(0.0, 0.0, 0.0),
+        scan=None if manifest.scan is None else clear_scan(manifest.scan),
+        imu=None if manifest.imu == "none" else AT_REST,
+        people=None if manifest.people == "none" else NO_TRACKS,
         pictures={
             name: CameraPicture(grey(one.size), None, None, calibration_of(one, COURIER))
             for name, one in manifest.cameras.items()

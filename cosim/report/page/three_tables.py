@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby, pairwise
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, get_args
 
 import pandas as pd
 
@@ -29,6 +29,7 @@ from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
 from cosim.results.table import ORACLE, crashed_in, estimate_of, why_inconclusive
 from cosim.spec.robot import COURIER
 from cosim.spec.schedule import BEST_BLIND
+from cosim.spec.sensors import SensorTrack
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
 _SHARES: Final = {"success": "SR", "spl": "SPL", "route_completion": "RC"}
@@ -61,13 +62,14 @@ class TableRow(NamedTuple):
     """Row of figures.
 
     notes: what a reader must know of it
-    suite, colour: only in the summary of all runs
+    suite, track, colour: only in the summary of all runs
     """
 
     name: str
     cells: tuple[Estimate, ...]
     notes: str = ""
     suite: str = ""
+    track: str = ""
     colour: str = ""
     scored: int = 0
     crashed: int = 0
@@ -119,12 +121,26 @@ class _Column(NamedTuple):
 def tables_of(
     runs: Sequence[ReportedRun], blind: BlindRows = MappingProxyType({})
 ) -> list[ReportTable]:
-    """Return all tables for which the runs have rows.
+    """Return all tables for which the runs have rows; a table has runs of one sensor track.
 
     blind: results of blind schedules, shown as a row of the tables of success.
     """
-    tables = [_unit(runs, blind), *_reactive(runs, blind), _long(runs), _other(runs)]
-    return [table for table in tables if table is not None]
+    by_track: dict[str, list[ReportedRun]] = {track: [] for track in get_args(SensorTrack)}
+    for run in runs:
+        by_track[track_of(run.table)].append(run)
+    found = []
+    for track, its in by_track.items():
+        tables = [_unit(its, blind), *_reactive(its, blind), _long(its), _other(its)]
+        title = "" if len(its) == len(runs) else f", sensor track {track}"
+        found += [
+            table._replace(title=table.title + title) for table in tables if table is not None
+        ]
+    return found
+
+
+def track_of(table: pd.DataFrame) -> str:
+    """Return the sensor track of a run's table; "blind" without an episode."""
+    return str(table["track"].iloc[0]) if len(table) else "blind"
 
 
 def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> ReportTable:
@@ -139,6 +155,7 @@ def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> Re
                 run.label,
                 tuple(cell_of(run.table, metric) for metric in first),
                 suite=run.spec.suite,
+                track=track_of(run.table),
                 colour=colours[run.label],
                 scored=len(run.table) - invalid,
                 crashed=crashed_in(run.table),
@@ -310,19 +327,19 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 
 def _notes(table: pd.DataFrame) -> str:
-    """Return the notes of a row: episodes, pairs, robots, crashes, privileged, nonstandard camera.
+    """Return the notes of a row: episodes, sensor track, pairs, robots, crashes, odd cameras.
 
     The default robot is not named.
     """
     episodes = int((~is_decoy(table)).sum())
     notes = [f"{episodes} episode{'s' * (episodes != 1)}"]
+    notes += ["oracle"] * (ORACLE in {*table["policy"]})
+    notes.append(track_of(table))
     notes += [pairs_of(table).in_words] * has_decoys(table)
     notes += [f"robot {name}" for name in sorted({*table["robot"]} - {COURIER.name})]
     if crashed := crashed_in(table):
         notes.append(f"{crashed} crashed")
     notes += ["crowd added"] * bool(table["crowd_added"].any())
-    if table["privileged"].any():
-        notes.append("oracle, privileged" if ORACLE in {*table["policy"]} else "privileged")
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
     return ", ".join(notes)
 

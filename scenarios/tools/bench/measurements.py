@@ -9,7 +9,7 @@ from typing import Final
 
 from cosim.core.errors import unknown
 from cosim.core.progress import Progress
-from scenarios.tools.bench import cameras, environment, serving
+from scenarios.tools.bench import cameras, environment, sensors, serving
 from scenarios.tools.bench.figures import MORE, Figure, taken
 
 _Take = Callable[[], list[Figure]]
@@ -25,6 +25,7 @@ ENVIRONMENT: Final = (
     "street 150",
     "places",
     "reactive",
+    "sensors",
 )
 """Taken by `cosim bench`."""
 ON_REQUEST: Final = (
@@ -55,6 +56,7 @@ _TAKEN: Final[Mapping[str, _Take]] = {
     "street 150": partial(environment.walking, 150),
     "places": environment.places,
     "reactive": environment.reactive,
+    "sensors": sensors.sensing,
     "legs": environment.driving_on_legs,
     "ten environments": environment.driving_together,
     "200 episodes": environment.growing,

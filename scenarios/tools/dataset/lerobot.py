@@ -189,6 +189,8 @@ def _rows(
         part: dict[str, NDArray[Any]] = {"observation.state": shown.state}
         if not np.isnan(shown.goal).all():
             part["observation.goal"] = shown.goal
+        for sensor, readings in shown.sensors.items():
+            part[f"observation.{sensor}"] = readings.reshape(count, -1)
         part |= {
             "action": shown.command,
             "waypoints": shown.waypoints.reshape(count, -1),
@@ -224,6 +226,7 @@ def _features(rows: dict[str, Any], filmed: Filmed) -> dict[str, Any]:
     named: dict[str, Sequence[str]] = {
         "observation.state": _SPEEDS,
         "observation.goal": ("x_m", "y_m"),
+        "observation.imu": [f"{what}_{axis}" for what in ("gyro", "accel") for axis in "xyz"],
         "action": _SPEEDS,
         "waypoints": [f"{axis}{k}_m" for k in range(1, points + 1) for axis in "xy"],
     }

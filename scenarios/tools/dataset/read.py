@@ -144,6 +144,10 @@ def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = 
             and np.array_equal(
                 held.rows["waypoints"][here], shown.waypoints.reshape(len(shown), -1)
             )
+            and all(
+                np.array_equal(held.rows[f"observation.{name}"][here], rows.reshape(len(shown), -1))
+                for name, rows in shown.sensors.items()
+            )
         )
         if not same:
             raise RunError(

@@ -22,12 +22,16 @@ from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.goal import GOALS, TextSpace
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
+from cosim.spec.sensors import PEOPLE_ROWS, TRACKING_RANGE_M, people_rows
 
 Actions = Literal["command", "waypoints"]
 SeenParts = dict[str, Any]
 """Observation of a learner: arrays, and a text if the goal is an instruction."""
 
 _FARTHEST_M: Final = 10_000.0
+_MOST_GYRO_RADPS: Final = 35.0
+_MOST_ACCEL_MPS2: Final = 160.0
+_MOST_PERSON_MPS: Final = 10.0
 
 
 def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
@@ -40,6 +44,9 @@ def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
         picture_NAME, ...        of each further camera
         goal              as in the protocol; a point is (2,) metres ahead and to the left
         odometry          (3,), or (2,) without a heading
+        scan              (rings, rays) metres, the lidar's range without a return
+        imu               (6,) angular speeds in rad/s, specific force in m/s2
+        people            (32, 5), nearest first: 1, x, y, and velocity; 0 in rows without one
 
     Raises UsageError for a manifest with inputs that only the simulator knows.
     """
@@ -57,6 +64,13 @@ def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
     if manifest.odometry != "none":
         heading = [] if manifest.odometry == "gps" else [2.0 * np.pi]
         parts["odometry"] = _box([_FARTHEST_M, _FARTHEST_M, *heading])
+    if (scan := manifest.scan) is not None:
+        parts["scan"] = spaces.Box(0.0, scan.range_m, (scan.rings, scan.rays), np.float32)
+    if manifest.imu != "none":
+        parts["imu"] = _box([*[_MOST_GYRO_RADPS] * 3, *[_MOST_ACCEL_MPS2] * 3])
+    if manifest.people != "none":
+        most = [1.0, *[2.0 * TRACKING_RANGE_M] * 2, *[_MOST_PERSON_MPS] * 2]
+        parts["people"] = _box(np.tile(most, (PEOPLE_ROWS, 1)))
     return spaces.Dict(parts)
 
 
@@ -73,6 +87,9 @@ def seen_by(observation: Observation, space: spaces.Dict) -> SeenParts:
         parts["odometry"] = [
             v for v in (odometry.x_m, odometry.y_m, odometry.heading_rad) if v is not None
         ]
+    parts |= {"scan": observation.scan, "imu": observation.imu}
+    if (people := observation.people) is not None:
+        parts["people"] = people_rows(people)
     return {name: _within(parts[name], one) for name, one in space.items()}
 
 

@@ -156,7 +156,7 @@ def behind(asker: Asker) -> CheckOutcome:
 def constant(asker: Asker) -> CheckOutcome:
     """Different observations give different answers."""
     manifest = asker.manifest
-    if manifest.camera is None and manifest.goal == "none" and not manifest.privileged:
+    if manifest.track == "blind" and manifest.goal == "none":
         return inapplicable("it is told nothing that it could answer to")
     plain = asker.answer("straight")
     others = [asker.answer(scene) for scene in SCENES] + [

@@ -39,6 +39,7 @@ from scenarios.tools.policy_check.picture_checks import (
     street_mirrored,
 )
 from scenarios.tools.policy_check.query import Asker
+from scenarios.tools.policy_check.sensor_checks import lidar_ignored, people_ignored
 
 POLICY_CHECKS: Final[Mapping[str, Callable[[Asker], CheckOutcome]]] = MappingProxyType(
     {
@@ -52,6 +53,8 @@ POLICY_CHECKS: Final[Mapping[str, Callable[[Asker], CheckOutcome]]] = MappingPro
         "behind": behind,
         "constant": constant,
         "picture_ignored": picture_ignored,
+        "lidar_ignored": lidar_ignored,
+        "people_ignored": people_ignored,
         "frame_order": frame_order,
         "colour_order": colour_order,
         "mirror": street_mirrored,

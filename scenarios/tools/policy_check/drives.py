@@ -1,6 +1,6 @@
 """Drives that are shown to a policy: short ways along a real street of a suite.
 
-The cameras of the policy draw them without a simulation. Its answers do not affect the next
+The sensors of the policy see them without a simulation. Its answers do not affect the next
 observation.
 """
 
@@ -26,12 +26,14 @@ from cosim.episode.interfaces import Observation
 from cosim.episode.loop import Moment
 from cosim.episode.manifest_checks import check_camera
 from cosim.episode.observer import Observer
+from cosim.episode.sensing import sensing_range_m
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of
 from physics.dynamics.world import BulletWorld
+from physics.sensors.caster import RayCaster
 from scenarios.episodes.wiring import (
     CORRIDOR_M,
     draw_empty_street,
@@ -136,6 +138,9 @@ def _drive(
         }
         eye = cameras.pop("", None)
         look = None if eye is None else partial(draw_empty_street, eye, surface, robot)
+        rays: RayCaster | None = None
+        if range_m := sensing_range_m(manifest):
+            rays = stack.enter_context(RayCaster(surface, (), (), robot, range_m))
         told = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
         observer = Observer(
             scenario,
@@ -144,6 +149,7 @@ def _drive(
             lambda now: privileged_state(scenario, free(), (), now),
             cameras,
             look,
+            rays,
         )
         people = (
             _standing_person(route, 0.5 * route.length_m + _PERSON_M)

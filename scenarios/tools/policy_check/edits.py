@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -17,6 +17,7 @@ from cosim.core.state import write_protect
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import Calibration, CameraPicture, flipped
 from cosim.spec.goal import Goal
+from cosim.spec.sensors import clear_scan
 
 _MIRROR: Final = np.diag([1.0, -1.0, 1.0, 1.0])
 """Transformation that exchanges left and right in the frame of the robot."""
@@ -51,6 +52,9 @@ def in_mirror(seen: Observation) -> Observation:
         w_radps=-seen.w_radps,
         goal=None if seen.goal is None else seen.goal.mirrored(),
         odometry=odometry,
+        scan=None if seen.scan is None else seen.scan.mirrored(),
+        imu=None if seen.imu is None else seen.imu.mirrored(),
+        people=None if seen.people is None else seen.people.mirrored(),
         camera=None
         if seen.camera is None or seen.rgb is None
         else _camera_in_mirror(seen.camera, seen.rgb.shape[1]),
@@ -90,6 +94,10 @@ SWAPPED: Final = with_pictures(
 )
 ALL_BLACK: Final = with_pictures("black", np.zeros_like)
 ALL_WHITE: Final = with_pictures("white", lambda rgb: np.full_like(rgb, 255))
+NO_RETURNS: Final = of_each(
+    "no returns",
+    lambda seen: replace(seen, scan=None if seen.scan is None else clear_scan(seen.scan.spec)),
+)
 AT_REST: Final = of_each("standing", lambda seen: replace(seen, v_mps=0.0, w_radps=0.0))
 LATER_S: Final = 3600.0
 LATER: Final = of_each(
@@ -114,6 +122,16 @@ def showing(name: str, other: Observations, ages: Sequence[int] | None = None) -
         return edited
 
     return Edit(f"{name} {ages}", change)
+
+
+def sensing(name: str, other: Observations, sensor: Literal["scan", "people"]) -> Edit:
+    """Return an edit that gives the readings of one sensor in another drive of the same length."""
+
+    def change(seen: Observations) -> list[Observation]:
+        readings = [{sensor: getattr(one, sensor)} for one in other]
+        return [replace(mine, **theirs) for mine, theirs in zip(seen, readings, strict=True)]
+
+    return Edit(f"{sensor} of {name}", change)
 
 
 def _seeing(mine: Observation, theirs: Observation) -> Observation:

@@ -2,12 +2,12 @@
 
     world/map/...           ground by kind, fences, obstacles, the route, the goal; static
     world/robot             pose of the robot; plan: path of its command; camera: rgb, depth,
-                            labels
+                            labels; scan: returns of its lidar; tracks: people that it tracks
     world/waypoints         waypoints of its policy, if any; the followed one is large
     world/people, vehicles  bodies by kind; people/velocity: arrows of a second
     world/signals           red and green, over the crossings near the robot
     plots/...               speed, turn, command, gap to the nearest person, way, delay of the
-                            answers
+                            answers; imu: the inertial sensor
     told                    events, failures and the end, as text
 
 Timelines: `time`, simulated seconds, and `tick`. The file is written only as a whole, and only if
@@ -33,7 +33,7 @@ from cosim.core.files import atomic_file
 from cosim.core.geometry import Floats, Pose
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import LABELS, PERSON_RADIUS_M, RobotState, Street
-from cosim.episode.interfaces import ViewCamera
+from cosim.episode.interfaces import Observation, ViewCamera
 from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import calibration_of
 from cosim.place.street_map import Lane
@@ -57,6 +57,7 @@ from scenarios.episodes.replay import (
     load_recorded,
     replay_episode,
 )
+from scenarios.episodes.sensor_replay import SensorReplay, sensor_replay
 from scenarios.places.nets import place, surface_of_place
 from scenarios.tools.viewing.drawn_route import led_to
 
@@ -66,6 +67,9 @@ _TALL_M: Final = 1.75
 _CAR_M: Final = 1.5
 _LEADS_S: Final = 2.0
 _PICTURES: Final = ("rgb", "depth", "labels")
+_IMU_PLOTS: Final = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
+_RETURN: Final[Rgb255] = (220, 40, 40)
+_TRACK: Final[Rgb255] = (250, 170, 30)
 _WALK: Final[Rgb255] = (214, 210, 200)
 _CROSSING: Final[Rgb255] = (240, 232, 140)
 _GREEN: Final[Rgb255] = (0, 170, 80)
@@ -155,12 +159,12 @@ def _replay_into(
 ) -> None:
     spec = replace(told.record.manifest.camera or _SPEC, depth=True, labels=True)
     episode, policy = replay_episode(told, camera)
-    with episode, episode.eyes(spec) as eyes:
+    with episode, episode.eyes(spec) as eyes, sensor_replay(told) as sensors:
         surface = surface_of_place(told.scenario.place)
         tape.begin(surface, spec)
         for watch in (
             ReplayChecker(folder, told).watch,
-            lambda step, verdict: tape.tick(step, verdict, eyes),
+            lambda step, verdict: tape.tick(step, verdict, eyes, sensors),
         ):
             episode.watch(watch)
         observation = episode.reset()
@@ -290,9 +294,15 @@ class _Tape:
         """Return (N, 3) points above_m above the ground."""
         return np.column_stack([xy, self._surface.heights(xy) + above_m])
 
-    def tick(self, step: Step, verdict: Verdict, eyes: ViewCamera) -> None:
-        """Log the state at the end of a tick."""
+    def tick(
+        self, step: Step, verdict: Verdict, eyes: ViewCamera, sensors: SensorReplay | None
+    ) -> None:
+        """Log what the policy sensed at the start of a tick, and the state at its end."""
         rr = self._rr
+        if sensors is not None and (seen := sensors.read(step, verdict)) is not None:
+            self._to.set_time("time", duration=Clock().time_s(step.tick))
+            self._to.set_time("tick", sequence=step.tick)
+            self._sensed(seen)
         robot = step.motion.robot
         self._to.set_time("time", duration=Clock().time_s(step.tick + 1))
         self._to.set_time("tick", sequence=step.tick + 1)
@@ -325,6 +335,28 @@ class _Tape:
                 self._log(f"{camera}/depth", rr.DepthImage(millimetres, meter=1000.0))
             if frame.labels is not None:
                 self._log(f"{camera}/labels", rr.SegmentationImage(frame.labels))
+
+    def _sensed(self, seen: Observation) -> None:
+        """Log a scan, tracked people and a reading of the inertial sensor."""
+        rr = self._rr
+        if (scan := seen.scan) is not None:
+            ranges = scan.ranges_m.ravel()
+            hit = np.isfinite(ranges)
+            points = (scan.spec.directions[:, hit] * ranges[hit]).T
+            points[:, 2] += scan.spec.height_m
+            self._log("world/robot/scan", rr.Points3D(points, radii=[0.04], colors=[_RETURN]))
+        if (tracks := seen.people) is not None:
+            feet = np.column_stack([tracks.positions_m, np.full(len(tracks.ids), 0.9)])
+            ways = np.column_stack([tracks.velocities_mps, np.zeros(len(tracks.ids))])
+            dots = rr.Points3D(
+                feet, radii=[0.12], colors=[_TRACK], labels=[str(i) for i in tracks.ids.tolist()]
+            )
+            self._log("world/robot/tracks", dots)
+            arrows = rr.Arrows3D(vectors=ways, origins=feet, colors=[_TRACK])
+            self._log("world/robot/tracks/velocity", arrows)
+        if seen.imu is not None:
+            for name, value in zip(_IMU_PLOTS, np.asarray(seen.imu).tolist(), strict=True):
+                self._log(f"plots/imu/{name}", rr.Scalars(value))
 
     def _on_legs(self, robot: RobotState) -> None:
         """Log the place of a trunk on legs, and a line for each part of the legs."""

@@ -143,6 +143,8 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         "waypoints": "waypoint 2, units of 1 m, in 0.25 s, shipped",
         "run_seed": 7,
         "policy_runs": "in-process",
+        "track": "privileged",
+        **dict.fromkeys(("lidar", "imu", "people"), "none"),
     }  # type: ignore[dict-item]
     row = dict.fromkeys(METRICS, 1.0) | {name: 1.0 for name, _ in (*SHOWN, *COUNTS)} | row  # type: ignore[assignment]
     for odd, star in (("a camera of its own", True), ("", False)):
@@ -150,8 +152,8 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         print_table(out, pd.DataFrame([row | {"nonstandard": odd}]), 1)
         text = " ".join(said.getvalue().split())
         assert (
-            "policy orca (oracle, privileged); camera own mount, 64 x 64 px, 75 deg, at 4 "
-            "Hz; goal route_point; "
+            "policy orca (oracle, privileged); sensor track privileged; camera own mount, "
+            "64 x 64 px, 75 deg, at 4 Hz; goal route_point; "
             "odometry gps; waypoint 2, units of 1 m, in 0.25 s, shipped; seed 7" in text
         )
         assert (
@@ -183,7 +185,7 @@ def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_
         print_terms(out, table_of([record]), tmp_path / name)
         text = " ".join(said.getvalue().split())
         assert (
-            text.startswith("policy p; at 4 Hz; goal none; odometry none; ")
+            text.startswith("policy p; sensor track blind; at 4 Hz; goal none; odometry none; ")
             and "camera" not in text
         )
         assert ("waypoint 2, units of 1 m" in text) is (name == "waypoints")

@@ -19,8 +19,16 @@ from cosim.policies.onnx.inputs import GraphInput
 from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER
+from cosim.spec.sensors import Imu, Scan, ScanSpec, Tracks
 
 SEEN = Observation(tick=0, time_s=0.0, rgb=None, v_mps=1.2, w_radps=-0.3, robot=COURIER)
+SCAN = Scan(np.array([[1.0, 2.0, 3.0, 4.0, np.inf, 6.0, 7.0, 30.0]], np.float32), ScanSpec(rays=8))
+TRACKS = Tracks(
+    np.array([4, 2], np.int32),
+    np.array([[3.0, 4.0], [6.0, -1.0]], np.float32),
+    np.array([[0.5, 0.0], [-1.0, 0.25]], np.float32),
+)
+SENSED = replace(SEEN, scan=SCAN, imu=Imu((0.1, 0.2, 0.3), (1.0, 2.0, 9.8)), people=TRACKS)
 SMALL = {"what": "picture", "size": [4, 2], "layout": "TCHW"}
 
 
@@ -176,6 +184,35 @@ def test_numbers_are_those_that_the_input_says(name: str) -> None:
     """Of a robot at 1.2 m/s turning right at 0.3 rad/s, told this goal."""
     fields, goal, wanted = VECTORS[name]
     told = feeder((None, len(wanted)), one=fields).feed(replace(SEEN, goal=goal))["one"]
+    np.testing.assert_allclose(told, [wanted], atol=1e-6)
+
+
+SENSORS: dict[str, tuple[dict[str, Any], list[float]]] = {
+    "scan": ({"what": "scan", "unit_m": 10}, [0.1, 0.2, 0.3, 0.4, 2.0, 0.6, 0.7, 2.0]),
+    "sectors": (
+        {"what": "scan", "sectors": 4, "clockwise": True, "most_m": 5},
+        [5.0, 5.0, 3.0, 1.0],
+    ),
+    "imu": ({"what": "imu", "values": ["gyro_z", "accel_x"]}, [0.3, 1.0]),
+    "people": (
+        {"what": "people", "rows": 3, "values": ["distance", "-vy", "present"], "absent": -1},
+        [5.0, 0.0, 1.0, math.hypot(6.0, 1.0), -0.25, 1.0, -1.0, -1.0, -1.0],
+    ),
+    "joined": (
+        {
+            "what": "joined",
+            "parts": [{"what": "speeds"}, {"what": "people", "rows": 1, "values": ["x"]}],
+        },
+        [1.2, -0.3, 3.0],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_sensors_are_given_as_the_input_says(name: str) -> None:
+    """A scan with a return missing and one beyond the range, two tracked people, and a reading."""
+    fields, wanted = SENSORS[name]
+    told = feeder((None, len(wanted)), one=fields).feed(SENSED)["one"]
     np.testing.assert_allclose(told, [wanted], atol=1e-6)
 
 

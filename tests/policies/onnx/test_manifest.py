@@ -85,6 +85,17 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         {"inputs": {"past": {"what": "past_positions"}}, "goal": "none"},
         "odometry is 'none': say exact or wheel",
     ),
+    "no-lidar": ({"inputs": {"a": {"what": "scan"}}, "goal": "none"}, "scan is null or missing"),
+    "sectors": (
+        {"inputs": {"a": {"what": "scan", "sectors": 7}}, "goal": "none", "scan": {}},
+        "inputs.a has 7 sectors, which do not divide the 360 rays of the scan",
+    ),
+    "lidar": ({"scan": {"rays": 3}}, "scan rays must be in [8, 4096], not 3"),
+    "no-imu": ({"inputs": {"a": {"what": "imu"}}, "goal": "none"}, "imu is 'none': say exact or"),
+    "no-people": (
+        {"inputs": {"a": {"what": "people", "rows": 5}}, "goal": "none"},
+        "people is 'none': say seen",
+    ),
     "columns": (
         {"output": {**GNM["output"], "columns": ["x", "cos"]}},
         "columns lack y: ['x', 'cos']; waypoints",
