@@ -198,6 +198,8 @@ def collect_command(
     folder = config.out
     jobs = config.jobs or 1
     assert folder is not None
+    if config.ros2 is not None and jobs > 1:
+        raise UsageError(f"policy '{config.policy}' drives one episode at a time here: one job")
     collecting = demo.collecting
     host = host_of(config)
     expert = inspected_driver(config.policy, host, jobs)

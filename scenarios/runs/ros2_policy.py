@@ -326,7 +326,10 @@ def ros2_driver(name: str, host: PolicyHost, timer: Timer | None = None) -> Ros2
     Raises UsageError for invalid settings, MachineError without the extra [ros2].
     """
     if host.ros2 is None:
-        raise UsageError(f"policy '{name}' needs settings: PolicyHost(ros2=Ros2Settings(...))")
+        raise UsageError(
+            f"policy '{name}' has no settings here: use `cosim run` or `cosim scenario run`, or in "
+            "Python PolicyHost(ros2=Ros2Settings(...))"
+        )
     message_store()
     called = name.removeprefix(ROS2_SCHEME) or "ros2"
     policy = Ros2Policy(called, host.ros2)

@@ -4,6 +4,7 @@ design document; bytes against their decoded values."""
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,7 @@ from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER
 from cosim.spec.ros2 import LARGEST_B, SENT, TAKEN, Ros2Wait
 from cosim.spec.sensors import Imu, Scan, ScanSpec
+from tests.conftest import ROOT
 
 CHATTER = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 TALKER = (
@@ -277,3 +279,15 @@ def test_a_plan_is_turned_into_the_robots_frame() -> None:
     assert many is not None and len(many) == 32
     for payload in (path("camera", [(1.0, 1.0)]), path("odom", []), b"\0\1\0\0x"):
         assert plan_in_robot_frame(payload, pose) is None
+
+
+def test_the_page_names_each_topic_and_its_type() -> None:
+    """The table of topics in docs/ros2.md has those that are sent and read, with their types."""
+    page = (ROOT / "docs" / "ros2.md").read_text()
+    rows = [
+        line.split("|")[1:3] for line in page.splitlines() if line.startswith(("| `/", "| in: `/"))
+    ]
+    topics = {name for row in rows for name in re.findall(r"`([^`]+)`", row[0])}
+    assert topics == {*SENT, *TAKEN}
+    named = {name for row in rows for name in re.findall(r"`([^`]+)`", row[1])}
+    assert named == set(types.HASHES)
