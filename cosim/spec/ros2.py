@@ -20,7 +20,7 @@ Ros2Wait = Literal["next", "stamped", "rate"]
 """Rules that decide which command answers an observation."""
 Ros2Dialect = Literal["rmw_zenoh", "ros2dds"]
 """Wire formats: that of rmw_zenoh, and that of zenoh-bridge-ros2dds."""
-Ros2Distro = Literal["humble", "jazzy", "kilted", "rolling"]
+Ros2Distro = Literal["humble", "jazzy", "kilted"]
 """Distributions of nodes. Humble has no type hashes; the hashes of the others are equal."""
 Ros2Clock = Literal["restart", "monotonic"]
 """Behaviour of /clock at a new episode: back to its start, or further on."""
