@@ -19,8 +19,7 @@ from cosim.cli.options import LEARN, camera_here, check_output, parse_size, repl
 from cosim.cli.progress import doing, stages_in_lines
 from cosim.cli.run_progress import ProgressDisplay
 from cosim.core.errors import INTERRUPTED, UsageError
-from cosim.spec.demo_options import DataFormat
-from cosim.spec.run_config import Option, RunConfig
+from cosim.spec.run_config import DataFormat, Option, RunConfig
 
 if TYPE_CHECKING:
     from cosim.spec.demo_options import DemoOptions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import msgspec
 
@@ -13,6 +13,7 @@ from cosim.core.errors import SpecError, UsageError
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
+from cosim.spec.run_config import DataFormat
 from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec
 
 RECORDING_CAMERA: Final = "collected"
@@ -23,10 +24,6 @@ _MOST_WAYPOINTS: Final = 100
 """Maximum number of waypoints in a row."""
 _FASTEST_HZ: Final = 20.0
 """Maximum rate of pictures; a tick takes 0.05 s."""
-
-
-DataFormat = Literal["lerobot", "rosbag2"]
-"""Forms of a data set."""
 
 
 class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):

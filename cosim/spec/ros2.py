@@ -6,15 +6,17 @@ import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 
 from cosim.core.errors import UsageError
-from cosim.spec.camera import CameraSpec
 from cosim.spec.connection import Connection
-from cosim.spec.manifest import Manifest, WaypointRule
-from cosim.spec.sensors import ScanSpec
+
+if TYPE_CHECKING:  # slow to import, and the command line's options are made with this module
+    from cosim.spec.camera import CameraSpec
+    from cosim.spec.manifest import Manifest
+    from cosim.spec.sensors import ScanSpec
 
 Ros2Wait = Literal["next", "stamped", "rate"]
 """Rules that decide which command answers an observation."""
@@ -132,6 +134,8 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True):
 
     def manifest(self, name: str) -> Manifest:
         """Return the manifest of the policy: the sensors that are published."""
+        from cosim.spec.manifest import Manifest, WaypointRule
+
         return Manifest(
             name,
             rate_hz=self.rate_hz,
@@ -156,6 +160,8 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True):
 
 def camera_called(text: str, option: str, *, depth: bool = False) -> CameraSpec | None:
     """Return the front camera of an option's value. Raises UsageError."""
+    from cosim.spec.camera import CameraSpec
+
     if text == "none":
         if depth:
             raise UsageError(f"--ros2-depth needs a camera: leave out {option} none")
@@ -166,7 +172,9 @@ def camera_called(text: str, option: str, *, depth: bool = False) -> CameraSpec 
 
 
 def _scan(text: str) -> ScanSpec | None:
-    """Return the lidar of an option's value. Raises UsageError."""
+    """Return the lidar of an option's value. Raises UsageError, SpecError."""
+    from cosim.spec.sensors import ScanSpec
+
     if text == "none":
         return None
     if not (found := _SCAN.fullmatch(text)) or int(found[1]) == 0 or found[2] == "0":
