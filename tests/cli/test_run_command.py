@@ -162,7 +162,7 @@ def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim)
     spec = json.loads((desk / "run/run.json").read_text())
     kind = spec["policy_runs"]
     assert kind in ("isolated: namespaces", "isolated: landlock") and spec["policy"] == "far:Far"
-    row = f"policy far; at 4 Hz; goal route_point; odometry wheel; policy {kind}; seed"
+    row = f"policy far; sensor track blind; at 4 Hz; goal route_point; odometry wheel; policy {kind}; seed"
     assert row in said.stdout
     weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=desk)
     assert (
