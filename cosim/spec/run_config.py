@@ -9,10 +9,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
-import msgspec
-
 from cosim.core.errors import UsageError
-from cosim.spec.connection import Connection, connecting, listening
+from cosim.spec.connection import Connection, checked_endpoint, connecting, listening
 from cosim.spec.ros2 import (
     LARGEST_DOMAIN,
     ROS2_LISTEN,
@@ -550,8 +548,13 @@ class RunConfig:
         if self.ros2_at:
             end = connecting("coordinator", "--ros2-at", at, tls, insecure)
         else:
-            hub = listening("coordinator", "--ros2-listen", at, tls, insecure)
-            end = msgspec.structs.replace(hub, guests=("ros2",))
+            end = Connection(
+                role="coordinator",
+                listen=checked_endpoint(at, "--ros2-listen"),
+                tls=tls,
+                insecure=insecure,
+                guests=("ros2",),
+            )
         return Ros2Settings(
             connection=end,
             domain=self.ros2_domain,
@@ -669,7 +672,8 @@ def run_connections(
         )
     guarded = [name for name, end in given.items() if end.startswith("tls/")]
     if tls and not guarded and not (ros2 is not None and ros2.tls):
-        raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {', '.join(given.values())}")
+        shown = ", ".join([*given.values(), *([] if ros2 is None else [ros2.endpoint])])
+        raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {shown}")
     files = {name: tls if name in guarded else "" for name in given}
     return RunConnections(
         None
