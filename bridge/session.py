@@ -18,12 +18,14 @@ from types import TracebackType
 from typing import Any, Literal, NamedTuple, Self
 
 import zenoh
+import zenoh.ext
 
 from bridge.security.settings import local_settings, session_settings
 from cosim.core.errors import AccessError, EngineError
 from cosim.spec.connection import Connection
 
 Handler = Callable[[bytes], bytes]
+Publisher = zenoh.Publisher | zenoh.ext.AdvancedPublisher
 _Subscriber = zenoh.Subscriber["zenoh.Handler[zenoh.Sample]"]
 
 _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
@@ -46,6 +48,8 @@ _FIRST_RETRY_S = 0.005
 """First pause in seconds between retries; it doubles with each retry."""
 _LONGEST_RETRY_S = 0.2
 """Longest pause in seconds between retries."""
+_HEARTBEAT_MS = 500
+"""Period of the heartbeats of a latched publisher in ms, as rmw_zenoh's."""
 
 
 class Query:
@@ -102,8 +106,14 @@ class Session:
         self._inside = inside
         self._folder = folder
         self._queryables: list[zenoh.Queryable[None]] = []
-        self._subscribers: list[zenoh.Subscriber[Any]] = []
+        self._subscribers: list[zenoh.Subscriber[Any] | zenoh.ext.AdvancedSubscriber[Any]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
+        self._publishers: dict[str, Publisher] = {}
+
+    @property
+    def id(self) -> str:
+        """Id of the session in hexadecimal digits."""
+        return str(self._session.info.zid())
 
     @property
     def zenoh_session(self) -> zenoh.Session:
@@ -224,13 +234,65 @@ class Session:
         """Publish; slow subscribers miss messages."""
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
-    def listen(self, key: str, handler: Callable[[str, bytes], None]) -> None:
-        """Call `handler(key, payload)` for every publication on a key expression."""
+    def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
+        """Publish on an advertised key. Slow subscribers delay the call and miss nothing."""
+        self._publishers[key].put(payload, attachment=attachment or None)
+
+    def advertise(self, key: str, *, latched: int = 0) -> None:
+        """Declare a reliable publisher of a key. The first messages may miss a subscriber that
+        connects at the same moment.
+
+        latched: Number of messages that later subscribers also get, if they query the history.
+        """
+        self._publishers[key] = self._publisher(key, latched)
+
+    def _publisher(self, key: str, latched: int) -> Publisher:
+        block = zenoh.CongestionControl.BLOCK
+        reliable = zenoh.Reliability.RELIABLE
+        if not latched:
+            return self._session.declare_publisher(
+                key, congestion_control=block, reliability=reliable, express=True
+            )
+        return zenoh.ext.declare_advanced_publisher(
+            self._session,
+            key,
+            congestion_control=block,
+            reliability=reliable,
+            express=True,  # as the others: a batch would arrive later than what follows it
+            cache=zenoh.ext.CacheConfig(latched),
+            publisher_detection=True,
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                heartbeat=None, sporadic_heartbeat=_HEARTBEAT_MS / 1000.0
+            ),
+        )
+
+    def listen(
+        self, key: str, handler: Callable[[str, bytes, bytes], None], *, history: bool = False
+    ) -> None:
+        """Call `handler(key, payload, attachment)` for every publication on a key expression.
+
+        history: Query latched messages too.
+        """
 
         def received(sample: zenoh.Sample) -> None:
-            handler(str(sample.key_expr), sample.payload.to_bytes())
+            attached = sample.attachment
+            handler(
+                str(sample.key_expr),
+                sample.payload.to_bytes(),
+                b"" if attached is None else attached.to_bytes(),
+            )
 
-        self._subscribers.append(self._session.declare_subscriber(key, received))
+        if history:
+            self._subscribers.append(
+                zenoh.ext.declare_advanced_subscriber(
+                    self._session,
+                    key,
+                    received,
+                    history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+                )
+            )
+        else:
+            self._subscribers.append(self._session.declare_subscriber(key, received))
 
     def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryResult:
         """Send one query and return its first result."""
@@ -277,6 +339,9 @@ class Session:
             for token in self._tokens:
                 token.undeclare()  # type: ignore[no-untyped-call]
             self._tokens.clear()
+            for publisher in self._publishers.values():
+                publisher.undeclare()  # type: ignore[no-untyped-call]
+            self._publishers.clear()
             self._session.close()  # type: ignore[no-untyped-call]
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)

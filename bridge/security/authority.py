@@ -37,6 +37,8 @@ from cosim.core.files import atomic_folder
 from cosim.spec.connection import HUBS, Role
 
 _CA_KEY: Final = "ca.key"
+ROS2_CONFIG: Final = "session.json5"
+"""Zenoh configuration in the folder of the role `ros2`."""
 _AUTHORITY_DAYS: Final = 3650
 """Validity of an authority in days."""
 _SKEW: Final = timedelta(days=1)
@@ -125,6 +127,39 @@ def _issue(
         _write(made / CA, authority.public_bytes(Encoding.PEM))
         _write(made / CERTIFICATE, builder.sign(signing_key, SHA256()).public_bytes(Encoding.PEM))
         _write(made / KEY, _pem(key))
+        if role == "ros2":
+            reached = identity_in(folder / "coordinator").hosts
+            config = _ros2_session_config(folder / role, (*reached, "HOST")[0])
+            _write(made / ROS2_CONFIG, config.encode())
+
+
+def _ros2_session_config(folder: Path, host: str) -> str:
+    """Return a Zenoh configuration for ROS 2 nodes, for $ZENOH_SESSION_CONFIG_URI.
+
+    folder: Where the certificate is.
+    host: Machine of the run.
+    """
+    at = folder.absolute()
+    return f"""\
+// For nodes of rmw_zenoh: export ZENOH_SESSION_CONFIG_URI={at / ROS2_CONFIG}
+// Change host, port and paths where they differ.
+{{
+  mode: "client",
+  connect: {{ endpoints: ["tls/{host}:7447"], timeout_ms: -1 }},
+  scouting: {{ multicast: {{ enabled: false }} }},
+  transport: {{
+    link: {{
+      tls: {{
+        root_ca_certificate: "{at / CA}",
+        connect_certificate: "{at / CERTIFICATE}",
+        connect_private_key: "{at / KEY}",
+        enable_mtls: true,
+        verify_name_on_connect: true,
+      }},
+    }},
+  }},
+}}
+"""
 
 
 def _authority(folder: Path) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:

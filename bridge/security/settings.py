@@ -8,11 +8,12 @@ all roles allowed at the hub.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from cosim.spec.connection import Connection, Role
+from cosim.spec.ros2 import SENT, TAKEN
 
 _ENV = "cosim/*/env/*"
 
@@ -25,6 +26,8 @@ class _Rights(NamedTuple):
     hear: Keys it may subscribe to.
     answer: Keys on which it may declare queryables.
     show: Keys of its liveliness tokens.
+    tell: Keys on which it may publish.
+    watch: Keys of the liveliness tokens that it may see.
     """
 
     words: str
@@ -32,7 +35,24 @@ class _Rights(NamedTuple):
     hear: tuple[str, ...] = ()
     answer: tuple[str, ...] = ()
     show: tuple[str, ...] = ()
+    tell: tuple[str, ...] = ()
+    watch: tuple[str, ...] = ()
 
+
+def _ros2_keys(topics: Iterable[str]) -> tuple[str, ...]:
+    """Return the keys of ROS 2 topics: of rmw_zenoh in any domain and namespace, and of
+    zenoh-bridge-ros2dds in a namespace of at most one name."""
+    forms = ("*/**{}/*/*", "*{}")
+    bare = tuple(topic.removeprefix("/") for topic in topics)
+    return (*(form.format(topic) for topic in topics for form in forms), *bare)
+
+
+_ROS2_SENT = _ros2_keys(SENT)
+_ROS2_TAKEN = _ros2_keys(TAKEN)
+_ROS2_HISTORY = tuple(f"{key}/@adv/**" for key in _ROS2_SENT)
+_ROS2_TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
+_EVERYTHING = ("**", *_ROS2_TOKENS, "**/@adv/**")
+"""All keys; wildcards do not match a chunk that begins with @."""
 
 RIGHTS: Final[dict[Role, _Rights]] = {
     "coordinator": _Rights(
@@ -57,6 +77,14 @@ RIGHTS: Final[dict[Role, _Rights]] = {
         hear=tuple(f"{_ENV}/{key}" for key in ("clock", "robot", "crowd", "signals", "events")),
     ),
     "injector": _Rights("inject pedestrians", ask=(f"{_ENV}/inject", f"{_ENV}/status")),
+    "ros2": _Rights(
+        "see sensors and drive, as a ROS 2 node",
+        ask=(*_ROS2_SENT, *_ROS2_HISTORY),
+        hear=(*_ROS2_SENT, *_ROS2_HISTORY),
+        show=(*_ROS2_TOKENS, *_ROS2_HISTORY),
+        tell=_ROS2_TAKEN,
+        watch=(*_ROS2_TOKENS, *_ROS2_HISTORY),
+    ),
 }
 """Rights by role."""
 _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
@@ -66,7 +94,7 @@ _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
 }
 """Roles allowed at each hub."""
 _LARGEST_B: Final = {
-    64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
+    64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim", *_ROS2_TAKEN),
     1 << 20: (f"{_ENV}/director",),
     1 << 10: (
         "cosim/*/status",
@@ -96,8 +124,8 @@ def access_settings(connection: Connection) -> dict[str, object]:
     """
     if connection.listen.startswith("unixsock-stream/"):
         return {}
-    guests = _ADMITTED[connection.role]
-    rules = [_rule("inside", flow, _ALL, ("**",)) for flow in ("ingress", "egress")]
+    guests = connection.guests or _ADMITTED[connection.role]
+    rules = [_rule("inside", flow, _ALL, _EVERYTHING) for flow in ("ingress", "egress")]
     subjects: list[dict[str, object]] = [{"id": "inside", "link_protocols": ["unixsock-stream"]}]
     policies: list[dict[str, object]] = [
         {"rules": ["inside ingress", "inside egress"], "subjects": ["inside"]}
@@ -147,6 +175,15 @@ def _rules(role: Role) -> list[dict[str, object]]:
         _rule(f"{role} answers", "ingress", ("declare_queryable", "reply"), may.answer),
         _rule(f"{role} is asked", "egress", ("query",), may.answer),
         _rule(f"{role} shows", "ingress", ("liveliness_token",), may.show),
+        _rule(f"{role} tells", "ingress", ("put",), may.tell),
+        _rule(f"{role} is heard", "egress", ("declare_subscriber",), may.tell),
+        _rule(
+            f"{role} watches",
+            "ingress",
+            ("declare_liveliness_subscriber", "liveliness_query"),
+            may.watch,
+        ),
+        _rule(f"{role} is shown", "egress", ("liveliness_token", "reply"), may.watch),
     ]
     return [rule for rule in rules if rule["key_exprs"]]
 
@@ -170,6 +207,7 @@ _ALWAYS: Final[dict[str, object]] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
     "transport/link/tx/lease": 2000,
     "transport/link/tx/queue/size/data": 16,
+    "timestamping/enabled": True,
     "transport/shared_memory/enabled": False,
     "transport/link/rx/max_message_size": 16 << 20,
 }

@@ -19,7 +19,7 @@ from cosim.cli.options import LEARN, camera_here, check_output, parse_size, repl
 from cosim.cli.progress import doing, stages_in_lines
 from cosim.cli.run_progress import ProgressDisplay
 from cosim.core.errors import INTERRUPTED, UsageError
-from cosim.spec.run_config import Option, RunConfig
+from cosim.spec.run_config import DataFormat, Option, RunConfig
 
 if TYPE_CHECKING:
     from cosim.spec.demo_options import DemoOptions
@@ -131,6 +131,10 @@ class DemoConfig:
     unsolved: Annotated[
         bool, Option("Store unsolved episodes, too, up to where the robot is put back.")
     ] = False
+    format: Annotated[
+        DataFormat,
+        Option("A LeRobot data set, or a ROS 2 bag of each episode (package extra [ros2])."),
+    ] = "lerobot"
 
     lidar: Annotated[
         int, Option("Rays of a lidar that is stored, too; 0 for none.", metavar="RAYS")
@@ -154,6 +158,7 @@ class DemoConfig:
             noise=self.noise,
             learner=self.learner,
             unsolved=self.unsolved,
+            format=self.format,
             scan=ScanSpec(rays=self.lidar) if self.lidar else None,
             imu=imu_called(self.imu),
             people=people_called(self.people),
@@ -192,6 +197,8 @@ def collect_command(
     folder = config.out
     jobs = config.jobs or 1
     assert folder is not None
+    if config.ros2 is not None and jobs > 1:
+        raise UsageError(f"policy '{config.policy}' drives one episode at a time here: one job")
     collecting = demo.collecting
     host = host_of(config)
     expert = inspected_driver(config.policy, host, jobs)
@@ -239,6 +246,9 @@ def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
         )
     if found.spare:
         out.print(f"{found.spare} more were solved than requested, and left out", highlight=False)
+    if found.bags:
+        out.print(f"Bags: {folder / 'bags'}, one for each episode", highlight=False)
+        return
     if (back := found.back) is None:
         err.print("The data set was whole already: nothing is written.")
         return
@@ -300,7 +310,9 @@ def _show_board(
 
 
 def _size_mb(folder: Path) -> float:
-    parts = [path for name in ("meta", "data", "videos") for path in (folder / name).rglob("*")]
+    parts = [
+        path for name in ("meta", "data", "videos", "bags") for path in (folder / name).rglob("*")
+    ]
     return sum(path.stat().st_size for path in parts if path.is_file()) / 1e6
 
 

@@ -244,7 +244,7 @@ def listen(
             except TimeoutError as error:
                 raise EngineError(f"{error}: the episode has ended, or is too busy") from error
         received: SimpleQueue[bytes] = SimpleQueue()
-        session.listen(f"{below}/{topic}", lambda _, payload: received.put(payload))
+        session.listen(f"{below}/{topic}", lambda _, payload, __: received.put(payload))
         ends_at = time.monotonic() + (seconds if seconds is not None else 1e9)
         try:
             while (left_s := ends_at - time.monotonic()) > 0.0:

@@ -212,12 +212,14 @@ def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run fold
 
 
 show_app = typer.Typer()
+_BAG_HELP = "Write the episode as a ROS 2 bag (rosbag2, MCAP; package extra [ros2]), from a replay."
 
 
 @show_app.command(
     epilog="Examples:  \n`cosim show runs/mine`  \n`cosim show runs/mine --events`  \n"
     "`cosim show runs/mine --episode lh-011-00 -o episode.png`  \n"
-    "`cosim show runs/mine --episode lh-011-00 --rerun episode.rrd`"
+    "`cosim show runs/mine --episode lh-011-00 --rerun episode.rrd`  \n"
+    "`cosim show runs/mine --episode lh-011-00 --bag episode-bag`"
 )
 def show(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
@@ -231,6 +233,10 @@ def show(
         bool, typer.Option("--events", help="Measured values of every event, from its tracks.")
     ] = False,
     rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=RERUN_HELP)] = None,
+    bag: Annotated[Path | None, typer.Option(metavar="FOLDER", help=_BAG_HELP)] = None,
+    bag_camera: Annotated[
+        str, typer.Option(metavar="WxH[@DEG]", help="Camera of --bag, in place of the policy's.")
+    ] = "",
 ) -> None:
     """Show the table of a run, finished or not, or one episode as a picture from above."""
     from cosim.cli.run_table import kinds_of, print_by_kind, print_table
@@ -242,6 +248,9 @@ def show(
     records = {record.scenario.id: record for record in read_records(folder)}
     if rerun is not None:
         write_rerun(folder, [] if episode is None else [episode], rerun)
+        return
+    if bag is not None or bag_camera:
+        _write_bag(folder, episode, bag, bag_camera)
         return
     for record in records.values():
         check_record_file(folder, record)
@@ -279,6 +288,21 @@ def show(
         with doing(f"drawing {episode}"):
             draw_episode(folder, episode, path)
         out.print(f"Picture: {path}{instead}", soft_wrap=True)
+
+
+def _write_bag(folder: Path, episode: str | None, bag: Path | None, camera: str) -> None:
+    """Write the bag of an episode, and print its path. Raises UsageError."""
+    from cosim.spec.ros2 import camera_called
+    from scenarios.tools.viewing.bag import write_bag
+
+    if bag is None or episode is None:
+        raise UsageError("--bag is of one episode: name it with --episode")
+    picture = camera_called(camera, "--bag-camera") if camera else None
+    with doing(f"recording {episode}") as progress:
+        count = write_bag(folder, episode, bag, picture=picture, progress=progress)
+    size = sum(file.stat().st_size for file in bag.iterdir()) / 1e6
+    words = f"Bag: {bag} ({count} messages, {size:.1f} MB, the state hash is the record's)"
+    out.print(words, soft_wrap=True, highlight=False)
 
 
 def print_episode(out: Console, record: Record) -> None:

@@ -28,7 +28,7 @@ from cosim.core.errors import (
     unwritable,
 )
 from cosim.core.files import write_atomic
-from cosim.spec.run_config import MEASURED, RunConfig
+from cosim.spec.run_config import MEASURED, ROS2_OPTIONS, RunConfig
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,6 +61,7 @@ _OF_OWN_RUN = Fields(
         "latency",
         "real_time",
         "rerun",
+        *ROS2_OPTIONS,
     ),
     help={
         "policy": "A baseline, or your own as my.py:Class.",

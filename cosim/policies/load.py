@@ -37,6 +37,7 @@ from cosim.policies.user_module import (
 )
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
+from cosim.spec.ros2 import ROS2_SCHEME
 
 
 def shipped_bundles(below: Path = Path(__file__).parent) -> Mapping[str, Path]:
@@ -103,7 +104,7 @@ def load_policy(
         )
     if name.startswith(SCHEDULE_SCHEME):
         return _by_digest(name, lambda: schedule_policy(name.removeprefix(SCHEDULE_SCHEME)), timer)
-    if name.startswith(REMOTE_SCHEME):
+    if name.startswith((REMOTE_SCHEME, ROS2_SCHEME)):
         raise UsageError(
             f"policy '{name}' is served elsewhere; here it must be one that this process can load"
         )

@@ -14,7 +14,7 @@ import msgspec
 
 from cosim.core.errors import UsageError
 
-Role = Literal["coordinator", "director", "policy", "worker", "viewer", "injector"]
+Role = Literal["coordinator", "director", "policy", "worker", "viewer", "injector", "ros2"]
 """Role of an end of a session, for its rights (`bridge.security.settings`)."""
 HUBS: Final[tuple[Role, ...]] = ("coordinator", "director", "policy")
 """Roles that listen; the others connect."""
@@ -30,7 +30,9 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     listen, connect: exactly one of both, as PROTOCOL/ADDRESS:PORT (tcp or tls) or
         unixsock-stream/PATH.
     tls: folder with `ca.pem`, `cert.pem` and `key.pem` (`cosim certs`).
-    insecure: allow other machines without TLS. Raises UsageError.
+    insecure: allow other machines without TLS.
+    guests: roles allowed at a listening end, () for those of its own role
+        (`bridge.security.settings`). Raises UsageError.
 
     >>> Connection(role="worker", connect="tls/hub.lan:7447", tls="certs/worker").endpoint
     'tls/hub.lan:7447'
@@ -41,6 +43,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     connect: str = ""
     tls: str = ""
     insecure: bool = False
+    guests: tuple[Role, ...] = ()
 
     def __post_init__(self) -> None:
         if bool(self.listen) == bool(self.connect):
@@ -94,6 +97,8 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
                 f"whoever stands between here and {self.connect} may read and change all that is "
                 f"sent"
             )
+        if self.guests == ("ros2",):
+            return f"whoever can reach {self.listen} may see the sensors and drive the robot"
         may = {
             "coordinator": "watch, inject pedestrians, take episodes and tell their results, and "
             "answer as a policy",

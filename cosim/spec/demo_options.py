@@ -13,6 +13,7 @@ from cosim.core.errors import SpecError, UsageError
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
+from cosim.spec.run_config import DataFormat
 from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec
 
 RECORDING_CAMERA: Final = "collected"
@@ -35,6 +36,7 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     noise: share of the time in which another command than the expert's is driven, in bursts.
     learner: policy that drives in this time; "" for the expert's command, slowed and turned at
         random.
+    format: form of the data set: LeRobot, or a ROS 2 bag of each episode.
     unsolved: also record episodes that the expert fails, up to the first reset of the robot.
     scan, imu, people: sensors that are recorded beside the pictures, as in a manifest.
 
@@ -48,6 +50,7 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     noise: float = 0.0
     learner: str = ""
     unsolved: bool = False
+    format: DataFormat = "lerobot"
     scan: ScanSpec | None = None
     imu: ImuKind = "none"
     people: PeopleKind = "none"

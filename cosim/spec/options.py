@@ -14,6 +14,7 @@ from cosim.spec.demo_options import DemoOptions
 from cosim.spec.episode_id import check_seed
 from cosim.spec.goal import GoalProtocol, goal_called
 from cosim.spec.injection import Injected, LiveAddress
+from cosim.spec.ros2 import Ros2Settings
 from cosim.spec.run_config import (
     MOST_LATENCY_MS,
     POLICY_MEMORY_GB,
@@ -34,10 +35,13 @@ PolicyProcess = Literal[
     "isolated",
     "remote",
     "remote, jpeg",
+    "ros2, next",
+    "ros2, stamped",
+    "ros2, rate",
 ]
 """Process that runs a policy: the simulator's, an isolated one on the same machine with the kind of
-its sandbox, or a server over Zenoh. "isolated" is the weak kind, in older records. "remote, jpeg"
-means that its pictures may have been sent as JPEG."""
+its sandbox, a server over Zenoh, or a ROS 2 node with its waiting rule. "isolated" is the weak
+kind, in older records. "remote, jpeg" means that its pictures may have been sent as JPEG."""
 
 
 class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,6 +52,7 @@ class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
     memory_gb: limit of the memory of each of its processes.
     hidden: folders of this machine that it may not read, even in its own folder.
     servers: connections to the servers of a remote policy.
+    ros2: settings of a policy that is a ROS 2 node.
     run: name of the run, part of each query's key so that runs are not confused.
 
     >>> PolicyHost(isolated="auto").servers
@@ -59,7 +64,14 @@ class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
     memory_gb: float = POLICY_MEMORY_GB
     hidden: tuple[str, ...] = ()
     servers: tuple[Connection, ...] = ()
+    ros2: Ros2Settings | None = None
     run: str = ""
+
+    def of_job(self, number: int) -> PolicyHost:
+        """Return the host of an environment process, by its number from 0."""
+        if self.ros2 is None:
+            return self
+        return msgspec.structs.replace(self, ros2=self.ros2.of_job(number))
 
     def seen_by(self, worker: Connection) -> PolicyHost:
         """Return the host as a worker with this connection to the run reaches it."""

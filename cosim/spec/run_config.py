@@ -10,12 +10,26 @@ from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 from cosim.core.errors import UsageError
-from cosim.spec.connection import Connection, connecting, listening
+from cosim.spec.connection import Connection, checked_endpoint, connecting, listening
+from cosim.spec.ros2 import (
+    LARGEST_DOMAIN,
+    ROS2_LISTEN,
+    ROS2_SCHEME,
+    Ros2Clock,
+    Ros2Dialect,
+    Ros2Distro,
+    Ros2Imu,
+    Ros2Odometry,
+    Ros2Settings,
+    Ros2Wait,
+)
 
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 """Renderers of `--camera`; auto selects gl where it works."""
 Appearance = Literal["splats", "mesh"]
 """Appearances of scanned places in the gl camera; splats are drawn where a scan has them."""
+DataFormat = Literal["lerobot", "rosbag2"]
+"""Forms of a data set of `cosim collect`."""
 Isolation = Literal["no", "auto", "namespaces", "landlock", "weak"]
 """Kinds of `--isolated`: "auto" is the strongest sandbox that the kernel offers, "weak" none."""
 POLICY_MEMORY_GB = 16.0
@@ -58,6 +72,7 @@ _PICTURES = "Pictures"
 _WHERE = "Processes and machines"
 _FOLDER = "Run folder"
 _NETWORK = "Network"
+_ROS2 = "ROS 2"
 _LOG = "Log"
 
 
@@ -101,7 +116,8 @@ class RunConfig:
         str,
         Option(
             "One of `cosim list`, your own as my.py:Class, a network as onnx:FOLDER, an open-loop "
-            "schedule as schedule:FILE.json, or a served one as zenoh:NAME.",
+            "schedule as schedule:FILE.json, a served one as zenoh:NAME, or a ROS 2 node as "
+            "ros2:.",
             panel=_POLICY,
         ),
     ] = "route"
@@ -392,6 +408,78 @@ class RunConfig:
             panel=_WHERE,
         ),
     ] = ""
+    ros2_listen: Annotated[
+        str,
+        Option(
+            "Where ROS 2 nodes connect, with --policy ros2:. The default is where rmw_zenoh looks "
+            "for its router.",
+            metavar="ENDPOINT",
+            panel=_ROS2,
+        ),
+    ] = ROS2_LISTEN
+    ros2_at: Annotated[
+        str,
+        Option(
+            "Connect to this router in place of listening, such as tcp/127.0.0.1:7447.",
+            metavar="ENDPOINT",
+            panel=_ROS2,
+        ),
+    ] = ""
+    ros2_wait: Annotated[
+        Ros2Wait,
+        Option(
+            "The command that answers an observation: the next one; the one stamped with its "
+            "time; or at most one, of a controller with the rate --ros2-rate.",
+            panel=_ROS2,
+        ),
+    ] = "next"
+    ros2_rate: Annotated[
+        float,
+        Option("Rate of observations and commands in Hz.", metavar="HZ", least=0.1, panel=_ROS2),
+    ] = 10.0
+    ros2_camera: Annotated[
+        str,
+        Option(
+            "Size of the pictures, and their vertical field of view: 512x288, 512x288@75, none.",
+            metavar="WxH[@DEG]",
+            panel=_ROS2,
+        ),
+    ] = "512x288"
+    ros2_depth: Annotated[bool, Option("Publish depth, too.", panel=_ROS2)] = False
+    ros2_scan: Annotated[
+        str,
+        Option(
+            "Lidar: rays, rings and range in metres, such as 360, 360@20, 1024x16@50.",
+            metavar="RAYS[xRINGS][@M]",
+            panel=_ROS2,
+        ),
+    ] = "none"
+    ros2_imu: Annotated[Ros2Imu, Option("Inertial sensor.", panel=_ROS2)] = "none"
+    ros2_odometry: Annotated[Ros2Odometry, Option("Odometry of /odom and /tf.", panel=_ROS2)] = (
+        "wheel"
+    )
+    ros2_domain: Annotated[
+        int,
+        Option(
+            "ROS_DOMAIN_ID of the node; with --jobs N, N domains from this one, each with a node.",
+            least=0,
+            most=LARGEST_DOMAIN,
+            panel=_ROS2,
+        ),
+    ] = 0
+    ros2_namespace: Annotated[
+        str, Option("Prefix of all topics, such as /robot1.", metavar="/NAME", panel=_ROS2)
+    ] = ""
+    ros2_distro: Annotated[
+        Ros2Distro, Option("Distribution of the node; only humble differs.", panel=_ROS2)
+    ] = "jazzy"
+    ros2_clock: Annotated[
+        Ros2Clock, Option("/clock starts again with each episode, or never goes back.", panel=_ROS2)
+    ] = "restart"
+    ros2_dialect: Annotated[
+        Ros2Dialect,
+        Option("Keys of rmw_zenoh, or of zenoh-bridge-ros2dds for nodes on DDS.", panel=_ROS2),
+    ] = "rmw_zenoh"
     log_level: Annotated[
         str,
         Option(
@@ -417,6 +505,8 @@ class RunConfig:
                 f"{option} goes with --isolated: another policy may read every file, and has no "
                 "limit of memory"
             )
+        if self.ros2 is None and (given := self._ros2_given):
+            raise UsageError(f"{given} goes with --policy {ROS2_SCHEME}, not with '{self.policy}'")
         for path in self.policy_data:
             if not Path(path).exists():
                 raise UsageError(f"--policy-data {path}: there is no such file or folder")
@@ -429,6 +519,59 @@ class RunConfig:
     @property
     def _limits_memory(self) -> bool:
         return self.policy_memory != POLICY_MEMORY_GB
+
+    @property
+    def _ros2_given(self) -> str:
+        """First option of ROS 2 that is not at its default, "" if all are."""
+        known = self.__dataclass_fields__
+        changed = (name for name in ROS2_OPTIONS if getattr(self, name) != known[name].default)
+        name = next(changed, "")
+        return f"--{name.replace('_', '-')}" if name else ""
+
+    @property
+    def ros2(self) -> Ros2Settings | None:
+        """Settings of a policy that is a ROS 2 node; None for another policy. Raises UsageError."""
+        if not self.policy.startswith(ROS2_SCHEME):
+            return None
+        if self.ros2_domain + (self.jobs or 1) - 1 > LARGEST_DOMAIN:
+            raise UsageError(
+                f"--ros2-domain {self.ros2_domain} with {self.jobs} jobs: each job has a domain, "
+                f"and the last is {LARGEST_DOMAIN}"
+            )
+        if self.ros2_dialect == "ros2dds" and (self.jobs or 1) > 1:
+            raise UsageError("--ros2-dialect ros2dds has no domains: take one job")
+        if self.ros2_at and self.ros2_listen != ROS2_LISTEN:
+            raise UsageError("--ros2-listen or --ros2-at: a run listens or connects, not both")
+        at = self.ros2_at or self.ros2_listen
+        tls = self.tls if at.startswith("tls/") else ""
+        insecure = self.insecure and not tls
+        if self.ros2_at:
+            end = connecting("coordinator", "--ros2-at", at, tls, insecure)
+        else:
+            end = Connection(
+                role="coordinator",
+                listen=checked_endpoint(at, "--ros2-listen"),
+                tls=tls,
+                insecure=insecure,
+                guests=("ros2",),
+            )
+        return Ros2Settings(
+            connection=end,
+            domain=self.ros2_domain,
+            namespace=self.ros2_namespace,
+            wait=self.ros2_wait,
+            distro=self.ros2_distro,
+            clock=self.ros2_clock,
+            dialect=self.ros2_dialect,
+            rate_hz=self.ros2_rate,
+            camera=self.ros2_camera,
+            depth=self.ros2_depth,
+            scan=self.ros2_scan,
+            imu=self.ros2_imu,
+            odometry=self.ros2_odometry,
+            answer_s=self.answer_timeout,
+            start_s=self.start_timeout,
+        )
 
     @property
     def latency_ms(self) -> float | None:
@@ -454,7 +597,14 @@ class RunConfig:
     @property
     def ends(self) -> RunConnections:
         """Network connections of the run. Raises UsageError."""
-        return run_connections(self.live, self.director, self.policy_at, self.tls, self.insecure)
+        ros2 = None if self.ros2 is None else self.ros2.connection
+        return run_connections(
+            self.live, self.director, self.policy_at, self.tls, self.insecure, ros2
+        )
+
+
+ROS2_OPTIONS = tuple(name for name in RunConfig.__dataclass_fields__ if name.startswith("ros2_"))
+"""Fields of a policy that is a ROS 2 node."""
 
 
 def help_of(field: str) -> str:
@@ -484,33 +634,46 @@ class RunConnections(NamedTuple):
     live: endpoint on which it listens.
     director: connection to its director.
     servers: connections to the servers of its policy.
+    ros2: where it meets ROS 2 nodes.
     """
 
     live: Connection | None
     director: Connection | None
     servers: tuple[Connection, ...]
+    ros2: Connection | None = None
 
     @property
     def all(self) -> tuple[Connection, ...]:
         """All connections that are configured."""
-        return tuple(end for end in (self.live, self.director, *self.servers) if end is not None)
+        ends = self.live, self.director, *self.servers, self.ros2
+        return tuple(end for end in ends if end is not None)
 
 
 def run_connections(
-    live: str | None, director: str | None, policies: Sequence[str], tls: str, insecure: bool
+    live: str | None,
+    director: str | None,
+    policies: Sequence[str],
+    tls: str,
+    insecure: bool,
+    ros2: Connection | None = None,
 ) -> RunConnections:
-    """Return the connections of a run. `--tls` applies to tls/... endpoints. Raises UsageError."""
+    """Return the connections of a run. `--tls` applies to tls/... endpoints. Raises UsageError.
+
+    ros2: connection to ROS 2 nodes.
+    """
     at = {f"--policy-at {end}": end for end in policies}
     given = {
         name: end for name, end in (("--live", live), ("--director", director)) if end is not None
     } | at
-    if not given and (tls or insecure):
+    if not given and ros2 is None and (tls or insecure):
         raise UsageError(
-            f"{'--tls' if tls else '--insecure'} goes with --live, --director or --policy-at"
+            f"{'--tls' if tls else '--insecure'} goes with --live, --director, --policy-at or "
+            f"--policy {ROS2_SCHEME}"
         )
     guarded = [name for name, end in given.items() if end.startswith("tls/")]
-    if tls and not guarded:
-        raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {', '.join(given.values())}")
+    if tls and not guarded and not (ros2 is not None and ros2.tls):
+        shown = ", ".join([*given.values(), *([] if ros2 is None else [ros2.endpoint])])
+        raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {shown}")
     files = {name: tls if name in guarded else "" for name in given}
     return RunConnections(
         None
@@ -523,4 +686,5 @@ def run_connections(
             connecting("coordinator", "--policy-at", end, files[name], insecure)
             for name, end in at.items()
         ),
+        ros2,
     )

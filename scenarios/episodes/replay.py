@@ -6,9 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from cosim.core.clock import Clock
 from cosim.core.errors import RunError, unknown
 from cosim.core.progress import Progress, ignore
+from cosim.core.state import Command, WaypointCommand
 from cosim.core.versions import versions
 from cosim.episode.loop import Step
 from cosim.policies.baselines import Replay
@@ -18,6 +21,7 @@ from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records
 from cosim.results.run_setup import RunSetup, appearance_of
 from cosim.results.traffic import RoadState
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import Appearance, CameraChoice
@@ -87,6 +91,53 @@ def replay_episode(
         setup=setup,
     )
     return episode, policy
+
+
+class RecordedAnswers:
+    """Recorded answers of a policy, for a replay at its own rate."""
+
+    def __init__(self, log: Log) -> None:
+        self._answers = {
+            int(tick): (int(delay), v, w) for tick, delay, v, w in log.answers.tolist()
+        }
+        sizes = log.plan_sizes if len(log.plan_sizes) else np.zeros(len(self._answers), int)
+        plans = np.split(log.plan_points, np.cumsum(sizes)[:-1]) if len(sizes) else []
+        self._plans = dict(zip(self._answers, plans, strict=True))
+
+    def at(self, tick: int) -> tuple[Command, int]:
+        """Return the answer to the observation of a tick, and its delay in ticks.
+
+        Raises RunError for an observation that the policy did not answer.
+        """
+        if tick not in self._answers:
+            raise RunError(f"the record has no answer at tick {tick}: not the same")
+        delay, v_mps, w_radps = self._answers[tick]
+        plan = self._plans[tick]
+        if len(plan):
+            return WaypointCommand(v_mps, w_radps, plan, 0), delay
+        return Command(v_mps, w_radps), delay
+
+
+def observed_replay(
+    original: RecordedEpisode, manifest: Manifest, camera: CameraChoice = "auto"
+) -> tuple[Episode, RecordedAnswers]:
+    """Return a new Episode that observes with a manifest at the recorded rate, and the answers.
+
+    manifest: sensors of the observations; its rate is that of the record.
+    """
+    setup = original.record.setup
+    options = EpisodeOptions(
+        seed=setup.seed,
+        camera=camera,
+        appearance=appearance_of(setup.renderer),
+        gait=setup.gait,
+        injections=original.record.injections,
+        own_camera=True,
+        real_time=setup.real_time,
+    )
+    of_replay = RunSetup.of(options, gait_hash=setup.gait_hash)
+    episode = Episode(original.scenario, manifest, options, setup=of_replay)
+    return episode, RecordedAnswers(original.log)
 
 
 def replay_state_hash(

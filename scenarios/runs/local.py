@@ -5,6 +5,8 @@ from __future__ import annotations
 from multiprocessing.connection import wait
 from pathlib import Path
 
+import msgspec
+
 from cosim.episode.policy_caller import PolicyCaller
 from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.messages import Hello, Job, MessageHandler
@@ -28,6 +30,9 @@ class LocalProcesses:
         return ()
 
     def start(self, hello: Hello) -> EnvironmentSlot:
+        host = hello.host.of_job(len(self._slots))
+        hello = msgspec.structs.replace(hello, host=host)
+
         def start_next(hello: Hello) -> ChildProcess:
             number = self._started
             self._started = self._started + 1

@@ -1,5 +1,5 @@
-"""Drivers of a run's policy in this process, in an isolated one, behind Zenoh, or in the shared
-renderer."""
+"""Drivers of a run's policy: in this process, in an isolated one, behind Zenoh, as a ROS 2 node, or
+in the shared renderer."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from cosim.policies.user_module import importable_name
 from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import PolicyHost, RendererAddress
+from cosim.spec.ros2 import ROS2_SCHEME
 from cosim.spec.run_config import RunConfig
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_link import RendererLink, link_to
@@ -47,6 +48,12 @@ def policy_driver(
         if host.isolated != "no":
             raise UsageError(f"policy '{name}' is elsewhere anyway: leave --isolated out")
         return remote_driver(name, host, timer)
+    if name.startswith(ROS2_SCHEME):
+        from scenarios.runs.ros2_policy import ros2_driver
+
+        if host.isolated != "no":
+            raise UsageError(f"policy '{name}' is elsewhere anyway: leave --isolated out")
+        return ros2_driver(name, host, timer)
     if host.servers:
         raise UsageError(f"--policy-at goes with --policy {REMOTE_SCHEME}NAME, not with '{name}'")
     if host.isolated != "no":
@@ -62,6 +69,7 @@ def host_of(config: RunConfig, servers: tuple[Connection, ...] = ()) -> PolicyHo
         memory_gb=config.policy_memory,
         hidden=() if config.out is None else (str(config.out.absolute()),),
         servers=servers,
+        ros2=config.ros2,
         run=token_hex(8),
     )
 

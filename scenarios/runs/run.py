@@ -198,6 +198,7 @@ def execute_run(
     Raises what `run` raises.
     """
     ends = config.ends
+    _check_ros2(config, carrier)
     for line in (line for end in ends.all for line in connection_warnings(end)):
         reporter.say(line)
     _check_cluster(config, given)
@@ -220,7 +221,7 @@ def execute_run(
         plan = _checked(plan, folder, reporter, 1 if given else _checking_jobs(config, carrier))
         stack.enter_context(reporter.opening(plan, folder))
         create_transport = stack.enter_context(carrier or _workers(plan, given, reporter))
-        plan = stack.enter_context(_connected(plan, folder, ends))
+        plan = stack.enter_context(_connected(plan, folder, ends, reporter))
         held = stack.enter_context(held_run(plan, folder))
         with reporter.running(plan, held) as hear:
             _run_todo(plan, held, create_transport, hear)
@@ -242,6 +243,16 @@ def _check_cluster(config: RunConfig, given: RunObjects | None) -> None:
     }
     words = {name: name if given else f"--{name.replace('_', '-')}" for name in of_here}
     check_on_ray(config.on, {words[name]: asked for name, asked in of_here.items()})
+
+
+def _check_ros2(config: RunConfig, carrier: Carrier | None) -> None:
+    """Check that a ROS 2 node and its environment processes are on one network. Raises
+    UsageError."""
+    if config.ros2 is not None and (config.on or carrier is not None):
+        raise UsageError(
+            f"policy '{config.policy}' drives in the processes of this machine: use `cosim run` "
+            "without --on"
+        )
 
 
 def _loaded(config: RunConfig, given: RunObjects | None, reporter: Reporter) -> Suite:
@@ -401,8 +412,10 @@ def _in_this_process(
 
 
 @contextmanager
-def _connected(plan: PlannedRun, folder: Path, ends: RunConnections) -> Iterator[PlannedRun]:
-    """Connect a run to its director and to live clients, if the config requests them."""
+def _connected(
+    plan: PlannedRun, folder: Path, ends: RunConnections, reporter: Reporter
+) -> Iterator[PlannedRun]:
+    """Connect a run to its director, live clients and ROS 2 nodes, if the config requests them."""
     options = plan.options
     named = keys.chunk(folder.name)
     if ends.director is not None:
@@ -410,10 +423,29 @@ def _connected(plan: PlannedRun, folder: Path, ends: RunConnections) -> Iterator
             connection=ends.director, run=named, wait_s=plan.config.director_wait
         )
         options = msgspec.structs.replace(options, director=outside)
-    with _live(ends.live, named) as live:
+    with _live(ends.live, named) as live, _ros2_hub(plan.host, plan.config, reporter) as host:
         if live is not None:
             options = msgspec.structs.replace(options, live=live)
-        yield plan._replace(options=options)
+        yield plan._replace(options=options, host=host)
+
+
+@contextmanager
+def _ros2_hub(host: PolicyHost, config: RunConfig, reporter: Reporter) -> Iterator[PolicyHost]:
+    """Open the session to which ROS 2 nodes connect, if the policy is one and the run listens.
+
+    Yields the host by which environment processes reach it.
+    """
+    ros2 = host.ros2
+    if ros2 is None or not ros2.connection.listen:
+        yield host
+        return
+    with open_session(ros2.connection) as hub:
+        last = ros2.domain + (config.jobs or 1) - 1
+        domains = f"domain {ros2.domain}" + f" to {last}" * (last > ros2.domain)
+        reporter.say(f"ROS 2 nodes connect to {ros2.connection.listen}, {domains}")
+        at = ros2.connection.listen
+        inside = msgspec.structs.replace(ros2, connection=hub.inside, hub=at)
+        yield msgspec.structs.replace(host, ros2=inside)
 
 
 @contextmanager

@@ -1,5 +1,5 @@
-"""Measures the cost of a policy in another process: isolated, and over Zenoh for one and for
-many episodes."""
+"""Measures the cost of a policy in another process: isolated, over Zenoh for one and for
+many episodes, and as a ROS 2 node."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ from typing import Any, Final
 import numpy as np
 
 from bridge.policy_server import serve
+from bridge.ros2.commands import TWIST_STAMPED, Received, stamped_command
+from bridge.ros2.encode import ns_of
+from bridge.ros2.node import Network, Ros2Node
+from bridge.ros2.types import decode
+from bridge.session import open_session
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.episode.manifest_checks import calibration_of
@@ -26,15 +31,18 @@ from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
+from cosim.spec.ros2 import CMD_VEL, ROS2_SCHEME, SENT, Ros2Settings
 from scenarios.ipc.observation_codec import ObservationDecoder
 from scenarios.runs.isolated_policy import isolated_driver
 from scenarios.runs.remote_policy import remote_driver
+from scenarios.runs.ros2_policy import ros2_driver
 from scenarios.tools.bench.figures import MORE, Figure
 
 _SPEC: Final = CameraSpec(width=512, height=288)
 _ASKED: Final = 500
 _TOGETHER: Final = 8
 _HERE: Final = "the same policy asked in this process"
+_REMOTE: Final = "the remote policy"
 _NAME: Final = f"{__name__}:Blind"
 
 
@@ -61,15 +69,17 @@ def asking_elsewhere() -> list[Figure]:
     """Time round trips of a 512x288 picture, and answers of one server to eight clients."""
     here = PolicyCaller(Blind())
     isolated = isolated_driver(_NAME, expected=Blind.manifest, host=PolicyHost(isolated="auto"))
-    with _served() as host:
+    with _served() as host, _ros2_node() as ros2:
         remote = remote_driver("zenoh:blind", host)
-        here_ms, isolated_ms, remote_ms = _in_turns(here, isolated, remote)
+        here_ms, isolated_ms, remote_ms, ros2_ms = _in_turns(here, isolated, remote, ros2)
         remote.close()
+        ros2.close()
         a_second = _together(host)
     isolated.close()
     return [
         Figure("isolated policy, 512x288, ms a step", isolated_ms, here_ms, _HERE, 1.0),
         Figure("remote policy on this machine, 512x288, ms a step", remote_ms, here_ms, _HERE, 1.0),
+        Figure("ROS 2 node on this machine, 512x288, ms a step", ros2_ms, remote_ms, _REMOTE, 2.0),
         Figure(
             f"remote policy with act_batch, {_TOGETHER} episodes at once, answers per s",
             a_second,
@@ -130,6 +140,40 @@ def _served() -> Iterator[PolicyHost]:
         finally:
             process.kill()
             process.wait()
+
+
+@contextmanager
+def _ros2_node() -> Iterator[PolicyCaller]:
+    """Yield the driver of a ROS 2 node in another process, which connects to a hub as in a run."""
+    with tempfile.TemporaryDirectory() as folder:
+        endpoint = f"unixsock-stream/{Path(folder)}/hub"
+        at = Connection(role="coordinator", listen=endpoint, guests=("ros2",))
+        code = f"from {__name__} import answer_pictures; answer_pictures({endpoint!r})"
+        with open_session(at) as hub:
+            process = subprocess.Popen([sys.executable, "-c", code])
+            try:
+                settings = Ros2Settings(connection=hub.inside)
+                yield ros2_driver(ROS2_SCHEME, PolicyHost(ros2=settings))
+            finally:
+                process.kill()
+                process.wait()
+
+
+def answer_pictures(endpoint: str) -> None:
+    """Answer each picture at once with /cmd_vel, until killed."""
+    with open_session(Connection(role="coordinator", connect=endpoint)) as session:
+        node = Ros2Node(session, Network(), "blind")
+        node.advertise(CMD_VEL, TWIST_STAMPED)
+        picture = "/camera/image_raw"
+
+        def answer(got: Received) -> None:
+            sent = decode(got.payload, SENT[picture])
+            time_ns = ns_of(sent.header.stamp)
+            node.publish(CMD_VEL, stamped_command(Command(1.0, 0.0), time_ns))
+
+        node.subscribe(picture, (SENT[picture],), answer)
+        while True:
+            time.sleep(3600.0)
 
 
 def serve_blind(endpoint: str) -> None:

@@ -5,6 +5,7 @@ OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode
                       added if too few are solved. They may be deleted once
                       the data set is complete
 OUT/writing           unfinished data set
+OUT/bags              with the format rosbag2 a ROS 2 bag of each episode, in place of the following
 OUT/meta, data, videos   the data set; meta is written last and marks it as complete
 """
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +22,7 @@ from typing import Any, Final
 
 import msgspec
 
+from bridge.ros2.types import message_store
 from cosim.core.errors import RunError, SpecError, unwritable
 from cosim.core.files import write_atomic
 from cosim.core.progress import Progress, ignore
@@ -45,6 +47,7 @@ from scenarios.suites.fits import check_places
 from scenarios.suites.new_scenarios import Fresh
 from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
 from scenarios.tools.dataset.read import ReadBack, read_back
+from scenarios.tools.viewing.bag import write_bag
 
 _ASKED: Final = "collect.json"
 _RUNS: Final = "runs"
@@ -102,7 +105,8 @@ class Gathered:
     run: episodes that were driven.
     dropped: numbers of excluded episodes by reason.
     spare: solved episodes beyond the requested number.
-    back: result of reading the data set back, None if it was complete before.
+    back: result of reading the data set back, None if it was complete before or has bags.
+    bags: whether it has a ROS 2 bag of each episode in place of tables and films.
     """
 
     kept: int
@@ -111,6 +115,7 @@ class Gathered:
     dropped: Counter[str]
     spare: int
     back: ReadBack | None
+    bags: bool = False
 
 
 _Showing = Callable[[Sequence[Scenario], set[str]], AbstractContextManager[MessageHandler]]
@@ -153,6 +158,9 @@ def collect(
     Raises RunError for a folder of another data set. Raises UsageError and SpecError for invalid
     arguments, and MachineError if the machine lacks a requirement.
     """
+    bags = collecting.format == "rosbag2"
+    if bags:
+        message_store()
     check_parquet()
     policy = importable_name(policy)
     collecting = msgspec.structs.replace(collecting, learner=importable_name(collecting.learner))
@@ -179,6 +187,7 @@ def collect(
     )
     with ExitStack() as stack:
         found: list[Collected] = []
+        runs: dict[str, Path] = {}
         dropped = Counter[str]()
         run = 0
         taken = 0
@@ -191,6 +200,7 @@ def collect(
                 break
             rounds.run(held, scenarios, hello, showing)
             found += _kept(held, scenarios, dropped)
+            runs |= dict.fromkeys((one.id for one in scenarios), held.path)
             run += len(scenarios)
             taken = taken + count
             number = number + 1
@@ -202,10 +212,12 @@ def collect(
             raise SpecError(f"{out}: nothing to keep of {run} episodes: {told}")
         kept = found[: spec.episodes]
         back = None
-        if not (out / "meta").exists():
+        if bags:
+            _write_bags(out, {one.scenario.id: runs[one.scenario.id] for one in kept}, progress)
+        elif not (out / "meta").exists():
             back = _written(out, kept, spec, demonstrator, progress)
     rows = sum(len(one.load()) for one in kept)
-    return Gathered(len(kept), rows, run, dropped, len(found) - len(kept), back)
+    return Gathered(len(kept), rows, run, dropped, len(found) - len(kept), back, bags)
 
 
 @dataclass(frozen=True)
@@ -372,6 +384,15 @@ def _why(record: Record) -> str:
         first = record.failures[0]
         return " with ".join(filter(None, (first.kind, first.other_kind))).replace("_", " ")
     return f"ended by {record.ended}"
+
+
+def _write_bags(out: Path, runs: Mapping[str, Path], progress: Progress) -> None:
+    """Write the bag of each episode that has none. runs: run folder by scenario."""
+    for number, (name, folder) in enumerate(runs.items()):
+        progress("writing bags", number / len(runs))
+        if not (bag := out / "bags" / name).exists():
+            bag.parent.mkdir(exist_ok=True)
+            write_bag(folder, name, bag)
 
 
 def _written(

@@ -86,5 +86,6 @@ def test_guards_without_a_door_are_refused(cosim: Cosim, tmp_path: Path) -> None
         refused = cosim("run", "no-such-suite", *more)
         assert (
             refused.returncode == 2
-            and f"{more[0]} goes with --live, --director or --policy-at" in refused.stderr
+            and f"{more[0]} goes with --live, --director, --policy-at or --policy ros2:"
+            in refused.stderr
         )

@@ -41,6 +41,7 @@ MAY_ASK: dict[str, tuple[str, ...]] = {
     "policy": (),
     "coordinator": (f"{ENV}/director", POLICY),
     "director": (),
+    "ros2": (),
 }
 """At a coordinator's hub. A director has no business there: others connect to it."""
 
@@ -84,8 +85,8 @@ class Air:
                 end = self.run if key.startswith(ENV) else self.hub
                 end.serve(key, lambda _, key=key: self._saw(key), found=key == f"{ENV}/status")  # type: ignore[misc]
         self.policy.declare_queryable(POLICY, self._answer)
-        self.hub.listen("cosim/**", lambda key, _: self.seen.append(key))
-        self.run.listen("cosim/**", lambda key, _: self.seen.append(key))
+        self.hub.listen("cosim/**", lambda key, *_: self.seen.append(key))
+        self.run.listen("cosim/**", lambda key, *_: self.seen.append(key))
         wait_until(lambda: self.hub.ask(POLICY, b"", timeout_s=PATIENCE_S) == POLICY.encode())
 
     def _saw(self, key: str) -> bytes:

@@ -1,0 +1,189 @@
+"""A ROS 2 node on a Zenoh session: tokens, publishers, subscriptions, and the nodes around it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+from bridge.ros2.commands import Received
+from bridge.ros2.types import encode
+from bridge.ros2.wire import (
+    DIALECTS,
+    Attachment,
+    Endpoint,
+    Kind,
+    Qos,
+    full_topic,
+    gid_of,
+    read_attachment,
+    ros_type,
+    type_hash,
+)
+from bridge.session import Session
+from cosim.spec.ros2 import Ros2Dialect, Ros2Distro
+
+NAME: Final = "cosim"
+"""Name of the node of a run."""
+
+
+class Network(NamedTuple):
+    """Part of a ROS 2 network: its domain, and the form of its keys."""
+
+    domain: int = 0
+    namespace: str = ""
+    distro: Ros2Distro = "jazzy"
+    dialect: Ros2Dialect = "rmw_zenoh"
+
+
+class _Publisher(NamedTuple):
+    """A declared publisher. numbers: a list with its last sequence number."""
+
+    key: str
+    gid: bytes
+    numbers: list[int]
+
+
+class Ros2Node:
+    """A node of a ROS 2 network.
+
+    changed: Notified whenever a message arrives or a token changes.
+    tokens_changed_s: Monotonic time of the last change of a token in this network.
+    """
+
+    def __init__(self, session: Session, network: Network, name: str = NAME) -> None:
+        self.network = network
+        self.name = name
+        self.changed = threading.Condition()
+        self._session = session
+        self._dialect = DIALECTS[network.dialect]
+        self._publishers: dict[str, _Publisher] = {}
+        self._leave: list[Callable[[], None]] = []
+        self._others: dict[str, Endpoint] = {}
+        self._by_gid: dict[bytes, Endpoint] = {}
+        self._entities = 0
+        self.tokens_changed_s = time.monotonic()
+        self._show(Endpoint("NN", network.domain, session.id, name, namespace=self._namespace))
+        session.watch(self._dialect.tokens, self._token)
+
+    @property
+    def _namespace(self) -> str:
+        return self.network.namespace or "/"
+
+    @property
+    def others(self) -> list[Endpoint]:
+        """Entities of other sessions whose tokens are there, in any domain."""
+        with self.changed:
+            return list(self._others.values())
+
+    def advertise(self, topic: str, name: str, qos: Qos = Qos()) -> None:  # noqa: B008
+        """Declare a publisher of a topic and a type."""
+        end = self._endpoint("MP", topic, name, qos)
+        key = self._dialect.key(self.network.domain, end.topic, name, end.hash)
+        self._publishers[topic] = _Publisher(key, gid_of(self._show(end)), [0])
+        self._session.advertise(key, latched=qos.depth if qos.latched else 0)
+
+    def publish(self, topic: str, sent: Any) -> None:
+        """Publish a message on an advertised topic, without loss."""
+        publisher = self._publishers[topic]
+        publisher.numbers[0] += 1
+        attached = b""
+        if self._dialect.attached:
+            attached = Attachment(publisher.numbers[0], time.time_ns(), publisher.gid).data
+        self._session.publish(publisher.key, encode(sent), attached)
+
+    def has_subscriber(self, topic: str) -> bool:
+        """Return whether another node subscribes to an advertised topic."""
+        return bool(self._others_at(topic, "MS"))
+
+    def subscribe(
+        self, topic: str, names: tuple[str, ...], take: Callable[[Received], None]
+    ) -> None:
+        """Call `take` with every message of a topic, of any type, in a thread of Zenoh.
+
+        names: Types that are read, for the tokens.
+        """
+        for name in names:
+            self._show(self._endpoint("MS", topic, name, Qos()))
+        full = full_topic(self.network.namespace, topic)
+        key = self._dialect.key_of_any_type(self.network.domain, full)
+
+        def received(key: str, payload: bytes, attachment: bytes) -> None:
+            take(self._read(key, payload, attachment))
+            with self.changed:
+                self.changed.notify_all()
+
+        self._session.listen(key, received)
+
+    def wait_for(self, holds: Callable[[], object], timeout_s: float) -> bool:
+        """Wait until a condition holds; it is tested after each message and change of tokens."""
+        with self.changed:
+            return bool(self.changed.wait_for(holds, timeout_s))
+
+    def publishers_of(self, topic: str) -> list[Endpoint]:
+        """Return the publishers of a topic in this network."""
+        return self._others_at(topic, "MP")
+
+    def close(self) -> None:
+        """Remove the tokens; the session stays open."""
+        for leave in self._leave:
+            leave()
+        self._leave.clear()
+
+    def _others_at(self, topic: str, kind: Kind) -> list[Endpoint]:
+        full = full_topic(self.network.namespace, topic)
+        return [
+            end
+            for end in self.others
+            if end.kind == kind and end.topic == full and self._in_network(end)
+        ]
+
+    def _in_network(self, end: Endpoint) -> bool:
+        """Return whether an entity is in this domain, as far as its token names one."""
+        return end.domain in (-1, self.network.domain)
+
+    def _endpoint(self, kind: Kind, topic: str, name: str, qos: Qos) -> Endpoint:
+        self._entities += 1
+        return Endpoint(
+            kind,
+            self.network.domain,
+            self._session.id,
+            self.name,
+            (0, self._entities),
+            self._namespace,
+            full_topic(self.network.namespace, topic),
+            name,
+            type_hash(name, self.network.distro),
+            qos.text,
+        )
+
+    def _show(self, end: Endpoint) -> str:
+        """Declare the token of an entity, and return it."""
+        token = self._dialect.token(end)
+        self._leave.append(self._session.stand(token))
+        return token
+
+    def _token(self, token: str, alive: bool) -> None:
+        end = self._dialect.read_token(token)
+        if end is None or end.session == self._session.id:
+            return
+        with self.changed:
+            if alive:
+                self._others[token] = end
+                self._by_gid[gid_of(token)] = end
+            else:
+                self._others.pop(token, None)
+            if self._in_network(end):
+                self.tokens_changed_s = time.monotonic()
+            self.changed.notify_all()
+
+    def _read(self, key: str, payload: bytes, attachment: bytes) -> Received:
+        """Return a received message, with its publisher in words."""
+        attached = read_attachment(attachment) if self._dialect.attached else None
+        end = None if attached is None else self._by_gid.get(attached.gid)
+        by = "a node" if end is None else end.in_words
+        if not self._dialect.names_type:
+            return Received(payload, by=by)
+        _, name, hash = key.rsplit("/", 2)
+        return Received(payload, ros_type(name), hash, attached, by)

@@ -1,0 +1,343 @@
+"""A policy that is a ROS 2 node: publishes observations, and waits for a command.
+
+Time stands still while the node computes. The rule of `Ros2Settings.wait` decides which command
+answers an observation:
+
+next        the first one that arrives after the observation was sent
+stamped     the first TwistStamped with the stamp of the observation
+rate        at most one for each observation; without one the last command holds for a while
+
+A message that is not understood is reported once and never drives the robot.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable
+from logging import WARNING
+from typing import Any, ClassVar, Final, cast
+
+import numpy as np
+
+from bridge.policy_server import PolicyFault
+from bridge.ros2 import encode
+from bridge.ros2.commands import (
+    COMMAND_TYPES,
+    PATH,
+    Judged,
+    Received,
+    hash_fault,
+    judged,
+    plan_in_robot_frame,
+)
+from bridge.ros2.encode import TOPICS
+from bridge.ros2.node import NAME, Network, Ros2Node
+from bridge.ros2.types import message_store
+from bridge.ros2.wire import Endpoint, full_topic, type_hash
+from bridge.session import Session, open_session
+from cosim.core.clock import Clock
+from cosim.core.errors import EngineError, MachineError, PolicyError, UsageError
+from cosim.core.log_event import log_event
+from cosim.core.state import STILL, Command, WaypointCommand
+from cosim.episode.interfaces import Observation
+from cosim.episode.policy_caller import PolicyCaller, Timer
+from cosim.policies.load import checked_manifest
+from cosim.spec.options import PolicyHost, PolicyProcess
+from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, ROS2_SCHEME, Ros2Settings
+
+JOINED_S: Final = 1.0
+"""Time without new publishers and subscriptions after which all nodes count as started."""
+SETTLE_S: Final = 0.3
+"""Time in seconds for nodes to notice that /clock was set back."""
+GONE_S: Final = 3.0
+"""Time in seconds without a publisher of /cmd_vel after which the node counts as lost."""
+HOLD_S: Final = 0.5
+"""Simulated time in seconds for which the rule `rate` repeats a command."""
+_SILENT_PERIODS: Final = 2.0
+"""Periods of the policy, in seconds of the machine, that the rule `rate` waits for a command."""
+_LOOK_S: Final = 0.25
+"""Longest time in seconds between two looks at the nodes around."""
+_MOST_QUEUED: Final = 1024
+"""Largest number of unread messages; older ones are dropped."""
+_EARLY_S: Final = 1.0
+"""Time in seconds before the run's timeout at which the policy reports why it has no command."""
+
+
+class Ros2Policy:
+    """Policy that is a ROS 2 node, reached over a Zenoh session that the first episode opens.
+
+    took_ms: Time of each answer of the episode.
+    """
+
+    def __init__(self, name: str, settings: Ros2Settings) -> None:
+        self.settings = settings
+        self.manifest = settings.manifest(name)
+        self.took_ms: list[float] = []
+        self._session: Session | None = None
+        self._node: Ros2Node | None = None
+        self._queue: deque[Received] = deque(maxlen=_MOST_QUEUED)
+        self._plan: Received | None = None
+        self._remarks: dict[str, None] = {}
+        self._controller: tuple[bytes, str] | None = None
+        self._stream: encode.EpisodeStream | None = None
+        self._elapsed_s = 0.0
+        self._last: tuple[Command, int] = STILL, 0
+        self._heard_s = 0.0
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Wait for a node that publishes /cmd_vel, and announce the episode to it."""
+        node = self._joined()
+        before = self._stream
+        if before is not None and self.settings.clock == "monotonic":
+            self._elapsed_s += Clock().time_s(before.tick + 1)
+        self._stream = encode.EpisodeStream(episode_id, seed, self._elapsed_s)
+        self._controller = None
+        self._last = STILL, 0
+        self.took_ms = []
+        self._await_controller(node)
+        for topic, sent in self._stream.begun():
+            node.publish(topic, sent)
+        if before is not None:
+            time.sleep(SETTLE_S)
+        self._queue.clear()
+        self._plan = None
+        self._heard_s = time.monotonic()
+
+    def act(self, seen: Observation) -> Command:
+        """Publish an observation and return the command that answers it."""
+        began_s = time.perf_counter()
+        node, stream = self._joined(), self._stream
+        assert stream is not None, "reset comes first"
+        first = stream.tick < 0
+        self._refuse_another(self._queue)
+        self._queue.clear()
+        for topic, sent in stream.observed(seen, node.has_subscriber):
+            node.publish(topic, sent)
+        now_ns = stream.time_ns(seen.tick)
+        if self.settings.wait == "rate":
+            command = self._held(node, seen.tick, now_ns)
+        else:
+            command = self._next(node, now_ns, first)
+        self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
+        return self._with_plan(command, seen)
+
+    def close(self) -> None:
+        """Remove the node from the network."""
+        if self._session is not None:
+            self._session.close()
+        self._session = self._node = None
+
+    def _joined(self) -> Ros2Node:
+        """Return the node, which joins the network at the first call."""
+        if self._node is None:
+            settings = self.settings
+            self._session = open_session(settings.connection)
+            network = Network(
+                settings.domain, settings.namespace, settings.distro, settings.dialect
+            )
+            self._node = node = Ros2Node(self._session, network)
+            for topic in TOPICS.values():
+                node.advertise(topic.name, topic.type, topic.qos)
+            node.subscribe(CMD_VEL, COMMAND_TYPES, self._queue.append)
+            node.subscribe(PLAN, (PATH,), self._take_plan)
+        return self._node
+
+    def _take_plan(self, got: Received) -> None:
+        self._plan = got
+
+    def _next(self, node: Ros2Node, now_ns: int, first: bool) -> Command:
+        """Wait for the command that answers the observation. Raises PolicyFault without one."""
+        began_s = time.monotonic()
+        allowed_s = self._allowed_s(first)
+        seen_s = began_s
+        while True:
+            now_s = time.monotonic()
+            if (left_s := began_s + allowed_s - now_s) <= 0.0:
+                raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
+            node.wait_for(lambda: self._queue, min(left_s, _LOOK_S))
+            while self._queue:
+                if (command := self._accepted(self._queue.popleft(), now_ns)) is not None:
+                    return command
+            if node.publishers_of(CMD_VEL):
+                seen_s = now_s
+            elif now_s - seen_s > GONE_S:
+                name = "the node" if self._controller is None else self._controller[1]
+                raise PolicyFault(f"is gone: {name} published {CMD_VEL}, and has left")
+
+    def _held(self, node: Ros2Node, at_tick: int, now_ns: int) -> Command:
+        """Return a command if one comes within two periods, else the last one while it holds."""
+        now_s = time.monotonic()
+        until_s = now_s + _SILENT_PERIODS / self.settings.rate_hz
+        while (left_s := until_s - time.monotonic()) > 0.0:
+            node.wait_for(lambda: self._queue, left_s)
+            while self._queue:
+                if (command := self._accepted(self._queue.popleft(), now_ns)) is not None:
+                    self._last = command, at_tick
+                    self._heard_s = time.monotonic()
+                    return command
+        allowed_s = self._allowed_s(False)
+        if time.monotonic() - self._heard_s > allowed_s:
+            raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
+        command, tick = self._last
+        return command if Clock().time_s(at_tick - tick) <= HOLD_S else STILL
+
+    def _allowed_s(self, first: bool) -> float:
+        """Return the timeout of an answer, before that of the run."""
+        whole_s = self.settings.start_s if first else self.settings.answer_s
+        return max(whole_s - _EARLY_S, 0.5 * whole_s)
+
+    def _accepted(self, got: Received, now_ns: int) -> Command | None:
+        """Return the command of a message; None, with a remark, if it is refused."""
+        found: Judged = judged(
+            got,
+            self.settings.wait,
+            now_ns,
+            type_hash(got.type, self.settings.distro) if got.type in COMMAND_TYPES else "",
+            attached=self.settings.dialect == "rmw_zenoh",
+        )
+        if found.fault:
+            self._remark(found.fault)
+        if found.command is not None:
+            self._refuse_another([got])
+            if self._controller is None and got.attachment is not None:
+                self._controller = got.attachment.gid, got.by
+        return found.command
+
+    def _refuse_another(self, messages: Iterable[Received]) -> None:
+        """Raise PolicyFault if a message comes from another node than the episode's commands."""
+        for got in tuple(messages):
+            if self._controller is None or got.attachment is None or got.type not in COMMAND_TYPES:
+                continue
+            gid, by = self._controller
+            if got.attachment.gid != gid:
+                raise PolicyFault(
+                    f"is two nodes, {by} and {got.by}, which both publish {CMD_VEL}: stop one, or "
+                    "mix their commands in a node of your own"
+                )
+
+    def _with_plan(self, command: Command, seen: Observation) -> Command:
+        """Return a command with the points of the latest plan, for the record."""
+        got, self._plan = self._plan, None
+        if got is None or len(got.payload) > LARGEST_B or (got.type and got.type != PATH):
+            return command
+        points = plan_in_robot_frame(got.payload, encode.pose_of(seen))
+        if points is None:
+            self._remark(f"{got.by} sends a {PLAN} that is empty, malformed or not in map or odom")
+            return command
+        return WaypointCommand(command.v_mps, command.w_radps, points.astype(np.float32), 0)
+
+    def _remark(self, words: str) -> None:
+        """Report a refused message, each kind once."""
+        if words not in self._remarks and len(self._remarks) < 32:
+            self._remarks[words] = None
+            print(f"ros2: {words}", file=sys.stderr, flush=True)
+            log_event("ros2 message refused", WARNING, why=words)
+
+    def _await_controller(self, node: Ros2Node) -> None:
+        """Wait until a node publishes /cmd_vel and no further entity comes. Raises PolicyFault."""
+        began_s = time.monotonic()
+        allowed_s = self._allowed_s(True)
+
+        def ready() -> bool:
+            settled = time.monotonic() - node.tokens_changed_s > JOINED_S
+            return settled and bool(self._controllers(node))
+
+        while not ready():
+            if time.monotonic() - began_s > allowed_s:
+                raise PolicyFault(f"is missing after {allowed_s:.0f} s: {self._diagnosis(node)}")
+            node.wait_for(ready, _LOOK_S)
+
+    def _controllers(self, node: Ros2Node) -> list[Endpoint]:
+        """Return the publishers of /cmd_vel with a type that is read."""
+        return [end for end in node.publishers_of(CMD_VEL) if not self._unreadable(end)]
+
+    def _unreadable(self, end: Endpoint) -> str:
+        """Return why the commands of a publisher cannot be read, "" if they can."""
+        if end.type not in COMMAND_TYPES:
+            types = " or ".join(COMMAND_TYPES)
+            return f"{end.in_words} publishes {CMD_VEL} as {end.type}: publish {types}"
+        wanted = type_hash(end.type, self.settings.distro)
+        if end.hash and end.hash != wanted:
+            return f"{end.in_words} {hash_fault(end.type, end.hash, wanted)}"
+        return ""
+
+    def _diagnosis(self, node: Ros2Node) -> str:
+        """Return why there is no command, as far as the nodes around and their messages show."""
+        others = [end for end in node.others if end.node != NAME]
+        settings = self.settings
+        here = full_topic(settings.namespace, CMD_VEL)
+        found: list[str] = list(self._remarks)
+        for end in others:
+            if end.kind != "MP" or not end.topic.endswith(CMD_VEL):
+                continue
+            if end.domain not in (-1, settings.domain):
+                found.append(
+                    f"{end.in_words} publishes {end.topic} in domain {end.domain}, and this "
+                    f"episode is in domain {settings.domain}: set ROS_DOMAIN_ID={settings.domain} "
+                    f"or --ros2-domain"
+                )
+            elif end.topic != here:
+                found.append(f"{end.in_words} publishes {end.topic}, not {here}: remap it")
+            elif words := self._unreadable(end):
+                found.append(words)
+        if found:
+            return "; ".join(dict.fromkeys(found))
+        if not others:
+            return (
+                f"no ROS 2 node is at {settings.where} in any domain: nodes of rmw_zenoh connect "
+                f"there, and those on DDS need zenoh-bridge-ros2dds and --ros2-dialect ros2dds"
+            )
+        if not node.publishers_of(CMD_VEL):
+            names = ", ".join(sorted({end.in_words for end in others})[:8])
+            return f"none of the nodes {names} publishes {here} in domain {settings.domain}"
+        answered = "no command came with the stamp of the observation"
+        return answered if settings.wait == "stamped" else f"no message came on {here}"
+
+
+class Ros2Driver(PolicyCaller):
+    """Driver of a policy that is a ROS 2 node."""
+
+    _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError, EngineError, MachineError)
+
+    def __init__(self, policy: Ros2Policy, timer: Timer | None = None) -> None:
+        super().__init__(policy, policy.manifest, timer=timer)
+        self._ros2 = policy
+        self.runs = cast(PolicyProcess, f"ros2, {policy.settings.wait}")
+
+    @property
+    def clock(self) -> dict[str, float]:
+        if not self._ros2.took_ms:
+            return {}
+        median, most = np.quantile(self._ros2.took_ms, [0.5, 0.95])
+        return {"answer_median_ms": float(median), "answer_p95_ms": float(most)}
+
+    def close(self) -> None:
+        self._ros2.close()
+
+    def _own(self, observation: Observation) -> Observation:
+        return observation  # the messages are copies
+
+
+def ros2_driver(name: str, host: PolicyHost, timer: Timer | None = None) -> Ros2Driver:
+    """Return the driver of policy `ros2:` or `ros2:NAME`, which joins the network in an episode.
+
+    Raises UsageError for invalid settings, MachineError without the extra [ros2].
+    """
+    if host.ros2 is None:
+        raise UsageError(
+            f"policy '{name}' has no settings here: use `cosim run` or `cosim scenario run`, or in "
+            "Python PolicyHost(ros2=Ros2Settings(...))"
+        )
+    message_store()
+    called = name.removeprefix(ROS2_SCHEME) or "ros2"
+    policy = Ros2Policy(called, host.ros2)
+    checked_manifest(name, _builtins(policy))
+    return Ros2Driver(policy, timer)
+
+
+def _builtins(policy: Ros2Policy) -> Any:
+    import msgspec
+
+    return msgspec.to_builtins(policy.manifest)

@@ -1,0 +1,313 @@
+"""The policy `ros2:` against ROS 2 nodes over real sessions, without an engine of the street."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import pytest
+
+from bridge.ros2 import encode
+from bridge.ros2.commands import TWIST, TWIST_STAMPED
+from bridge.ros2.node import Network
+from bridge.session import open_session
+from cosim.core.errors import PolicyError, UsageError
+from cosim.core.state import Command
+from cosim.episode.interfaces import Observation
+from cosim.spec.connection import Connection
+from cosim.spec.goal import PointGoal
+from cosim.spec.odometry import Odometry
+from cosim.spec.options import PolicyHost
+from cosim.spec.robot import COURIER
+from cosim.spec.ros2 import CMD_VEL, Ros2Settings
+from cosim.spec.run_config import RunConfig
+from scenarios.runs import ros2_policy
+from scenarios.runs.policy_host import policy_driver
+from scenarios.runs.ros2_policy import Ros2Driver, ros2_driver
+from tests.conftest import wait_until
+from tests.support.plain import free_port
+from tests.support.ros2_peer import Peer, Seen, answers, stamped, steer, twist
+
+pytestmark = pytest.mark.engine
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes of a test start together, and are lost soon."""
+    monkeypatch.setattr(ros2_policy, "JOINED_S", 0.2)
+    monkeypatch.setattr(ros2_policy, "GONE_S", 0.3)
+
+
+def seen_at(tick: int, **more: Any) -> Observation:
+    values: dict[str, Any] = {
+        "goal": PointGoal(10.0 - 0.1 * tick, 1.0),
+        "odometry": Odometry(0.1 * tick, 0.0, 0.0),
+    }
+    return Observation(tick, tick / 20.0, None, 0.5, 0.0, COURIER, **(values | more))
+
+
+@pytest.fixture
+def at() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+@contextmanager
+def driven(at: str, **more: Any) -> Iterator[Ros2Driver]:
+    """The driver of `ros2:` that listens at an endpoint."""
+    settings = Ros2Settings(
+        connection=Connection(role="coordinator", listen=at, guests=("ros2",)),
+        **({"camera": "none", "start_s": 6.0, "answer_s": 2.0} | more),
+    )
+    driver = ros2_driver("ros2:", PolicyHost(ros2=settings))
+    driver.policy._joined()  # type: ignore[attr-defined]  so that nodes find it
+    try:
+        yield driver
+    finally:
+        driver.close()
+
+
+def test_a_node_drives_in_lockstep(at: str) -> None:
+    """Each observation is answered by the node's command for it; /clock rises every 50 ms before
+    stamps of its time; a new episode sets it back and is announced."""
+    with driven(at) as driver, Peer(at) as peer:
+        for episode in ("k1", "k2"):
+            driver.reset(episode, 7)
+            for tick in (0, 2, 4):
+                command = driver.act(seen_at(tick))
+                assert command == steer(Seen(0, 0.1 * tick, 0.0, 0.0, (10.0, 1.0)))
+        assert driver.runs == "ros2, next" and driver.clock["answer_median_ms"] > 0.0
+        stamps = [encode.ns_of(one.header.stamp) for one in peer.seen["/odom"]]
+        assert stamps == 2 * [10**9, 11 * 10**8, 12 * 10**8]
+        clock = [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
+        assert clock == 2 * [10**9 + 5 * 10**7 * tick for tick in range(5)]
+        told = [msgspec.json.decode(one.data) for one in peer.seen["/cosim/episode"]]
+        assert [(one["episode"], one["seed"], one["reset"]) for one in told] == [
+            ("k1", 7, False),
+            ("k2", 7, False),
+        ]
+        driver.act(seen_at(6, reset=True))
+        assert msgspec.json.decode(peer.seen["/cosim/episode"][-1].data)["reset"]
+
+
+def test_a_monotonic_clock_never_goes_back(at: str) -> None:
+    """With --ros2-clock monotonic the next episode continues the time of the last one."""
+    with driven(at, clock="monotonic") as driver, Peer(at) as peer:
+        for episode in ("k1", "k2"):
+            driver.reset(episode, 7)
+            for tick in (0, 2):
+                driver.act(seen_at(tick))
+        clock = [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
+        assert clock == sorted(set(clock)) and len(clock) == 6
+
+
+def test_stamped_waits_for_the_command_of_the_picture(at: str) -> None:
+    """A late answer to an older observation is skipped; a Twist and a wall clock never drive."""
+
+    def late(peer: Peer, seen: Seen) -> None:
+        now_ns = seen.time_ns
+        for command, time_ns in (
+            (Command(0.1, 0.0), now_ns - 10**8),
+            (Command(0.2, 0.0), int(1.8e18)),
+            (Command(0.3, 0.0), now_ns),
+        ):
+            peer.node.publish(CMD_VEL, stamped(command, time_ns))
+
+    with driven(at, wait="stamped") as driver, Peer(at, late, type_name=TWIST_STAMPED):
+        driver.reset("k1", 7)
+        assert [driver.act(seen_at(tick)).v_mps for tick in (0, 2)] == [0.3, 0.3]
+
+
+def test_rate_holds_a_command_for_half_a_second(at: str) -> None:
+    """Without a command within two periods the last one is repeated, and after 0.5 s of simulated
+    time the robot stops."""
+
+    def once(peer: Peer, seen: Seen) -> None:
+        if len(peer.seen["/odom"]) == 1:
+            answers(peer, seen)
+
+    with driven(at, wait="rate", rate_hz=20.0) as driver, Peer(at, once):
+        driver.reset("k1", 7)
+        speeds = [driver.act(seen_at(tick)).v_mps for tick in (0, 5, 10, 11)]
+        assert speeds == [1.0, 1.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("sends", "words"),
+    [
+        (lambda seen: twist(Command(math.nan, 0.0)), "finite"),
+        (lambda seen: stamped(Command(1.0, 0.0), int(1.8e18)), "use_sim_time"),
+    ],
+    ids=["nan", "wall clock"],
+)
+def test_what_is_no_command_is_a_crash_in_words(
+    at: str, sends: Any, words: str, capfd: Any
+) -> None:
+    """The episode crashes at its timeout with what was sent, by which node, printed once."""
+    type_name = TWIST if words == "finite" else TWIST_STAMPED
+    with (
+        driven(at, start_s=1.5) as driver,
+        Peer(
+            at,
+            lambda peer, seen: [peer.node.publish(CMD_VEL, sends(seen)) for _ in range(3)] and None,
+            type_name=type_name,
+        ),
+    ):
+        driver.reset("k1", 7)
+        with pytest.raises(PolicyError, match=f"gave no command .* /driver .*{words}"):
+            driver.act(seen_at(0))
+    assert capfd.readouterr().err.count(words) == 1
+
+
+@pytest.mark.parametrize(
+    ("network", "type_name", "words"),
+    [
+        (Network(), "std_msgs/msg/String", "/driver publishes /cmd_vel as std_msgs/msg/String"),
+        (Network(5), TWIST, "in domain 5, and this episode is in domain 0: set ROS_DOMAIN_ID=0"),
+        (
+            Network(namespace="/robot1"),
+            TWIST,
+            "/robot1/driver publishes /robot1/cmd_vel, not /cmd_vel",
+        ),
+        (Network(distro="humble"), TWIST, "run with --ros2-distro humble"),
+    ],
+    ids=["type", "domain", "namespace", "humble"],
+)
+def test_a_node_that_cannot_drive_is_described(
+    at: str, network: Network, type_name: str, words: str
+) -> None:
+    """A wrong type, domain, namespace or distribution is in the message of the crash."""
+    with (
+        driven(at, start_s=1.2) as driver,
+        Peer(at, network=network, type_name=type_name),
+        pytest.raises(PolicyError, match="is missing after") as error,
+    ):
+        driver.reset("k1", 7)
+    assert words in str(error.value)
+
+
+def test_without_a_node_the_crash_says_where_they_connect(at: str) -> None:
+    """No node: its endpoint and the other dialect are in the message."""
+    with (
+        driven(at, start_s=1.0) as driver,
+        pytest.raises(PolicyError, match=f"no ROS 2 node is at {at}.*ros2dds"),
+    ):
+        driver.reset("k1", 7)
+
+
+def test_humble_nodes_drive_with_their_distribution(at: str) -> None:
+    """With --ros2-distro humble the keys have no hash on either side."""
+    with (
+        driven(at, distro="humble", domain=3, namespace="/env") as driver,
+        Peer(at, network=Network(3, "/env", "humble")),
+    ):
+        driver.reset("k1", 7)
+        assert driver.act(seen_at(0)).v_mps == 1.0
+
+
+def test_nodes_behind_the_dds_bridge_drive(at: str) -> None:
+    """With --ros2-dialect ros2dds the keys are bare topic names, and commands need no attachment."""
+    with driven(at, dialect="ros2dds") as driver, Peer(at, network=Network(dialect="ros2dds")):
+        driver.reset("k1", 7)
+        assert [driver.act(seen_at(tick)).v_mps for tick in (0, 2)] == [1.0, 1.0]
+
+
+def test_a_lost_node_is_a_crash_and_a_new_one_drives_the_next_episode(at: str) -> None:
+    """The node ends in an episode: it is named; its tokens are gone; the next episode waits for
+    another."""
+
+    def silent(peer: Peer, seen: Seen) -> None:
+        if seen.time_ns == 10**9:
+            answers(peer, seen)
+
+    with driven(at, answer_s=30.0) as driver:
+        with Peer(at, silent) as peer:
+            driver.reset("k1", 7)
+            driver.act(seen_at(0))
+            threading.Timer(0.3, peer.close).start()
+            with pytest.raises(
+                PolicyError, match="is gone: /driver published /cmd_vel, and has left"
+            ):
+                driver.act(seen_at(2))
+        with Peer(at):
+            driver.reset("k2", 7)
+            assert driver.act(seen_at(0)).v_mps == 1.0
+
+
+def test_two_nodes_do_not_drive_together(at: str) -> None:
+    """Commands of a second node crash the episode, and both are named."""
+    with driven(at) as driver, Peer(at, name="one"), Peer(at, name="two"):
+        driver.reset("k1", 7)
+        with pytest.raises(
+            PolicyError, match=r"is two nodes, /(one|two) and /(one|two), which both publish"
+        ):
+            for tick in range(0, 100, 2):
+                driver.act(seen_at(tick))
+
+
+def test_a_flood_of_commands_and_long_messages_does_not_stop_the_drive(at: str) -> None:
+    """A thousand commands after each answer, and megabytes that the hub drops: the drive goes on."""
+
+    def flood(peer: Peer, seen: Seen) -> None:
+        answers(peer, seen)
+        for _ in range(1000):
+            answers(peer, seen)
+        peer.session.publish(peer.node._publishers[CMD_VEL].key, bytes(1 << 20))
+
+    with driven(at) as driver, Peer(at, flood):
+        driver.reset("k1", 7)
+        assert {driver.act(seen_at(tick)).v_mps for tick in range(0, 20, 2)} == {1.0}
+
+
+def test_a_late_node_gets_the_latched_topics(at: str) -> None:
+    """Constant transforms, goal and episode arrive within a second at a node that asks for the
+    history."""
+    late: dict[str, bytes] = {}
+    with driven(at) as driver, Peer(at):
+        driver.reset("k1", 7)
+        driver.act(seen_at(0))
+        with open_session(Connection(role="worker", connect=at)) as session:
+            began_s = time.monotonic()
+            for topic in (encode.STATIC, encode.GOAL, encode.EPISODE):
+                session.listen(
+                    f"0{topic}/*/*",
+                    lambda key, payload, _: late.update({key: payload}),
+                    history=True,
+                )
+            wait_until(lambda: len(late) == 3)
+            assert time.monotonic() - began_s < 30.0
+
+
+def test_settings_are_checked_before_anything_opens() -> None:
+    """Options of ROS 2 without it, both ends, a domain beyond the last, and bad values are refused
+    with a remedy."""
+    wrong: dict[str, dict[str, Any]] = {
+        "--ros2-wait goes with --policy ros2:": {"policy": "orca", "ros2_wait": "rate"},
+        "listens or connects, not both": {
+            "ros2_at": "tcp/h:1",
+            "ros2_listen": "tcp/127.0.0.1:7448",
+        },
+        "the last is 232": {"ros2_domain": 232, "jobs": 2},
+        "has no domains": {"ros2_dialect": "ros2dds", "jobs": 2},
+        "write it as 512x288": {"ros2_camera": "big"},
+        "write it as 360, 360@20": {"ros2_scan": "0"},
+        "letters, digits and _": {"ros2_namespace": "env-1"},
+        "needs a camera": {"ros2_camera": "none", "ros2_depth": True},
+        "is beyond this machine": {"ros2_listen": "tcp/0.0.0.0:7447"},
+    }
+    for words, fields in wrong.items():
+        with pytest.raises(UsageError, match=words):
+            RunConfig(**({"policy": "ros2:"} | fields))
+    config = RunConfig(
+        policy="ros2:mine", ros2_scan="1024x16@50", ros2_camera="320x240@60", ros2_domain=4
+    )
+    driver = policy_driver("ros2:mine", PolicyHost(ros2=config.ros2))
+    assert driver.manifest.name == "mine" and driver.manifest.scan is not None
+    assert (driver.manifest.scan.rings, driver.manifest.scan.range_m) == (16, 50.0)
+    assert PolicyHost(ros2=config.ros2).of_job(2).ros2.domain == 6  # type: ignore[union-attr]
+    with pytest.raises(UsageError, match="--isolated out"):
+        policy_driver("ros2:", PolicyHost(ros2=config.ros2, isolated="auto"))

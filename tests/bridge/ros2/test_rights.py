@@ -1,0 +1,156 @@
+"""What the role `ros2` may do at a run's hub: plain Zenoh tries each act over TLS on loopback."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from bridge.ros2.types import HASHES
+from bridge.ros2.wire import Endpoint, rmw_key, rmw_token
+from bridge.security.authority import issue, make_authority
+from bridge.session import Session, open_session
+from cosim.core.errors import AccessError, EngineError
+from cosim.spec.connection import Connection
+from cosim.spec.ros2 import LARGEST_B, SENT, TAKEN
+from tests.conftest import wait_until
+from tests.support.plain import free_port, plain_zenoh
+
+pytestmark = pytest.mark.engine
+
+
+def key(topic: str, name: str) -> str:
+    return rmw_key(3, topic, name, HASHES[name])
+
+
+OUT = {topic: key(topic, name) for topic, name in SENT.items()}
+IN = {topic: key(topic, names[0]) for topic, names in TAKEN.items()}
+FOREIGN = (
+    "3/other/std_msgs::msg::dds_::String_/RIHS01_0",
+    "cosim/r/env/e/inject",
+    "cosim/r/jobs/claim",
+)
+GIVEN_UP_S = 0.5
+"""What is refused is waited for so long: nothing comes, on any machine."""
+TOKEN = rmw_token(Endpoint("NN", 3, "ab", "driver"))
+
+
+@pytest.fixture(scope="module")
+def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tls") / "certs"
+    make_authority(folder, ["localhost"], 365)
+    for role in ("ros2", "viewer"):
+        issue(folder, role, [], 365)  # type: ignore[arg-type]
+    return folder
+
+
+class Hub:
+    """A run's hub and its own process. heard: keys that reached them from outside."""
+
+    def __init__(self, certs: Path, stack: ExitStack) -> None:
+        self.at = f"tls/localhost:{free_port()}"
+        end = Connection(
+            role="coordinator", listen=self.at, tls=str(certs / "coordinator"), guests=("ros2",)
+        )
+        self.session = stack.enter_context(open_session(end))
+        self.run: Session = stack.enter_context(open_session(self.session.inside))
+        self.heard: list[tuple[str, int]] = []
+        self.tokens: list[str] = []
+        for topic, name in OUT.items():
+            self.run.advertise(name, latched=int(topic == "/tf_static"))
+        self.run.stand(rmw_token(Endpoint("NN", 3, "cd", "cosim")))
+        self.run.listen("**", lambda name, payload, _: self.heard.append((name, len(payload))))
+        for tokens in ("@ros2_lv/**", "cosim/**"):
+            self.run.watch(tokens, lambda name, alive: self.tokens.append(name))
+
+
+@pytest.fixture(scope="module")
+def hub(certs: Path) -> Iterator[Hub]:
+    with ExitStack() as stack:
+        yield Hub(certs, stack)
+
+
+def test_a_node_hears_sensors_and_tells_commands_alone(certs: Path, hub: Hub) -> None:
+    """It gets every published topic, latched ones later too, and sees the run's token; its commands,
+    plans and tokens arrive; what it publishes elsewhere, deletes, answers or says at length does
+    not."""
+    with plain_zenoh(hub.at, certs, "ros2") as guest:
+        got: list[str] = []
+        guest.declare_subscriber("3/**", lambda sample: got.append(str(sample.key_expr)))
+        for name in OUT.values():
+            guest.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
+        asked: list[str] = []
+        for name in (*IN.values(), *FOREIGN):
+            guest.declare_queryable(name, lambda query: asked.append(str(query.key_expr)))
+        token = guest.liveliness().declare_token(TOKEN)
+        foreign = guest.liveliness().declare_token("cosim/r/workers/one")
+        wait_until(lambda: TOKEN in hub.tokens)
+        assert "cosim/r/workers/one" not in hub.tokens
+        seen = [str(one.ok.key_expr) for one in guest.liveliness().get("@ros2_lv/**") if one.ok]
+        assert rmw_token(Endpoint("NN", 3, "cd", "cosim")) in seen
+
+        def all_arrived() -> bool:
+            for name in OUT.values():
+                hub.run.publish(name, b"x")
+            time.sleep(0.05)
+            return set(OUT.values()) <= set(got)
+
+        wait_until(all_arrived)
+        hub.run.tell("cosim/r/env/e/robot", b"x")
+        hub.heard.clear()
+        for name in (*FOREIGN, *OUT.values(), IN["/plan"], IN["/cmd_vel"]):
+            guest.put(name, b"x")
+            guest.delete(name)
+        guest.put(IN["/cmd_vel"], bytes(LARGEST_B + 1))
+        guest.put(IN["/cmd_vel"], b"last")
+        wait_until(lambda: (IN["/cmd_vel"], 4) in hub.heard)
+        own = {(name, 1) for name in OUT.values()} | {("cosim/r/env/e/robot", 1)}
+        assert set(hub.heard) - own == {(IN["/plan"], 1), (IN["/cmd_vel"], 1), (IN["/cmd_vel"], 4)}
+        for name in (*IN.values(), *FOREIGN):
+            assert hub.run.answers(name, timeout_s=GIVEN_UP_S) == {}
+        assert asked == []
+        del token, foreign
+
+
+def test_nodes_do_not_reach_each_other_through_the_run(certs: Path, hub: Hub) -> None:
+    """One node's commands and topics of its own are not passed to another."""
+    with plain_zenoh(hub.at, certs, "ros2") as one, plain_zenoh(hub.at, certs, "ros2") as other:
+        got: list[str] = []
+        for name in (IN["/cmd_vel"], FOREIGN[0]):
+            other.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
+        hub.heard.clear()
+        one.put(FOREIGN[0], b"x")
+        one.put(IN["/cmd_vel"], b"x")
+        wait_until(lambda: (IN["/cmd_vel"], 1) in hub.heard)
+        time.sleep(GIVEN_UP_S)
+        assert got == []
+
+
+def test_without_the_certificate_of_a_node_nothing_is_heard(certs: Path, hub: Hub) -> None:
+    """No certificate: no link. Another role: a link that carries nothing."""
+    with plain_zenoh(hub.at, certs, "viewer") as viewer:
+        got: list[str] = []
+        for name in (*OUT.values(), "**"):
+            viewer.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
+        hub.heard.clear()
+        viewer.put(IN["/cmd_vel"], b"forged")
+        for name in OUT.values():
+            hub.run.publish(name, b"x")
+        time.sleep(GIVEN_UP_S)
+        assert (IN["/cmd_vel"], 6) not in hub.heard
+        assert [name for name in got if not name.endswith(IN["/cmd_vel"])] == []
+        assert list(viewer.liveliness().get("@ros2_lv/**", timeout=GIVEN_UP_S)) == []
+    with pytest.raises((AccessError, EngineError)):
+        open_session(Connection(role="worker", connect=hub.at.replace("tls/", "tcp/")))
+
+
+def test_the_configuration_for_nodes_is_one_that_zenoh_reads(certs: Path, hub: Hub) -> None:
+    """`session.json5` of the role opens a session to the run's machine, once its port is set."""
+    path = certs / "ros2" / "session.json5"
+    path.write_text(path.read_text().replace(":7447", f":{hub.at.rpartition(':')[2]}"))
+    with zenoh.open(zenoh.Config.from_file(path)) as guest:
+        assert [str(one.ok.key_expr) for one in guest.liveliness().get("@ros2_lv/**") if one.ok]
