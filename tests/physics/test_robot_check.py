@@ -12,10 +12,13 @@ import pytest
 from cosim.core.errors import SpecError
 from cosim.spec import robot as table
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.robot import COURIER, DOG, ROBOTS, SCOUT, Robot
+from cosim.spec.robot import COURIER, DOG, ROBOTS, SCOUT, Legs, Robot, Skid
 from physics.robots import urdf_path
 from physics.robots.check import check_robot
+from physics.robots.dog import DOG_MODEL
+from physics.robots.kinematics import link_tree
 from scenarios.runs.run import run
+from tests.support.documents import blocks, text_of
 
 WHEEL = "wheel_rear_left"
 JOINT = re.compile(rf'  <joint name="{WHEEL}".*?</joint>\n', re.S)
@@ -96,6 +99,36 @@ def test_a_faulty_row_is_refused_with_its_field(
         robot = dataclasses.replace(robot, **{name.partition(".")[0]: value})
     with pytest.raises(SpecError, match=f"^robot '{robot.name}': {why}"):
         check_robot(robot)
+
+
+def test_the_robot_of_the_documents_is_valid(tmp_path: Path) -> None:
+    """The row and the URDF on the page of robots are sound and agree."""
+    (row,), (urdf,) = (blocks(language, "docs/robots.md") for language in ("python", "xml"))
+    (tmp_path / "barrow.urdf").write_text(urdf.text)
+    names: dict[str, Any] = {}
+    exec(row.text, names)
+    check_robot(dataclasses.replace(names["BARROW"], urdf=str(tmp_path / "barrow.urdf")))
+
+
+def test_the_documents_have_the_fields_of_rows_and_the_joints_of_the_dog() -> None:
+    """Every field of a row on wheels; axis, range, angle at rest and torque of each joint; and the
+    directions of positive angles."""
+    text = text_of("docs/robots.md")
+    for field in (*dataclasses.fields(Robot), *dataclasses.fields(Skid)):
+        assert field.name == "drive" or f"`{field.name}`" in text, field.name
+    assert isinstance(DOG.drive, Legs)
+    joints = {joint.name: joint for joint in DOG_MODEL.joints}
+    rows = zip(DOG.drive.joints, DOG.drive.rest_rad, DOG.drive.torque_nm, strict=True)
+    for name, rest_rad, torque_nm in rows:
+        axis, (low, high) = joints[name].axis, joints[name].range_rad
+        assert axis is not None
+        cells = name, "xyz"[axis], f"{low:.4g} to {high:.4g}", f"{rest_rad:g}", f"{torque_nm:g}"
+        assert "| `{}` | {} | {} | {} | {} |".format(*cells) in text
+        leg = name.rpartition("_")[0]
+        (x, y, _), (moved_x, moved_y, _) = (
+            link_tree(urdf_path(DOG)).frames({name: angle})[f"{leg}_foot"][1] for angle in (0, 0.1)
+        )
+        assert moved_y > y if name.endswith("hip") else moved_x < x
 
 
 def test_a_run_does_not_begin_with_a_faulty_robot(
