@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as xml
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -34,6 +35,8 @@ _SPEED: Final = Within(0, 20, above=True)
 _RAMP: Final = Within(0, 100, above=True)
 _TORQUE_NM: Final = Within(0, 10_000, above=True)
 _GAIN: Final = Within(0, 10_000)
+_RGBA: Final = r"((\d+\.?\d*|\.\d+)(\s+|$)){4}"
+"""Four numbers."""
 _checked: Final[set[str]] = set()
 """Hashes of the robots that this process has found valid."""
 
@@ -54,7 +57,8 @@ def check_robot(robot: Robot) -> None:
     except xml.ParseError as error:
         raise SpecError(f"{path}: is no XML: {error}") from error
     except ValueError as error:
-        raise SpecError(f"{path}: {error}") from error
+        words = str(error)
+        raise SpecError(words if words.startswith(f"{path}: ") else f"{path}: {words}") from error
     if faults:
         raise SpecError(f"{path}: {join_faults(faults)}")
     _checked.add(digest)
@@ -140,6 +144,7 @@ def _body_faults(robot: Robot, root: xml.Element, path: Path) -> Iterator[str]:
     """Yield what is wrong with masses and joints, and what differs from the row."""
     for link in root.findall("link"):
         yield from _inertial_faults(link)
+    yield from _visual_faults(root, path)
     drive, tree = robot.drive, tree_of(root)
     kinds = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     if lacking := [name for name in drive.joints if name not in kinds]:
@@ -158,8 +163,8 @@ def _body_faults(robot: Robot, root: xml.Element, path: Path) -> Iterator[str]:
             )
             return
     corners = _collision_corners(root, tree, rest, path)
+    valid = ("revolute", "continuous") if isinstance(drive, Legs) else ("continuous",)
     if isinstance(drive, Legs):
-        valid = ("revolute", "continuous")
         links = {*tree.frames({})}
         yield from (
             f"lacks link '{name}' of feet or trunk of robot '{robot.name}'"
@@ -167,7 +172,6 @@ def _body_faults(robot: Robot, root: xml.Element, path: Path) -> Iterator[str]:
             if name not in links
         )
     else:
-        valid = ("continuous",)
         yield from _wheel_faults(drive, tree, corners)
         yield from _base_faults(robot, root)
     yield from (
@@ -199,6 +203,20 @@ def _inertial_faults(link: xml.Element) -> Iterator[str]:
             f"{words} is that of no body: about one axis it is larger than the sum of the others "
             f"({', '.join(f'{one:.4g}' for one in values)} kg m2)"
         )
+
+
+def _visual_faults(root: xml.Element, path: Path) -> Iterator[str]:
+    """Yield visuals that cannot be drawn. Raises SpecError for an unknown shape."""
+    for visual in root.iter("visual"):
+        mesh = visual.find("geometry/mesh")
+        if mesh is None:
+            shape_of(visual, path)
+        elif not (path.parent / (name := mesh.get("filename", ""))).is_file():
+            yield f"visual mesh '{name}' does not exist beside it"
+    for colour in root.iter("color"):
+        rgba = colour.get("rgba", "")
+        if not re.fullmatch(_RGBA, rgba.strip()):
+            yield f"rgba of a colour must be four numbers from 0 to 1, not '{rgba}'"
 
 
 def _base_faults(robot: Robot, root: xml.Element) -> Iterator[str]:
