@@ -217,9 +217,9 @@ def test_every_block_has_a_language_that_is_tested() -> None:
     """Pages have no other blocks than those that a test reads, and output and citations as text."""
     for page in PAGES:
         languages = re.findall(r"^```(.*)\n(?:.*\n)*?```$", text_of(page), re.MULTILINE)
-        assert {*languages} <= {"bash", "python", "toml", "json", "text", "bibtex", "{eval-rst}"}, (
-            page
-        )
+        assert {*languages} <= {
+            *("bash", "python", "toml", "json", "xml", "text", "bibtex", "{eval-rst}")
+        }, page
         assert not re.search(
             r"\n\n    \S", re.sub(r"^```.*?^```$", "", text_of(page), flags=re.M | re.S)
         ), page

@@ -367,10 +367,17 @@ def bench(
         float,
         typer.Option(
             min=0.1,
-            help="For `crowd`: simulated minutes in each; for `legs`: of random commands in all.",
+            help="For `crowd`: simulated minutes in each; for `legs`: of random commands in all, "
+            "a third on each of three grounds.",
         ),
     ] = 10.0,
     robot: Annotated[str, typer.Option(help="For `legs`: the robot.")] = "dog",
+    gait: Annotated[
+        str,
+        typer.Option(
+            metavar="onnx:FILE.onnx", help="For `legs`: in place of the robot's own gait."
+        ),
+    ] = "",
     residents: Annotated[int, typer.Option(min=0, help="For `crowd`: number of residents.")] = 0,
     crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: their number.")] = 200,
     policy: Annotated[str, typer.Option(help="For `crossings`: the policy.")] = "orca",
@@ -463,7 +470,7 @@ def bench(
         bench_crossings(crossings, min(20, crossings) if cities is None else cities, policy, jobs)
         return
     if what == "legs":
-        bench_legs(robot, minutes)
+        bench_legs(robot, minutes, gait)
         return
     if what == "people":
         bench_people(jobs)

@@ -28,6 +28,7 @@ from cosim.results.metrics import (
     RATED_PER_PROGRESS,
     SUCCESS_IN_WORDS,
 )
+from cosim.results.run_folder import read_spec
 from cosim.results.run_setup import appearance_of
 from cosim.results.table import (
     INJECTED,
@@ -119,7 +120,7 @@ def print_table(
 
     table: a row per episode.
     scheduled: number of episodes of the run.
-    folder: of the run, to look for waypoints in its trajectories.
+    folder: of the run, to look for waypoints in its trajectories and for its robots.
     """
     heads = (*(f"{head}\n{UNITS.get(head, '')}" for _, head in SHOWN), "counts")
     rows = []
@@ -131,12 +132,21 @@ def print_table(
     columns = [*tables.names("episode"), *tables.labels("ended"), *tables.figures(*heads)]
     tables.show(out, columns, rows)
     print_terms(out, table, folder)
+    if words := _robot_in_words(folder):
+        out.print(words, highlight=False, markup=False)
     counted = "/".join(name for _, name in COUNTS)
     shown = [letter for letter in LETTERS if letter != "D" or has_decoys(table)]
     out.print("; ".join(f"{letter} {LETTERS[letter]}" for letter in shown) + f"; counts: {counted}")
     print_means(out, table)
     print_delays(out, table)
     print_statuses(out, table, scheduled)
+
+
+def _robot_in_words(folder: Path | None) -> str:
+    """Return robots and gait of a run; "" for the default robot, and without a run's folder."""
+    if folder is None or not (folder / "run.json").is_file():
+        return ""
+    return read_spec(folder).robot_in_words
 
 
 def print_means(out: Console, table: pd.DataFrame) -> None:

@@ -47,6 +47,7 @@ def print_names(out: Console) -> None:
     from cosim.spec.goal import GOALS
     from cosim.spec.robot import ROBOTS
     from physics.dynamics.legs.gait_file import weights_in_words as gait_weights_in_words
+    from physics.robots.check import check_robot
     from scenarios.suites.catalog import SUITES, load_suite
 
     for name in SUITES:
@@ -56,6 +57,7 @@ def print_names(out: Console) -> None:
             f"{whole.content_hash}"
         )
     for one in ROBOTS.values():
+        check_robot(one)
         size = f"{one.length_m:.2f} x {one.width_m:.2f} m"
         out.print(
             f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at "

@@ -426,6 +426,8 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
         pairs = pairs_of(other.table)
         if pairs.invalid or pairs.single:
             yield f"{other.label}: D is over {pairs.in_words}"
+        if words := run.spec.robot_in_words:
+            yield f"{other.label}: {words}"
         if words := injections_in_words(other.table):
             yield f"{other.label}: {words}"
         crashed = sum(record.status == "crashed" for record in run.records.values())

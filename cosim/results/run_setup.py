@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 
 from cosim.core.versions import versions
@@ -19,6 +21,15 @@ MESH_LOOK = ", mesh"
 def appearance_of(renderer: str) -> Appearance:
     """Return the appearance of scanned places in pictures, by the renderer's name in a record."""
     return "mesh" if renderer.endswith(MESH_LOOK) else "splats"
+
+
+def gait_in_words(gait: str, gait_hash: str) -> str:
+    """Return the file name and the short hash of a gait in place of the robot's own.
+
+    >>> gait_in_words("onnx:/gaits/walk.onnx", "0123456789abcdef")
+    'gait walk.onnx (01234567)'
+    """
+    return f"gait {Path(gait).name} ({gait_hash[:8]})"
 
 
 class RunSetup(msgspec.Struct, frozen=True, kw_only=True):

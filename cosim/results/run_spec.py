@@ -11,8 +11,9 @@ import msgspec
 
 from cosim.core.errors import RunError, UsageError
 from cosim.results.flat_file import FlatFile
-from cosim.results.run_setup import RunSetup
+from cosim.results.run_setup import RunSetup, gait_in_words
 from cosim.spec.manifest import Manifest
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Suite
 from cosim.spec.selection import selection_in_words
 
@@ -106,6 +107,14 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     shared_renderer: bool = False
     shard: Shard | None = None
     schema: int = SCHEMA
+
+    @property
+    def robot_in_words(self) -> str:
+        """Names and short hashes of robots and gait; "" for the default robot."""
+        robots = [f"robot {n} ({h[:8]})" for n, h in self.robots.items() if n != COURIER.name]
+        if self.setup.gait:
+            robots.append(gait_in_words(self.setup.gait, self.setup.gait_hash))
+        return ", ".join(robots)
 
     def apart(
         self, other: RunSpec, but: str = "", whole: Suite | None = None

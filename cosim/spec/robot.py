@@ -1,8 +1,8 @@
 """Table of robots; everything that depends on the robot is derived from it.
 
-A new robot is a row of `ROBOTS` and a URDF. The base frame is on the ground in the middle of the
-robot, x ahead, y left, z up. Mounts and boxes are given in it. The frame of the URDF's base link
-depends on the drive:
+A new robot is a row of `ROBOTS` and a URDF; `physics.robots.check` checks both. The base frame is
+on the ground in the middle of the robot, x ahead, y left, z up. Mounts and boxes are given in it.
+The frame of the URDF's base link depends on the drive:
 
 - Wheels: it is the base frame. The link's centre of mass is `com_height_m` above it. Wheels turn
   forward for positive joint speeds.

@@ -168,8 +168,8 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
     elif isinstance(tree, dict) and get_origin(kind) is dict:
         for name, item in tree.items():
             yield from faults_in(item, get_args(kind)[1], f"{place}.{one_line(name, MOST_SHOWN)}")
-    elif isinstance(tree, list) and get_origin(kind) is tuple:
-        parts = get_args(kind)
+    elif isinstance(tree, list) and get_origin(kind) in (tuple, list):
+        parts = get_args(kind) if get_origin(kind) is tuple else (*get_args(kind), ...)
         if parts[-1] is not Ellipsis and len(parts) != len(tree):
             return
         for number, item in enumerate(tree):
@@ -214,10 +214,9 @@ def _choices(kind: Any, tree: Any) -> str:
     if get_origin(bare) is Literal:
         return _listed(get_args(bare), tree)
     if get_origin(bare) in (Union, UnionType):
-        tags = [
-            one.__struct_config__.tag for one in get_args(bare) if hasattr(one, "__struct_config__")
-        ]
-        return _listed(tags)
+        structs = [one for one in get_args(bare) if hasattr(one, "__struct_config__")]
+        tag = tree.get(structs[0].__struct_config__.tag_field) if isinstance(tree, dict) else None
+        return _listed([one.__struct_config__.tag for one in structs], tag)
     return ""
 
 

@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.errors import EngineError, SpecError
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PERSON_RADIUS_M, LegState, RobotState, Trunk
 from cosim.spec.robot import Legs, Robot
@@ -21,6 +22,7 @@ from physics.dynamics.movers import Mover, TickPoses
 from physics.ground.mesh import Mesh, join
 from physics.ground.tiles import CURB_M
 from physics.robots import urdf_path
+from physics.robots.check import check_robot
 from physics.robots.kinematics import rotate, rows_of
 from physics.street.buildings import Building, Wall
 from physics.street.furniture import Prop, solids_of
@@ -77,6 +79,7 @@ class Bodies(BulletClient):
     """
 
     def __init__(self, robot: Robot, substep_s: float) -> None:
+        check_robot(robot)
         super().__init__()
         self._com_height_m = robot.com_height_m
         self._legs = robot.drive if isinstance(robot.drive, Legs) else None
@@ -101,9 +104,11 @@ class Bodies(BulletClient):
             deterministicOverlappingPairs=1,
             enableConeFriction=0,
         )
-        self._robot: int = self._call(
-            "loadURDF", str(urdf_path(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE
-        )
+        path = str(urdf_path(robot))
+        try:
+            self._robot: int = self._call("loadURDF", path, flags=p.URDF_USE_INERTIA_FROM_FILE)
+        except EngineError as error:
+            raise SpecError(f"{path}: {error}") from error
         infos = [
             self._call("getJointInfo", self._robot, j)
             for j in range(self._call("getNumJoints", self._robot))

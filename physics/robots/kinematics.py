@@ -70,7 +70,11 @@ class LinkTree(NamedTuple):
 @lru_cache(maxsize=8)
 def link_tree(urdf: Path) -> LinkTree:
     """Return the tree of a URDF file."""
-    root = xml.parse(urdf).getroot()
+    return tree_of(xml.parse(urdf).getroot())
+
+
+def tree_of(root: xml.Element) -> LinkTree:
+    """Return the tree of a URDF; it lacks joints that are not connected to the base link."""
     links = [link.get("name", "") for link in root.findall("link")]
     joints = {}
     for element in root.findall("joint"):
@@ -165,7 +169,10 @@ def angles_of(turn: Floats) -> tuple[float, float, float]:
 
 
 def _triple(text: str) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in text.split())
+    try:
+        x, y, z = (float(value) for value in text.split())
+    except ValueError:
+        raise ValueError(f"'{text}' must be three numbers") from None
     return x, y, z
 
 

@@ -18,7 +18,7 @@ from cosim.policies.baselines import Replay
 from cosim.results.log import Log, Tick
 from cosim.results.record import Record
 from cosim.results.referee import Verdict
-from cosim.results.run_folder import read_records
+from cosim.results.run_folder import read_records, read_spec
 from cosim.results.run_setup import RunSetup, appearance_of
 from cosim.results.traffic import RoadState
 from cosim.spec.manifest import Manifest
@@ -26,6 +26,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
+from physics.robots import robot_hash
 from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.run_episode import drive
@@ -34,11 +35,15 @@ from sumo_nets.crowd.demand_log import Entrances
 
 
 class RecordedEpisode(NamedTuple):
-    """A finished episode as loaded from a run folder."""
+    """A finished episode as loaded from a run folder.
+
+    robot_hash: hash of its robot in the run (`physics.robots.robot_hash`); "" if unknown.
+    """
 
     scenario: Scenario
     record: Record
     log: Log
+    robot_hash: str = ""
 
 
 def load_recorded(folder: Path, scenario_id: str) -> RecordedEpisode:
@@ -53,7 +58,9 @@ def load_recorded(folder: Path, scenario_id: str) -> RecordedEpisode:
         raise RunError(
             f"{folder}: '{scenario_id}' did not come to its end: there is nothing to run again"
         )
-    return RecordedEpisode(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
+    scenario = scenarios[scenario_id]
+    digest = read_spec(folder).robots.get(scenario.robot, "")
+    return RecordedEpisode(scenario, record, Log.load(episode / "trajectory.npz"), digest)
 
 
 def replay_episode(
@@ -200,20 +207,28 @@ def check_state_hash(folder: Path, original: RecordedEpisode, state_hash: str) -
 
 def replay_mismatch(folder: Path, original: RecordedEpisode, what: str) -> RunError:
     """Return the error for a replay that differs from the record. what: the difference."""
-    record = original.record
-    here = versions()
-    changed = [
-        f"{name} {record.setup.versions.get(name)}, here {here[name]}"
-        for name in here
-        if here[name] != record.setup.versions.get(name)
-    ]
-    why = (
-        f"made with other versions: {'; '.join(changed)}"
-        if changed
-        else "of the same versions: of other code"
-    )
+    name = original.record.scenario.id
     return RunError(
-        f"{folder}: '{record.scenario.id}' was not the same when it was replayed ({what}). "
-        f"The record is {why}, or "
-        "it was changed. Replay it with the code that made it, or run it again."
+        f"{folder}: '{name}' was not the same when it was replayed ({what}). The record is "
+        f"{_origin_in_words(original)}, or it was changed. Replay it with the code and the files "
+        "that made it, or run it again."
     )
+
+
+def _origin_in_words(original: RecordedEpisode) -> str:
+    """Return what differs between the origin of a record and this machine, in words."""
+    robot = robot_called(original.scenario.robot)
+    if original.robot_hash not in ("", digest := robot_hash(robot)):
+        return (
+            f"of robot '{robot.name}' with hash {original.robot_hash}, and its row and files here "
+            f"have hash {digest}"
+        )
+    here, there = versions(), original.record.setup.versions
+    changed = [
+        f"{name} {there.get(name)}, here {here[name]}"
+        for name in here
+        if here[name] != there.get(name)
+    ]
+    if changed:
+        return f"made with other versions: {'; '.join(changed)}"
+    return "of the same versions: of other code"

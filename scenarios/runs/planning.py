@@ -27,6 +27,7 @@ from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from physics.dynamics.drives import gait_hash
 from physics.robots import robot_hash
+from physics.robots.check import check_robot
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello
 from scenarios.runs.policy_host import inspected_driver, settled_host
@@ -163,13 +164,16 @@ def run_spec(
     shared: whether one renderer draws for all episodes.
     shard: the part of the run in the folder, None for all.
     Raises UsageError if a robot lacks the policy's camera, unless the options allow an own camera,
-    if the policy does not support the goal, or if the gait does not fit the robot.
+    if the policy does not support the goal, or if the gait does not fit the robot. Raises SpecError
+    if a robot's row or URDF is invalid.
     """
     manifest = with_goal(driver.manifest, options.goal)
     robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
     if manifest.camera is not None:
         for robot in robots:
             check_camera(manifest, robot, options.own_camera)
+    for robot in robots:
+        check_robot(robot)
     gaits = [gait_hash(options.gait, robot) for robot in robots]
     setup = RunSetup.of(
         options,

@@ -29,6 +29,7 @@ from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.run_config import RunConfig, RunConnections
 from cosim.spec.scenario import Scenario, Suite, split_called
 from cosim.spec.selection import select_scenarios
+from physics.robots.check import check_robot
 from scenarios.ipc.messages import MessageHandler
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
@@ -202,6 +203,8 @@ def execute_run(
     for line in (line for end in ends.all for line in connection_warnings(end)):
         reporter.say(line)
     _check_cluster(config, given)
+    if config.robot:
+        check_robot(robot_called(config.robot))
     if config.out is not None:
         (refuse_not_begun if config.resume else refuse_used)(config.out)
     whole = _loaded(config, given, reporter)

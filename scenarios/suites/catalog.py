@@ -10,6 +10,7 @@ from types import MappingProxyType
 import msgspec
 
 from cosim.core.errors import UsageError, unknown
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Suite, read_suite
 from cosim.spec.selection import select_scenarios
 from scenarios.events import EVENT_KINDS
@@ -155,8 +156,12 @@ def with_robot(whole: Suite, robot: str) -> Suite:
 
     The robot belongs to a run, not to its suite: the identity of a run has the `content_hash` of
     the suite without it. The suite is returned unchanged if it has this robot, or if `robot` is "".
-    Raises UsageError with the valid names.
+    Raises UsageError with the valid names, and SpecError for a robot whose row or URDF is invalid.
     """
+    if robot:
+        from physics.robots.check import check_robot  # imported only where needed: loads OpenCV
+
+        check_robot(robot_called(robot))
     scenarios = tuple(scenario.driven_by(robot) for scenario in whole.scenarios)
     if scenarios == whole.scenarios:
         return whole

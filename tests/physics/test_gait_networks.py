@@ -28,9 +28,11 @@ from cosim.core.network import (
     tanh,
 )
 from cosim.core.state import Command
+from cosim.policies.onnx.converting import Converter
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.manifest import file_facts
 from cosim.policies.onnx.torch_file import read_torch_file
+from cosim.policies.onnx.weights import NetworkFile
 from cosim.spec.robot import COURIER, DOG, WALKER, Legs
 from physics.dynamics.drive import SUBSTEP_S, BodyNow
 from physics.dynamics.drives import drive_of, gait_drive
@@ -287,7 +289,14 @@ def test_malformed_graphs_are_refused() -> None:
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"joints": JOINTS | {"tail": JOINTS["rear_left_hip"]}}, "joints has 'tail'.*robot 'dog'"),
+        (
+            {"joints": JOINTS | {"tail": JOINTS["rear_left_hip"]}},
+            "joints has 'tail', which robot 'dog' l",
+        ),
+        (
+            {"joints": JOINTS | {"front_left_knee": JOINTS["rear_left_hip"]}},
+            r"rear_right_calf. Did you mean front_left_\w+\?$",
+        ),
         ({"joints": dict(list(JOINTS.items())[1:])}, "joints lacks front_left_hip of robot 'dog'"),
         (
             {"balance": {"ankles": ["front_left_calf", "front_right_calf"], "sole_m": 0.0}},
@@ -295,7 +304,10 @@ def test_malformed_graphs_are_refused() -> None:
         ),
         ({"rate_hz": 30}, "rate_hz is 30: an interval must be a multiple of the substep of 5 ms"),
         ({"observation": OBSERVATION[1:]}, "takes 45 numbers, and the observation .* has 42"),
-        ({"observation": [{"what": "smell"}]}, "smell"),
+        (
+            {"observation": [OBSERVATION[0], {"what": "gravty"}]},
+            r"'gravty' - at `\$.observation\[1\]`. Valid choices: .*Did you mean gravity\?",
+        ),
         ({"robot": "walker"}, "is a gait of robot 'walker', not of 'dog'"),
         ({"model": "other.onnx"}, "other.onnx"),
         (
@@ -303,12 +315,13 @@ def test_malformed_graphs_are_refused() -> None:
                 "joints": JOINTS
                 | {"front_left_hip": {"rest_rad": 0, "kp": 9e9, "kd": 1, "scale": 1}}
             },
-            r"kp must be in \[0, 2000\]",
+            r"json: kp must be in \[0, 2000\], not 9000000000.0 - at `\$.joints.front_left_hip`",
         ),
         ({"files": {"tiny.onnx": {"bytes": 7, "blake2b": "0" * 64}}}, "expected tiny.onnx"),
     ],
     ids=[
         "unknown",
+        "similar",
         "missing",
         "balance",
         "rate",
@@ -346,6 +359,13 @@ def test_a_gait_is_named_by_its_graph(tmp_path: Path) -> None:
         user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
 
 
+FOUND = {
+    name: rf"tiny\.onnx: .* bytes, .*; expected tiny\.onnx: .*\. Different: {words}$"
+    for name, words in (("bytes", "size"), ("blake2b", "BLAKE2b"), ("sha256", "SHA-256"))
+}
+"""Messages for another file."""
+
+
 @pytest.mark.parametrize("wrong", ["bytes", "blake2b", "sha256"])
 @pytest.mark.parametrize("names", [("blake2b",), ("sha256",), ("blake2b", "sha256")])
 def test_each_hash_that_a_manifest_gives_is_checked(
@@ -359,7 +379,7 @@ def test_each_hash_that_a_manifest_gives_is_checked(
     if wrong in given:
         given[wrong] = 1 if wrong == "bytes" else "0" * 64
         path = written_gait(tmp_path, files={"tiny.onnx": given})
-        with pytest.raises(UsageError, match=r"tiny\.onnx: .* bytes, .*; expected tiny\.onnx: "):
+        with pytest.raises(UsageError, match=FOUND[wrong]):
             user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
 
 
@@ -480,6 +500,7 @@ def test_a_walker_without_weights_says_where_they_are_to_be_had(
         published_gait(WALKER, WALKER.drive, SUBSTEP_S)
     said = str(caught.value)
     assert "robot 'walker': walker.npz is missing, 126154 bytes, BLAKE2b 085c4b6c" in said
+    assert "https://github.com/unitreerobotics/unitree_rl_gym/raw/276801e46c5d4335" in said
     assert f"145745 bytes, SHA-256 {WALKER_NETWORK.weights.facts.sha256}" in said
     assert "`python -m physics.dynamics.legs.walker motion.pt`" in said and "\n" not in said
     assert weights_in_words(WALKER) == ", weights missing (walker.npz)"
@@ -495,10 +516,23 @@ def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> Non
     assert (walker_folder / "walker.npz").stat().st_size == facts.bytes
 
 
+def test_a_converter_writes_into_the_folder_of_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """$COSIM_WEIGHTS, where a run looks for it, or the folder of -o."""
+    monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path / "weights"))
+    (tmp_path / "a.pt").write_bytes(b"a")
+    files = [NetworkFile(name, "", None) for name in ("a.pt", "a.npz")]
+    converter = Converter("tests.a", files[0], bytes, lambda: files[1])
+    converter.command([str(tmp_path / "a.pt")])
+    converter.command([str(tmp_path / "a.pt"), "-o", str(tmp_path / "other")])
+    assert [(tmp_path / name / "a.npz").is_file() for name in ("weights", "other")] == [True] * 2
+
+
 def test_another_file_makes_no_arrays(tmp_path: Path) -> None:
     """Neither another file, nor arrays of another network."""
     (tmp_path / "motion.pt").write_bytes(b"no weights")
-    with pytest.raises(UsageError, match=r"motion\.pt: 10 bytes, .*expected motion\.pt of unitree"):
+    with pytest.raises(UsageError, match=r"motion\.pt: 10 bytes, .*expected motion\.pt of https:"):
         WALKER_NETWORK.write(tmp_path / "motion.pt", tmp_path)
     with pytest.raises(ValueError, match=r"has no 'memory\.weight_ih_l0'"):
         walker_network({})

@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cosim.cli.legs import bench_legs
 from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Pose, wrap_angle
+from cosim.core.progress import Progress
 from cosim.core.state import STILL, Command, LegState, Motion, RobotState, Street
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import DOG, ROBOTS, Legs, Robot
@@ -26,7 +28,7 @@ from physics.cameras.gl.robot_body import link_parts
 from physics.cameras.posture import posture_of
 from physics.cameras.view import robot_shot
 from physics.dynamics.bullet import p
-from physics.dynamics.drive import BodyNow, Motors
+from physics.dynamics.drive import BodyNow, Drive, Motors
 from physics.dynamics.legs.trot import leg_angles
 from physics.dynamics.legs.watch import LegWatch
 from physics.dynamics.world import BulletWorld
@@ -35,10 +37,12 @@ from physics.robots.dog import SEGMENT_M, THIGH_ASIDE_M
 from physics.robots.kinematics import link_tree, turned
 from physics.robots.make_urdf import MODELS
 from physics.street.street_surface import StreetSurface
+from scenarios.tools.bench import legs
 from scenarios.tools.bench.legs import (
     FLAT,
     RAMPS,
     STEPS,
+    MakeDrive,
     Walk,
     down_curb,
     mean_speeds,
@@ -49,6 +53,7 @@ from scenarios.tools.bench.legs import (
     walking,
     wander,
 )
+from tests.support.gaits import written_gait
 from tests.support.tiny_street import tiny_map
 
 pytestmark = pytest.mark.engine
@@ -356,3 +361,20 @@ def test_speeds_are_means_over_a_gait_cycle(walk: Walk) -> None:
     )
     assert np.mean(speeds) == pytest.approx(way_m, abs=0.05)
     assert abs(wrap_angle(motions[-1].robot.pose.heading_rad)) < 0.5
+
+
+def test_the_bench_walks_with_a_gait_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each walk has a drive of its own with that gait, and the table names it."""
+    made: list[Drive | None] = []
+
+    def measure(robot: Robot, minutes: float, progress: Progress, drive: MakeDrive) -> list[str]:
+        made.extend([drive(), drive()])
+        return []
+
+    monkeypatch.setattr(legs, "measure", measure)
+    path = written_gait(tmp_path, cycle_s=0.4)
+    bench_legs("dog", 0.1, f"onnx:{path}")
+    assert [one.cycle_s for one in made if one] == [0.4, 0.4] and made[0] is not made[1]
+    assert "dog, gait tiny.onnx (" in capsys.readouterr().out

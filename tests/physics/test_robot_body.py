@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.core.errors import EngineError, SpecError
+from cosim.core.errors import SpecError
 from cosim.spec.robot import COURIER
 from physics.cameras.gl.robot_body import link_parts, robot_parts
 from physics.robots import urdf_path
@@ -49,13 +49,22 @@ def corners(mesh: object) -> set[tuple[float, ...]]:
     return set(map(tuple, (np.rint(1e5 * rows) + 0.0).tolist()))
 
 
+def test_a_colour_inside_a_visual_is_drawn(tmp_path: Path) -> None:
+    """It replaces the one of its name under `robot`."""
+    path, colour = with_visual(tmp_path, r'<box size="\1"/>'), '<color rgba="1 0 0 1"/>'
+    text = path.read_text()
+    path.write_text(text.replace('name="body"/>', f'name="body">{colour}</material>', 1))
+    assert robot_parts(path)[0].colour == (1.0, 0.0, 0.0)
+    assert robot_parts(path)[1].colour == robot_parts(urdf_path(COURIER))[1].colour
+
+
 def test_a_body_that_cannot_be_drawn_is_named(tmp_path: Path) -> None:
     """A file that is not there, and a shape that is none."""
     with pytest.raises(SpecError, match=r"gone\.stl: cannot be read as a mesh"):
         robot_parts(with_visual(tmp_path, '<mesh filename="gone.stl"/>'))
     link_parts.cache_clear()
     with pytest.raises(
-        EngineError,
-        match=r"a visual shows a capsule; the gl camera draws boxes, cylinders, spheres and meshes",
+        SpecError,
+        match=r"a visual is a capsule; valid are box, cylinder, sphere and mesh",
     ):
         robot_parts(with_visual(tmp_path, '<capsule radius="1" length="2"/>'))

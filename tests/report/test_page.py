@@ -9,12 +9,15 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
+from io import StringIO
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
+from cosim.cli.run_table import print_table
 from cosim.report.page.choice import choose_failures, showable_failures
 from cosim.report.page.page import Maps, colours_of, episode_counts, render_page
 from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER
@@ -22,9 +25,10 @@ from cosim.report.page.plots import exposure_of, people_nearby, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_table, tables_of, warnings_of
+from cosim.results.compare import compare_runs
 from cosim.results.intervals import Estimate
-from cosim.results.run_folder import RunFolder, read_spec
-from cosim.results.table import summary_of
+from cosim.results.run_folder import RunFolder, read_records, read_spec
+from cosim.results.table import summary_of, table_of
 from cosim.spec.scenario import read_suite
 from cosim.spec.schedule import BEST_BLIND
 from tests.conftest import ROOT, Cosim
@@ -107,6 +111,24 @@ def test_tables_hold_runs_of_one_sensor_track(tmp_path: Path) -> None:
     assert tables[0].rows[0].notes == "2 episodes, people"
     summary = summary_table(both, {"a": "#000000", "b": "#ffffff"})
     assert [row.track for row in summary.rows] == ["blind", "people"]
+
+
+def test_tables_name_a_gait_of_the_user(tmp_path: Path) -> None:
+    """Rows and facts of a report, a comparison, and the table of a run have its file and hash."""
+    folder = run_of(tmp_path / "run", ["goal"], robot="dog", gait="onnx:/gaits/walk.onnx")
+    words = "gait walk.onnx (01234567)"
+    (own,) = read_runs([folder])
+    (table,) = tables_of([own])
+    assert [row.notes for row in table.rows] == [f"1 episode, robot dog, {words}"]
+    assert words in render_page([own], [], [], Maps([], {}, {}), "").decode().split("its source")[1]
+    plain = run_of(tmp_path / "plain", ["goal"])
+    notes = compare_runs([plain, folder]).notes
+    assert notes[0] == f"p, dog: robot dog (h), {words}"
+    assert not any("robot courier (h" in note for note in notes)
+    for path, found in ((folder, True), (plain, False)):
+        console = Console(file=StringIO(), width=300)
+        print_table(console, table_of(read_records(path)), 1, path)
+        assert (f"robot dog (h), {words}" in console.file.getvalue()) == found  # type: ignore[attr-defined]
 
 
 def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Path) -> None:

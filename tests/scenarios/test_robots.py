@@ -43,6 +43,7 @@ from cosim.spec.scenario import Suite, content_hash
 from physics.cameras.view import robot_shot
 from physics.robots import robot_hash, urdf_path
 from physics.street.street_surface import StreetSurface
+from scenarios.episodes.replay import load_recorded, replay_mismatch
 from scenarios.places.nets import place
 from scenarios.runs.planning import run_spec
 from scenarios.runs.run import run
@@ -315,6 +316,18 @@ def test_an_edited_robot_is_another_one(barrow: Robot, tmp_path: Path) -> None:
     )
     Path(again.urdf).write_bytes(urdf_path(barrow).read_bytes() + b"<!-- heavier -->")
     assert robot_hash(again) != as_it_was
+
+
+def test_a_replay_that_differs_names_an_edited_robot(barrow: Robot, tmp_path: Path) -> None:
+    """With the hash of the run, and the hash of its row and files now."""
+    folder = run_of(tmp_path / "run", ["goal"], robot=barrow.name)
+    episode = load_recorded(folder, "s-000")
+    for recorded, why in (
+        (episode.robot_hash, f"robot 'barrow' with hash h, and .* have hash {robot_hash(barrow)}"),
+        (robot_hash(barrow), "(other|same) versions: "),
+    ):
+        error = replay_mismatch(folder, episode._replace(robot_hash=recorded), "from 1 s on")
+        assert re.search(why, str(error))
 
 
 def test_a_robot_that_is_not_there_is_refused_with_those_that_are(

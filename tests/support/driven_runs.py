@@ -145,17 +145,22 @@ def run_of(
     policy: str = "p",
     scenarios: Sequence[Scenario] = (),
     robot: str = "",
+    gait: str = "",
 ) -> Path:
     """A finished run of one short way after the other, each as `episode_of` says; s-000, s-001 and
-    so on. robot: applied to the scenarios, as by `--robot`"""
+    so on. robot: applied to the scenarios, as by `--robot`; gait: as by `--gait`"""
     ways = tuple(scenarios) or tuple(short_way(f"s-{i:03d}") for i in range(len(hows)))
     suite = Suite(name=ways[0].suite, version="1", scenarios=ways)
     of_run = with_robot(suite, robot)
     robots = {way.robot: "h" for way in of_run.scenarios}
     spec = msgspec.structs.replace(spec_of(suite, policy), robots=robots)
+    of_gait = {"gait": gait, "gait_hash": "0123456789abcdef" if gait else ""}
+    spec = msgspec.structs.replace(spec, setup=msgspec.structs.replace(spec.setup, **of_gait))
     with RunFolder.create(path, spec, of_run) as folder:
         for way, how in zip(of_run.scenarios, hows, strict=True):
             record, log = episode_of(way, suite.content_hash, how, policy)
+            setup = msgspec.structs.replace(record.setup, **of_gait)
+            record = msgspec.structs.replace(record, setup=setup)
             folder.keep(record, log.encoded() if log is not None else b"")
         folder.finish()
     return path

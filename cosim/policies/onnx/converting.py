@@ -112,6 +112,9 @@ def graph_of_bundle(folder: Path) -> NetworkFile:
 class Converter:
     """Command `python -m MODULE FILE [-o FOLDER]` that writes the graph of a network.
 
+    Without a folder it writes into $COSIM_WEIGHTS or, if that is not set, into the user's data
+    folder.
+
     weights: Published file.
     make: Converts the file's bytes to the graph's bytes.
     graph: Returns the graph's file; its facts are None if any version may be written.
@@ -173,7 +176,7 @@ class Converter:
             "--output",
             type=Path,
             metavar="FOLDER",
-            default=weight_folders()[-1],
+            default=weight_folders()[0],
             help="where to write the graph; %(default)s by default",
         )
         given = parser.parse_args(arguments)

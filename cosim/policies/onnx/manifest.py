@@ -66,6 +66,10 @@ def file_name_fault(name: str) -> str:
     )
 
 
+_HASHES: Final = {"blake2b": "BLAKE2b", "sha256": "SHA-256"}
+"""Hashes of `FileFacts` in words."""
+
+
 class FileFacts(Ranged, frozen=True, kw_only=True):
     """Size of a file and hexadecimal hashes: BLAKE2b of 32 bytes, SHA-256, or both."""
 
@@ -85,17 +89,19 @@ class FileFacts(Ranged, frozen=True, kw_only=True):
         """Hashes by name; "" for a missing one."""
         return {"blake2b": self.blake2b, "sha256": self.sha256}
 
-    def matches(self, found: FileFacts) -> bool:
-        """Return whether a file's size and each hash given here are those found."""
-        return self.bytes == found.bytes and all(
-            digits in ("", found.hashes[name]) for name, digits in self.hashes.items()
-        )
+    def differences(self, found: FileFacts) -> list[str]:
+        """Return which of size and hashes given here differ from those found, in words."""
+        size = [] if self.bytes == found.bytes else ["size"]
+        return size + [
+            _HASHES[name]
+            for name, digits in self.hashes.items()
+            if digits not in ("", found.hashes[name])
+        ]
 
     @property
     def in_words(self) -> str:
         """Size and hashes as text for error messages."""
-        hashes = {"BLAKE2b": self.blake2b, "SHA-256": self.sha256}
-        known = (f"{name} {digits}" for name, digits in hashes.items() if digits)
+        known = (f"{_HASHES[name]} {digits}" for name, digits in self.hashes.items() if digits)
         return ", ".join([f"{self.bytes} bytes", *known])
 
 

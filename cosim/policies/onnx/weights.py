@@ -54,10 +54,11 @@ class NetworkFile:
         if self.facts is None:
             return
         found = file_facts(data)
-        if not self.facts.matches(found):
+        if differences := self.facts.differences(found):
             of = f" of {self.source}" if self.source else ""
             raise UsageError(
-                f"{path}: {found.in_words}; expected {self.name}{of}: {self.facts.in_words}"
+                f"{path}: {found.in_words}; expected {self.name}{of}: {self.facts.in_words}. "
+                f"Different: {', '.join(differences)}"
             )
 
 

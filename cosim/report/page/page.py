@@ -22,6 +22,7 @@ from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import BlindRows, summary_table, tables_of, warnings_of
 from cosim.results.discerned import is_decoy
 from cosim.results.log import holds_waypoints
+from cosim.results.run_setup import gait_in_words
 from cosim.results.table import injections_in_words, policy_in_words
 from cosim.results.throughput import median_answer_ms
 
@@ -231,6 +232,9 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         if has_waypoints
         else "none: it answers with commands",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
+        "gait": gait_in_words(spec.setup.gait, spec.setup.gait_hash)
+        if spec.setup.gait
+        else "the robot's own",
         "seed of the run": str(spec.setup.seed),
         "injected": injections_in_words(run.table) or "nobody",
         "wall time": wall,

@@ -26,6 +26,7 @@ from cosim.results.discerned import (
     with_discerned,
 )
 from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
+from cosim.results.run_setup import gait_in_words
 from cosim.results.table import ORACLE, crashed_in, estimate_of, why_inconclusive
 from cosim.spec.robot import COURIER
 from cosim.spec.schedule import BEST_BLIND
@@ -327,9 +328,9 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 
 def _notes(table: pd.DataFrame) -> str:
-    """Return the notes of a row: episodes, sensor track, pairs, robots, crashes, odd cameras.
+    """Return the notes of a row: episodes, sensor track, pairs, robots, gaits, crashes, odd cameras.
 
-    The default robot is not named.
+    The default robot and a robot's own gait are not named.
     """
     episodes = int((~is_decoy(table)).sum())
     notes = [f"{episodes} episode{'s' * (episodes != 1)}"]
@@ -337,6 +338,8 @@ def _notes(table: pd.DataFrame) -> str:
     notes.append(track_of(table))
     notes += [pairs_of(table).in_words] * has_decoys(table)
     notes += [f"robot {name}" for name in sorted({*table["robot"]} - {COURIER.name})]
+    gaits = table[["gait", "gait_hash"]].drop_duplicates().itertuples(index=False)
+    notes += [gait_in_words(*gait) for gait in gaits if gait[0]]
     if crashed := crashed_in(table):
         notes.append(f"{crashed} crashed")
     notes += ["crowd added"] * bool(table["crowd_added"].any())

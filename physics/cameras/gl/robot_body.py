@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as xml
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from cosim.core.errors import EngineError, SpecError
-from cosim.core.geometry import Floats
-from physics.ground.mesh import Mesh, Part, box, frustum, join
+from physics.ground.mesh import Mesh, Part
 from physics.robots.kinematics import link_tree, origin_of
+from physics.robots.shapes import shape_of
 
 _GREY = (0.6, 0.6, 0.6)
 
@@ -19,7 +19,7 @@ _GREY = (0.6, 0.6, 0.6)
 def robot_parts(urdf: Path) -> tuple[Part, ...]:
     """Return the visible parts of a robot in its base link's frame, with joints at zero.
 
-    Raises EngineError for an unknown shape.
+    Raises SpecError for an unknown shape.
     """
     places = link_tree(urdf).places({})
     parts = []
@@ -35,7 +35,7 @@ def robot_parts(urdf: Path) -> tuple[Part, ...]:
 def link_parts(urdf: Path) -> dict[str, tuple[Part, ...]]:
     """Return the visible parts of each link in its own frame.
 
-    Raises EngineError for an unknown shape.
+    Raises SpecError for an unknown shape.
     """
     root = xml.parse(urdf).getroot()
     colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
@@ -44,70 +44,23 @@ def link_parts(urdf: Path) -> dict[str, tuple[Part, ...]]:
         parts = []
         for visual in link.findall("visual"):
             turn, shift = map(np.array, origin_of(visual))
-            mesh = _shape(visual, urdf)
-            material = visual.find("material")
-            name = material.get("name", "") if material is not None else ""
+            mesh = shape_of(visual, urdf)
             turned = Mesh(mesh.vertices @ turn.T + shift, mesh.normals @ turn.T, mesh.triangles)
-            parts.append(Part(turned, colours.get(name, _GREY)))
+            parts.append(Part(turned, _colour_of(visual, colours)))
         found[link.get("name", "")] = tuple(parts)
     return found
 
 
-def _shape(visual: xml.Element, urdf: Path) -> Mesh:
-    geometry = visual.find("geometry")
-    shape = next(iter(geometry), None) if geometry is not None else None
-    if shape is not None and shape.tag == "box":
-        return box([float(v) for v in shape.get("size", "").split()])
-    if shape is not None and shape.tag == "cylinder":
-        radius = float(shape.get("radius", ""))
-        half = 0.5 * float(shape.get("length", ""))
-        upper = frustum((radius, radius), (radius, radius), -half, half, sides=16)
-        flip = np.array([1.0, -1.0, -1.0])
-        return join([upper, Mesh(upper.vertices * flip, upper.normals * flip, upper.triangles)])
-    if shape is not None and shape.tag == "sphere":
-        return _ball(float(shape.get("radius", "")))
-    if shape is not None and shape.tag == "mesh":
-        scale = np.array([float(v) for v in shape.get("scale", "1 1 1").split()])
-        return _mesh_of_file(urdf.parent / shape.get("filename", ""), scale)
-    what = "nothing" if shape is None else f"a {shape.tag}"
-    raise EngineError(
-        f"{urdf}: a visual shows {what}; the gl camera draws boxes, cylinders, spheres and meshes"
-    )
-
-
-def _ball(radius_m: float, rings: int = 8, sides: int = 12) -> Mesh:
-    """Return a sphere around the origin."""
-    up = np.linspace(-0.5 * np.pi, 0.5 * np.pi, rings + 1)[:, None]
-    round_ = np.linspace(0.0, 2.0 * np.pi, sides + 1)[None]
-    normals = np.stack(
-        np.broadcast_arrays(np.cos(up) * np.cos(round_), np.cos(up) * np.sin(round_), np.sin(up)),
-        axis=-1,
-    ).reshape(-1, 3)
-    first = (np.arange(rings)[:, None] * (sides + 1) + np.arange(sides)[None]).ravel()
-    above = first + sides + 1
-    triangles = np.concatenate(
-        [np.column_stack([first, first + 1, above + 1]), np.column_stack([first, above + 1, above])]
-    ).astype(np.int32)
-    return Mesh(radius_m * normals, normals, triangles)
-
-
-def _mesh_of_file(path: Path, scale: Floats) -> Mesh:
-    """Load all triangles of a file that trimesh reads, flat shaded.
-
-    Raises SpecError naming the file.
-    """
-    import trimesh  # import takes 0.2 s, and most robots do not need it
-
-    try:
-        scene = trimesh.load_scene(path)
-    except (OSError, ValueError, KeyError, TypeError, IndexError, NotImplementedError) as error:
-        raise SpecError(f"{path}: cannot be read as a mesh: {error}") from error
-    if not any(len(getattr(shape, "faces", ())) for shape in scene.geometry.values()):
-        raise SpecError(f"{path}: there is no triangle in it")
-    mesh = scene.to_mesh().apply_scale(scale)
-    corners = mesh.triangles.reshape(-1, 3)
-    triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-    return Mesh(corners, np.repeat(mesh.face_normals, 3, axis=0), triangles)
+def _colour_of(
+    visual: xml.Element, named: Mapping[str, tuple[float, float, float]]
+) -> tuple[float, float, float]:
+    """Return the colour in a visual's material, else the one of its name under `robot`."""
+    material = visual.find("material")
+    if material is None:
+        return _GREY
+    if material.find("color") is not None:
+        return _colour(material)
+    return named.get(material.get("name", ""), _GREY)
 
 
 def _colour(material: xml.Element) -> tuple[float, float, float]:

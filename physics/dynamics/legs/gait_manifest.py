@@ -25,7 +25,15 @@ _SCALE = Within(-1000, 1000)
 _GAIN = Within(0, 2000)
 
 
-class ObservedTerm(Ranged, frozen=True, kw_only=True, tag_field="what"):
+class GaitPart(Ranged, frozen=True, kw_only=True):
+    """Part of a manifest; messages name its place in the file."""
+
+    @property
+    def called(self) -> str:
+        return ""
+
+
+class ObservedTerm(GaitPart, frozen=True, kw_only=True, tag_field="what"):
     """Part of a network's observation. scale: factor of its numbers."""
 
     scale: Annotated[float, _SCALE] = 1.0
@@ -98,7 +106,7 @@ Term = (
 )
 
 
-class GaitJoint(Ranged, frozen=True, kw_only=True):
+class GaitJoint(GaitPart, frozen=True, kw_only=True):
     """Joint of a gait: its target is rest_rad + scale * output.
 
     kp, kd: gains, Nm/rad and Nm s/rad.
@@ -113,7 +121,7 @@ class GaitJoint(Ranged, frozen=True, kw_only=True):
     stand_kd: Annotated[float, _GAIN] = 0.0
 
 
-class Correction(Ranged, frozen=True, kw_only=True):
+class Correction(GaitPart, frozen=True, kw_only=True):
     """Correction of a commanded speed. The network gets factor * speed plus an integral.
 
     gain_hz: integral gain of the difference between commanded and measured speed.
@@ -125,7 +133,7 @@ class Correction(Ranged, frozen=True, kw_only=True):
     most: Annotated[float, Within(0, 10, above=True)] = 10.0
 
 
-class AnkleBalance(Ranged, frozen=True, kw_only=True):
+class AnkleBalance(GaitPart, frozen=True, kw_only=True):
     """Standing of a biped on frozen joints (`physics.dynamics.legs.balance`).
 
     ankles: left and right pitch joint.
@@ -136,7 +144,7 @@ class AnkleBalance(Ranged, frozen=True, kw_only=True):
     sole_m: Annotated[float, Within(-0.2, 0.2)]
 
 
-class GaitManifest(Ranged, frozen=True, kw_only=True):
+class GaitManifest(GaitPart, frozen=True, kw_only=True):
     """Manifest of a gait.
 
     robot: robot that it moves.
@@ -172,10 +180,6 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
     balance: AnkleBalance | None = None
 
     @property
-    def called(self) -> str:
-        return ""
-
-    @property
     def sizes(self) -> tuple[int, int]:
         """Numbers of inputs and outputs of the network."""
         return sum(term.count(len(self.joints)) for term in self.observation), len(self.joints)
@@ -200,8 +204,8 @@ class GaitManifest(Ranged, frozen=True, kw_only=True):
             raise SpecError(f"is a gait of robot '{self.robot}', not of '{robot.name}'")
         if unknown := [name for name in self.joints if name not in legs.joints]:
             raise SpecError(
-                f"joints has {unknown[0]!r}{nearest(unknown[0], legs.joints)}, which robot "
-                f"'{robot.name}' lacks; its joints are {', '.join(legs.joints)}"
+                f"joints has {unknown[0]!r}, which robot '{robot.name}' lacks; its joints are "
+                f"{', '.join(legs.joints)}.{nearest(unknown[0], legs.joints)}"
             )
         if missing := [name for name in legs.joints if name not in self.joints]:
             raise SpecError(f"joints lacks {', '.join(missing)} of robot '{robot.name}'")

@@ -66,7 +66,8 @@ WALKER_NETWORK: Final = Converter(
     "physics.dynamics.legs.walker",
     NetworkFile(
         "motion.pt",
-        "unitreerobotics/unitree_rl_gym, commit 276801e4, deploy/pre_train/g1 (BSD-3-Clause)",
+        "https://github.com/unitreerobotics/unitree_rl_gym/raw/"
+        "276801e46c5d433564f24658bac64f254b7d2d4b/deploy/pre_train/g1/motion.pt (BSD-3-Clause)",
         FileFacts(
             bytes=145745,
             blake2b="30e7ee957aeff4191286b3c9d1a3452608b9492d8fb7c59609bef8a9b77a1d49",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -16,6 +16,7 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose, wrap_angle
 from cosim.core.progress import Progress
 from cosim.core.state import STILL, Command, Motion, RobotState, Street
+from cosim.core.units import duration
 from cosim.results.referee import FALL_S
 from cosim.spec.robot import COURIER, Robot
 from physics.dynamics.drive import Drive
@@ -260,16 +261,30 @@ class LegFigure(NamedTuple):
     target: str = ""
 
 
+MakeDrive = Callable[[], Drive | None]
+"""Maker of the drive of a walk; None is the robot's own."""
+
+
+def own_drive() -> None:
+    """Choose the robot's own drive."""
+
+
 CURB_PHASES: Final = 20
 """Phases of the gait in which a curb is walked down."""
 
 
-def measure(robot: Robot, minutes: float, progress: Progress) -> list[LegFigure]:
-    """Measure a robot with legs. minutes: simulated time of random commands in all."""
+def measure(
+    robot: Robot, minutes: float, progress: Progress, drive: MakeDrive = own_drive
+) -> list[LegFigure]:
+    """Measure a robot with legs.
+
+    minutes: simulated time of random commands in all, a third of it on each ground
+    drive: makes the drive of each walk
+    """
     start = Pose(-40.0, 0.0, 0.0)
     v_mps = 5 / 6 * robot.cruise_mps
     rows = []
-    with walking(robot, FLAT, start) as walk:
+    with walking(robot, FLAT, start, drive()) as walk:
         found = straight(walk, v_mps)
     rows.append(
         LegFigure(
@@ -278,34 +293,35 @@ def measure(robot: Robot, minutes: float, progress: Progress) -> list[LegFigure]
             "off by less than 0.3 m, no fall",
         )
     )
-    rows += [_steady(robot, start, v, 0.0, "") for v in (0.5, v_mps, robot.v_max_mps)]
+    rows += [_steady(robot, start, v, 0.0, "", drive()) for v in (0.5, v_mps, robot.v_max_mps)]
     rows += [
-        _steady(robot, start, v, robot.w_max_radps, "yaw rate within 15 %") for v in (v_mps, 0.0)
+        _steady(robot, start, v, robot.w_max_radps, "yaw rate within 15 %", drive())
+        for v in (v_mps, 0.0)
     ]
-    with walking(robot, FLAT, start) as walk:
+    with walking(robot, FLAT, start, drive()) as walk:
         stop_s, way_m = stop(walk, v_mps)
     rows.append(LegFigure("stop", f"{stop_s:.2f} s, {way_m:.2f} m", "0.5 m"))
-    with walking(robot, FLAT, start) as walk:
+    with walking(robot, FLAT, start, drive()) as walk:
         drift_m, turned_deg = stand(walk, 60.0)
     drift = f"{100 * drift_m:.1f} cm, {turned_deg:.1f} deg"
     rows.append(LegFigure("standing for 60 s", drift, "5 cm, 3 deg"))
-    rows += _curbs(robot, v_mps)
+    rows += _curbs(robot, v_mps, drive)
     for number, (name, course) in enumerate(
         (("level ground", FLAT), ("ramps of 1:12", RAMPS), ("steps of 3 cm", STEPS))
     ):
         progress(f"random commands on {name}", number / 3)
-        with walking(robot, course, start) as walk:
+        with walking(robot, course, start, drive()) as walk:
             wandered = wander(walk, robot, minutes / 3, number)
         rows.append(
             LegFigure(
-                f"{minutes / 3:g} min of random commands, {name}",
+                f"{duration(20.0 * minutes)} of random commands, {name}",
                 f"{wandered.fallen} falls; errors {wandered.error_mps:.3f} m/s, "
                 f"{wandered.error_radps:.3f} rad/s; sway {wandered.sway_mps:.3f} m/s, "
                 f"{wandered.sway_radps:.3f} rad/s; pitch {wandered.jitter_deg:.1f} deg",
                 "1 fall in an hour; 0.1 m/s, 0.1 rad/s",
             )
         )
-    own, courier = (cpu_ms_per_s(one) for one in (robot, COURIER))
+    own, courier = cpu_ms_per_s(robot, drive()), cpu_ms_per_s(COURIER)
     rows.append(
         LegFigure(
             "physics, CPU ms per simulated s",
@@ -316,33 +332,35 @@ def measure(robot: Robot, minutes: float, progress: Progress) -> list[LegFigure]
     return rows
 
 
-def _steady(robot: Robot, start: Pose, v_mps: float, w_radps: float, target: str) -> LegFigure:
+def _steady(
+    robot: Robot, start: Pose, v_mps: float, w_radps: float, target: str, drive: Drive | None
+) -> LegFigure:
     """Measure the mean speeds of a steady command."""
     command = Command(v_mps, w_radps)
-    with walking(robot, FLAT, start) as walk:
+    with walking(robot, FLAT, start, drive) as walk:
         walk.drive(command, 3.0)
         v, w = mean_speeds(walk.drive(command, 4.0))
     commanded = f"{v_mps:.2g} m/s, {w_radps:.2g} rad/s commanded"
     return LegFigure(commanded, f"{v:.2f} m/s, {w:.2f} rad/s", target)
 
 
-def _curbs(robot: Robot, v_mps: float) -> Iterator[LegFigure]:
+def _curbs(robot: Robot, v_mps: float, drive: MakeDrive) -> Iterator[LegFigure]:
     """Measure walks down and up curbs."""
     for v in (0.5, v_mps):
-        falls = sum(down_curb(robot, v, 0.6 + 0.011 * k) for k in range(CURB_PHASES))
+        falls = sum(down_curb(robot, v, 0.6 + 0.011 * k, drive()) for k in range(CURB_PHASES))
         target = "no fall" if v == 0.5 else ""
         name = f"down {100 * CURB_M:.0f} cm at {v:.2g} m/s, {CURB_PHASES} phases"
         yield LegFigure(name, f"{falls} falls", target)
         for height_m in (0.03, 0.06, CURB_M):
-            state, fallen = up_curb(robot, v, height_m)
+            state, fallen = up_curb(robot, v, height_m, drive())
             over = state.pose.x_m > 0.3
             said = "falls" if fallen else "climbs" if over else "does not climb"
             yield LegFigure(f"up {100 * height_m:.0f} cm at {v:.2g} m/s", said)
 
 
-def cpu_ms_per_s(robot: Robot, seconds: float = 20.0) -> float:
+def cpu_ms_per_s(robot: Robot, drive: Drive | None = None, seconds: float = 20.0) -> float:
     """Return the CPU time in ms of a simulated second of walking or driving at its pace."""
-    with walking(robot, FLAT, Pose(-40.0, 0.0, 0.0)) as walk:
+    with walking(robot, FLAT, Pose(-40.0, 0.0, 0.0), drive) as walk:
         walk.drive(Command(robot.cruise_mps, 0.2), 1.0)
         began = time.process_time()
         walk.drive(Command(robot.cruise_mps, 0.2), seconds)
