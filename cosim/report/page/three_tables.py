@@ -328,7 +328,7 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 
 def _notes(table: pd.DataFrame) -> str:
-    """Return the notes of a row: episodes, sensor track, pairs, robots, gaits, crashes, odd cameras.
+    """Return the notes of a row: episodes, sensor track, pairs, robots, gaits, crashes and so on.
 
     The default robot and a robot's own gait are not named.
     """
