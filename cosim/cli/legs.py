@@ -8,7 +8,6 @@ from cosim.cli import tables
 from cosim.cli.console import out
 from cosim.cli.progress import doing
 from cosim.core.errors import UsageError
-from cosim.results.run_setup import gait_in_words
 
 
 def bench_legs(name: str, minutes: float, gait: str) -> None:
@@ -17,6 +16,7 @@ def bench_legs(name: str, minutes: float, gait: str) -> None:
     minutes: simulated time of random commands
     gait: in place of the robot's own, onnx:FILE.onnx; "" for its own
     """
+    from cosim.results.run_setup import gait_in_words
     from cosim.spec.robot import ROBOTS, Legs, robot_called
     from physics.dynamics.drive import SUBSTEP_S
     from physics.dynamics.drives import gait_drive

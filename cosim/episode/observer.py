@@ -174,6 +174,8 @@ class Observer:
         self._odometer.moved(step.robot.pose, step.motion.robot.pose)
         if self._imu is not None:
             self._imu.moved(step.robot, step.motion.robot)
+        if self._tracker is not None:
+            self._tracker.moved(step.street)
         if put_back:
             self._goals.put_back()
             if self._tracker is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Sequence, Set
 from typing import Final
 
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
-from cosim.core.state import RobotState, Street, Trunk
+from cosim.core.state import People, RobotState, Street, Trunk
 from cosim.episode.interfaces import RangeSensor
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
@@ -27,6 +29,9 @@ from cosim.spec.sensors import (
 )
 
 _GRAVITY_MPS2: Final = 9.81
+_TICK_S: Final = Clock().tick_ms / 1000
+_VELOCITY_TICKS: Final = 8
+"""Ticks over which a tracked person's velocity is the mean displacement."""
 
 
 def sensing_range_m(manifest: Manifest) -> float:
@@ -54,6 +59,7 @@ class Lidar:
         )
         noise = spec.noise_m * self._draws.standard_normal(len(distances))
         ranges = np.maximum(distances + noise, 0.0).astype(np.float32)
+        ranges[ranges > np.float32(spec.range_m)] = np.inf
         return Scan(ranges.reshape(spec.rings, spec.rays), spec)
 
 
@@ -76,8 +82,13 @@ class Tracker:
         self._draws = draws
         self._noise = noise
         self._tracks: dict[str, tuple[int, float]] = {}
+        self._past: deque[People] = deque(maxlen=_VELOCITY_TICKS)
         self._time_s = 0.0
         self._next = 0
+
+    def moved(self, before: Street) -> None:
+        """Record the people before a tick, for velocities."""
+        self._past.append(before.people)
 
     def put_back(self) -> None:
         """Forget all tracks: the robot was put elsewhere."""
@@ -88,21 +99,22 @@ class Tracker:
         people, draws, noise = street.people, self._draws, self._noise
         rows = self._rays.seen_people(robot, street, self._eye_m, TRACKING_RANGE_M)
         seen = draws.random(len(rows)) >= noise.miss
+        before_s, self._time_s = self._time_s, time_s
         switch = draws.random(len(rows)) < -math.expm1(
-            -noise.switch_hz * max(time_s - self._time_s, 0.0)
+            -noise.switch_hz * max(time_s - before_s, 0.0)
         )
         errors = draws.standard_normal((4, len(rows)))
-        self._time_s = time_s
         cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
         x, y = people.xy[rows, 0] - robot.pose.x_m, people.xy[rows, 1] - robot.pose.y_m
-        turn, speed = people.heading[rows] - robot.pose.heading_rad, people.speed[rows]
+        east, north = self._velocities(people, rows)
         positions = np.stack([cos * x + sin * y, cos * y - sin * x])
         positions += noise.position_m * errors[:2]
-        velocities = np.stack([speed * np.cos(turn), speed * np.sin(turn)])
+        velocities = np.stack([cos * east + sin * north, cos * north - sin * east])
         velocities += noise.velocity_mps * errors[2:]
         far = np.hypot(*positions)
         order = np.argsort(far, kind="stable")
         order = order[seen[order]][:MOST_TRACKS]
+        self._keep({people.ids[i] for i in rows.tolist()}, time_s, before_s)
         names = [people.ids[i] for i in rows[order].tolist()]
         ids = self._ids(names, switch[order], positions.T[order], time_s)
         return Tracks(
@@ -111,12 +123,40 @@ class Tracker:
             velocities.T[order].astype(np.float32),
         )
 
+    def _velocities(self, people: People, rows: NDArray[np.intp]) -> Floats:
+        """Return (2, N) mean velocities in map axes since the oldest recorded tick with them."""
+        found = np.zeros((2, len(rows)))
+        missing: Sequence[int] = range(len(rows))
+        for ticks, past in zip(range(len(self._past), 0, -1), self._past, strict=True):
+            if not missing:
+                break
+            row_of = {name: row for row, name in enumerate(past.ids)}
+            left = []
+            for i in missing:
+                row = row_of.get(people.ids[rows[i]])
+                if row is None:
+                    left.append(i)
+                else:
+                    found[:, i] = (people.xy[rows[i]] - past.xy[row]) / (ticks * _TICK_S)
+            missing = left
+        return found
+
+    def _keep(self, visible: Set[str], time_s: float, before_s: float) -> None:
+        """Drop tracks of people that were out of sight for long; a missed person is in sight.
+
+        before_s: time of the last observation: people in sight then and now have not been away.
+        """
+        since_s = min(time_s - self._noise.forget_s, before_s)
+        self._tracks = {
+            name: (own, time_s if name in visible else seen_s)
+            for name, (own, seen_s) in self._tracks.items()
+            if seen_s >= since_s
+        }
+
     def _ids(
         self, names: list[str], switch: NDArray[np.bool_], positions: Floats, time_s: float
     ) -> NDArray[np.int32]:
         """Return the ids of people, nearest first, and record that they are tracked now."""
-        since_s = time_s - self._noise.forget_s
-        self._tracks = {k: track for k, track in self._tracks.items() if track[1] >= since_s}
         ids = [self._tracks[name][0] if name in self._tracks else self._new_id() for name in names]
         for i in np.flatnonzero(switch).tolist():
             off = np.hypot(*(positions - positions[i]).T)

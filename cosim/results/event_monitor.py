@@ -175,7 +175,7 @@ class EventMonitor:
             triggered_at_s=self._time_s(state.triggered_tick),
             trigger_distance_m=state.trigger_distance_m,
             seen=self._seen[i],
-            staged=self._can_begin[i] and (state.triggered_tick is None or self._came_near[i]),
+            staged=self._can_begin[i] if state.triggered_tick is None else self._came_near[i],
             rule_met=all(rules) if rules else None,
             passed_at_s=self._time_s(end),
             passing_mps=None if passing is None else passing.mean_mps,

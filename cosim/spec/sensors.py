@@ -25,7 +25,8 @@ PeopleKind = Literal["none", "seen"]
 
 SensorTrack = Literal["privileged", "people", "lidar", "picture", "blind"]
 """Sensor tracks, the strongest first. A policy is in the track of its strongest source of knowledge
-of the street; results of different tracks are not compared."""
+of the street. `compare` gives a verdict within a track, and on a blind and an unprivileged policy.
+"""
 
 IMU: Final[Mapping[str, str]] = MappingProxyType(
     {

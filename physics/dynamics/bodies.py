@@ -22,7 +22,6 @@ from physics.dynamics.movers import Mover, TickPoses
 from physics.ground.mesh import Mesh, join
 from physics.ground.tiles import CURB_M
 from physics.robots import urdf_path
-from physics.robots.check import check_robot
 from physics.robots.kinematics import rotate, rows_of
 from physics.street.buildings import Building, Wall
 from physics.street.furniture import Prop, solids_of
@@ -79,7 +78,6 @@ class Bodies(BulletClient):
     """
 
     def __init__(self, robot: Robot, substep_s: float) -> None:
-        check_robot(robot)
         super().__init__()
         self._com_height_m = robot.com_height_m
         self._legs = robot.drive if isinstance(robot.drive, Legs) else None

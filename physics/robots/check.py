@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import xml.etree.ElementTree as xml
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -35,8 +34,6 @@ _SPEED: Final = Within(0, 20, above=True)
 _RAMP: Final = Within(0, 100, above=True)
 _TORQUE_NM: Final = Within(0, 10_000, above=True)
 _GAIN: Final = Within(0, 10_000)
-_RGBA: Final = r"((\d+\.?\d*|\.\d+)(\s+|$)){4}"
-"""Four numbers."""
 _checked: Final[set[str]] = set()
 """Hashes of the robots that this process has found valid."""
 
@@ -102,7 +99,7 @@ def _row_faults(robot: Robot) -> Iterator[str]:
 
 
 def _mount_faults(mount: Mount) -> Iterator[str]:
-    if not max(map(abs, mount.at_m)) <= _FARTHEST_M:
+    if not all(abs(value) <= _FARTHEST_M for value in mount.at_m):
         yield f"at_m must be within {_FARTHEST_M:g} m of the base, not {mount.at_m}"
     low, high = mount.fov_deg
     if not 0.0 < low <= high < 180.0:
@@ -215,8 +212,16 @@ def _visual_faults(root: xml.Element, path: Path) -> Iterator[str]:
             yield f"visual mesh '{name}' does not exist beside it"
     for colour in root.iter("color"):
         rgba = colour.get("rgba", "")
-        if not re.fullmatch(_RGBA, rgba.strip()):
+        if not _is_rgba(rgba):
             yield f"rgba of a colour must be four numbers from 0 to 1, not '{rgba}'"
+
+
+def _is_rgba(text: str) -> bool:
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        return False
+    return len(values) == 4 and all(0.0 <= value <= 1.0 for value in values)
 
 
 def _base_faults(robot: Robot, root: xml.Element) -> Iterator[str]:

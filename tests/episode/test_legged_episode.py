@@ -80,7 +80,7 @@ def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_walks_on(
 ) -> None:
     """A push of 30 N s fells it; it is reset standing and walks within 2 s; the trajectory agrees
     with the record."""
-    told, record, log = walked(scenario, robot, 30.0)
+    told, record, log, *_ = walked(scenario, robot, 30.0)
     assert [failure.kind for failure in record.failures] == ["fall"]
     assert (record.measures["falls"], record.measures["failures"]) == (1.0, 1.0)
     (reset,) = np.flatnonzero(np.isfinite(log.reset_s_m)).tolist()

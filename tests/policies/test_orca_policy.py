@@ -15,6 +15,7 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, Doing, People, PersonKind, RobotState, Signal, Vehicles
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.episode.policy_caller import PolicyCaller
+from cosim.policies.body_disks import BodyDisks
 from cosim.policies.privileged.orca import (
     STOP_BEFORE_M,
     Orca,
@@ -25,7 +26,7 @@ from cosim.policies.privileged.orca import (
     vehicle_violation,
 )
 from cosim.policies.privileged.people_prediction import Yielding, gaps_to_people
-from cosim.policies.privileged.rollout import STEP_S, BodyDisks, Plans, SampledPath, roll_out
+from cosim.policies.privileged.rollout import STEP_S, Plans, SampledPath, roll_out
 from cosim.policies.privileged.route import crossing_limit
 from cosim.policies.privileged.route_planner import DistanceField
 from cosim.policies.privileged.standing_groups import distances, groups, lines

@@ -119,7 +119,7 @@ def test_tables_name_a_gait_of_the_user(tmp_path: Path) -> None:
     words = "gait walk.onnx (01234567)"
     (own,) = read_runs([folder])
     (table,) = tables_of([own])
-    assert [row.notes for row in table.rows] == [f"1 episode, robot dog, {words}"]
+    assert [row.notes for row in table.rows] == [f"1 episode, blind, robot dog, {words}"]
     assert words in render_page([own], [], [], Maps([], {}, {}), "").decode().split("its source")[1]
     plain = run_of(tmp_path / "plain", ["goal"])
     notes = compare_runs([plain, folder]).notes

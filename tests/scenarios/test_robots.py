@@ -25,8 +25,9 @@ from cosim.episode.policy_caller import PolicyCaller
 from cosim.place.barriers import without_barriers
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
+from cosim.policies.body_disks import BodyDisks
 from cosim.policies.privileged.orca import PathState, best_lane_past
-from cosim.policies.privileged.rollout import BodyDisks, SampledPath
+from cosim.policies.privileged.rollout import SampledPath
 from cosim.policies.privileged.route import best_lane, crossing_limit
 from cosim.policies.privileged.route_planner import DistanceField
 from cosim.policies.privileged.social_force import contact_distance_m

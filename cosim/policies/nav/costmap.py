@@ -10,7 +10,6 @@ import math
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from cosim.core.geometry import Floats, Pose
 from cosim.policies.nav.tracking import NO_MOVERS, Movers
@@ -74,6 +73,8 @@ class Costmap:
         inside = (rows >= 0) & (rows < _CELLS) & (columns >= 0) & (columns < _CELLS)
         self._occupied[rows[inside], columns[inside]] = True
         if self._occupied.any():
+            from scipy.ndimage import distance_transform_edt  # loads SciPy, only where needed
+
             self._distance = np.minimum(CELL_M * distance_transform_edt(~self._occupied), FREE_M)
         else:
             self._distance = np.full((_CELLS, _CELLS), FREE_M)

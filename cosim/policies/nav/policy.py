@@ -116,6 +116,8 @@ class Nav:
     def _followed(self, path: Floats, movers: Movers, observation: Observation) -> Command:
         """Return the command along a path, past obstacles and after people."""
         robot, v_mps = observation.robot, observation.v_mps
+        if len(path) < 2:
+            return STILL  # no route in sight, or it ends here
         stood_s = observation.time_s - self._held_s
         margin_m = MARGIN_M if stood_s < PATIENCE_S else TIGHT_M
         plan = local_plan(

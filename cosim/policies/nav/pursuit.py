@@ -14,11 +14,11 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
+from cosim.policies.body_disks import BodyDisks
 from cosim.policies.nav.costmap import Costmap
 from cosim.policies.nav.local_plan import NEARER_M, LocalPlan
 from cosim.policies.nav.route_path import STEP_M
 from cosim.policies.nav.tracking import Movers
-from cosim.policies.privileged.rollout import BodyDisks
 from cosim.spec.robot import Robot
 
 LOOK_AHEAD_S: Final = 0.8

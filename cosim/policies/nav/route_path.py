@@ -52,6 +52,8 @@ def _along_patch(patch: RoutePatch, direction_rad: float) -> Floats:
         return np.zeros((1, 2))
     nearest = on_route[np.argmin((on_route * on_route).sum(axis=1))]
     beside = on_route[np.hypot(*(on_route - nearest).T) <= _BESIDE_M]
+    if len(beside) < 2:
+        return np.zeros((1, 2))
     at = beside.mean(axis=0)
     way = np.linalg.eigh(np.cov((beside - at).T))[1][:, -1]
     if way @ (math.cos(direction_rad), math.sin(direction_rad)) < 0.0:

@@ -30,6 +30,7 @@ from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
 from cosim.place.car_paths import STOP_SHORT_M
+from cosim.policies.body_disks import BodyDisks
 from cosim.policies.privileged.people_prediction import (
     Yielding,
     bodies,
@@ -40,7 +41,6 @@ from cosim.policies.privileged.rollout import (
     STEP_S,
     STEP_TIMES_S,
     STEPS,
-    BodyDisks,
     Plans,
     Rollout,
     SampledPath,

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People
 from cosim.episode.interfaces import Privileged
-from cosim.policies.privileged.rollout import STEP_TIMES_S, BodyDisks, Rollout
+from cosim.policies.body_disks import BodyDisks
+from cosim.policies.privileged.rollout import STEP_TIMES_S, Rollout
 from cosim.policies.privileged.standing_groups import distances, is_standing
 from cosim.spec.robot import Robot
 

@@ -17,7 +17,7 @@ from cosim.core.state import PERSON_RADIUS_M, Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.place.car_paths import STOP_SHORT_M
-from cosim.policies.privileged.rollout import BodyDisks
+from cosim.policies.body_disks import BodyDisks
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 

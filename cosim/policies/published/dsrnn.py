@@ -182,12 +182,21 @@ class Places:
         taken = []
         for track in wanted:
             at = [i for i, one in enumerate(self.held) if one is not None and one.track == track]
-            free = at or [i for i, one in enumerate(self.held) if one is None]
+            free = at or self._free(found)
             if not free:
                 continue
             taken += [] if at else free[:1]
             self.held[free[0]] = found[track]
         return taken
+
+    def _free(self, found: dict[int, Place]) -> list[int]:
+        """Return the places that are empty or of unseen people, longest unseen first."""
+        unseen_s = [
+            (-math.inf if one is None else one.seen_s, i)
+            for i, one in enumerate(self.held)
+            if one is None or one.track not in found
+        ]
+        return [i for _, i in sorted(unseen_s)]
 
     def relative(self, here: Floats, centre: Floats, now_s: float) -> Floats:
         """Return (5, 2) positions relative to the robot; unseen people are moved on."""

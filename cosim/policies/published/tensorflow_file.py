@@ -104,7 +104,8 @@ def _block(data: bytes, offset: int, size: int) -> Iterator[tuple[bytes, bytes]]
 def _entry(value: bytes) -> _Entry:
     fields = dict(_fields(value))
     shape = fields.get(_SHAPE, b"")
-    assert isinstance(shape, bytes), "a shape is a message"
+    if not isinstance(shape, bytes):
+        raise ValueError("is no index of a TensorFlow checkpoint: a shape is no message")
     sides = tuple(
         int(dict(_fields(side)).get(1, 0))
         for number, side in _fields(shape)
