@@ -99,12 +99,16 @@ class Manifest:
 
     @property
     def track(self) -> SensorTrack:
-        """Sensor track: the strongest of the policy's sources of knowledge of the street."""
+        """Sensor track: the strongest of the policy's sources of knowledge of the street.
+
+        Labels are the simulator's own knowledge.
+        """
+        cameras = [one for one in (self.camera, *self.cameras.values()) if one is not None]
         sources: dict[SensorTrack, bool] = {
-            "privileged": self.privileged,
+            "privileged": self.privileged or any(one.labels for one in cameras),
             "people": self.people != "none",
             "lidar": self.scan is not None,
-            "picture": self.camera is not None,
+            "picture": len(cameras) > 0,
         }
         return next((track for track, given in sources.items() if given), "blind")
 

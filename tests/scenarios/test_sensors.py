@@ -92,16 +92,19 @@ def test_a_sensor_changes_no_reading_of_another() -> None:
         ({"camera": None}, "blind"),
         ({"camera": None, "imu": "exact"}, "blind"),
         ({}, "picture"),
+        ({"camera": None, "cameras": {"left": CameraSpec()}}, "picture"),
         ({"scan": ScanSpec()}, "lidar"),
         ({"camera": None, "scan": ScanSpec(), "people": "seen"}, "people"),
         ({"scan": ScanSpec(), "people": "seen", "privileged": True}, "privileged"),
+        ({"camera": CameraSpec(labels=True)}, "privileged"),
     ],
-    ids=["nothing", "inertial", "camera", "lidar", "people", "privileged"],
+    ids=["nothing", "inertial", "camera", "left camera", "lidar", "people", "privileged", "labels"],
 )
 def test_the_sensor_track_is_that_of_the_strongest_source(
     sensors: dict[str, object], track: str
 ) -> None:
-    """A camera beside a lidar is in the track of the lidar; an inertial sensor alone is blind."""
+    """A camera beside a lidar is in the track of the lidar; an inertial sensor alone is blind;
+    labels are privileged."""
     manifest = dataclasses.replace(Manifest("mine", camera=CameraSpec()), **sensors)  # type: ignore[arg-type]
     assert manifest.track == track
 
