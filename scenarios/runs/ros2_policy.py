@@ -61,6 +61,8 @@ _LOOK_S: Final = 0.25
 """Longest time in seconds between two looks at the nodes around."""
 _MOST_QUEUED: Final = 1024
 """Largest number of unread messages; older ones are dropped."""
+_elapsed_s: Final[dict[int, float]] = {}
+"""Time in seconds of all episodes of this process, by domain, for a monotonic /clock."""
 _EARLY_S: Final = 1.0
 """Time in seconds before the run's timeout at which the policy reports why it has no command."""
 
@@ -82,25 +84,22 @@ class Ros2Policy:
         self._remarks: dict[str, None] = {}
         self._controller: tuple[bytes, str] | None = None
         self._stream: encode.EpisodeStream | None = None
-        self._elapsed_s = 0.0
         self._last: tuple[Command, int] = STILL, 0
         self._heard_s = 0.0
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Wait for a node that publishes /cmd_vel, and announce the episode to it."""
         node = self._joined()
-        before = self._stream
-        if before is not None and self.settings.clock == "monotonic":
-            self._elapsed_s += Clock().time_s(before.tick + 1)
-        self._stream = encode.EpisodeStream(episode_id, seed, self._elapsed_s)
+        monotonic = self.settings.clock == "monotonic"
+        elapsed_s = _elapsed_s.get(self.settings.domain, 0.0) if monotonic else 0.0
+        self._stream = encode.EpisodeStream(episode_id, seed, elapsed_s)
         self._controller = None
         self._last = STILL, 0
         self.took_ms = []
         self._await_controller(node)
         for topic, sent in self._stream.begun():
             node.publish(topic, sent)
-        if before is not None:
-            time.sleep(SETTLE_S)
+        time.sleep(SETTLE_S)
         self._queue.clear()
         self._plan = None
         self._heard_s = time.monotonic()
@@ -111,6 +110,7 @@ class Ros2Policy:
         node, stream = self._joined(), self._stream
         assert stream is not None, "reset comes first"
         first = stream.tick < 0
+        _elapsed_s[self.settings.domain] = stream.elapsed_s + Clock().time_s(seen.tick + 1)
         self._refuse_another(self._queue)
         self._queue.clear()
         for topic, sent in stream.observed(seen, node.has_subscriber):
