@@ -143,6 +143,44 @@ def test_rate_holds_a_command_for_half_a_second(at: str) -> None:
         assert speeds == [1.0, 1.0, 1.0, 0.0]
 
 
+def test_rate_takes_the_newest_command(at: str) -> None:
+    """Of a burst, the last command drives; one that came before the observation is not lost."""
+
+    def once(peer: Peer, seen: Seen) -> None:
+        if len(peer.seen["/odom"]) == 1:
+            answers(peer, seen)
+
+    with driven(at, wait="rate") as driver, Peer(at, once) as peer:
+        driver.reset("k1", 7)
+        driver.act(seen_at(0))
+        queue = driver.policy._queue  # type: ignore[attr-defined]
+        for v_mps in (0.4, 0.5, 0.6):
+            peer.node.publish(CMD_VEL, twist(Command(v_mps, 0.0)))
+        wait_until(lambda: len(queue) == 3)
+        assert driver.act(seen_at(2)).v_mps == 0.6
+
+
+def test_rate_waits_for_a_first_command_and_notices_that_a_node_left(at: str) -> None:
+    """The first command has the start timeout; a node that left is named before the timeout."""
+
+    def slow(peer: Peer, seen: Seen) -> None:
+        if seen.time_ns == 10**9 + 6 * 10**8:
+            answers(peer, seen)
+
+    more = {"wait": "rate", "answer_s": 0.4, "start_s": 30.0}
+    with driven(at, **more) as driver, Peer(at, slow) as peer:
+        driver.reset("k1", 7)
+        assert [driver.act(seen_at(tick)).v_mps for tick in range(0, 14, 2)] == 6 * [0.0] + [1.0]
+        driver.policy.settings = msgspec.structs.replace(  # type: ignore[attr-defined]
+            driver.policy.settings,  # type: ignore[attr-defined]
+            answer_s=30.0,
+        )
+        peer.close()
+        with pytest.raises(PolicyError, match="is gone: /driver published /cmd_vel"):
+            for tick in range(14, 200, 2):
+                driver.act(seen_at(tick))
+
+
 @pytest.mark.parametrize(
     ("sends", "words"),
     [
