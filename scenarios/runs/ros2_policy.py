@@ -36,7 +36,7 @@ from bridge.ros2.commands import (
 from bridge.ros2.encode import TOPICS
 from bridge.ros2.node import Network, Ros2Node
 from bridge.ros2.types import message_store
-from bridge.ros2.wire import Endpoint, full_topic, type_hash
+from bridge.ros2.wire import Endpoint, full_topic, gid_of, type_hash
 from bridge.session import Session, open_session
 from cosim.core.clock import Clock
 from cosim.core.errors import EngineError, MachineError, PolicyError, UsageError
@@ -139,15 +139,20 @@ class Ros2Policy:
         """Return the node, which joins the network at the first call."""
         if self._node is None:
             settings = self.settings
-            self._session = open_session(settings.connection)
+            session = open_session(settings.connection)
             network = Network(
                 settings.domain, settings.namespace, settings.distro, settings.dialect
             )
-            self._node = node = Ros2Node(self._session, network)
-            for topic in TOPICS.values():
-                node.advertise(topic.name, topic.type, topic.qos)
-            node.subscribe(CMD_VEL, COMMAND_TYPES, self._take_command)
-            node.subscribe(PLAN, (PATH,), self._take_plan)
+            try:
+                node = Ros2Node(session, network)
+                for topic in TOPICS.values():
+                    node.advertise(topic.name, topic.type, topic.qos)
+                node.subscribe(CMD_VEL, COMMAND_TYPES, self._take_command)
+                node.subscribe(PLAN, (PATH,), self._take_plan)
+            except BaseException:
+                session.close()
+                raise
+            self._session, self._node = session, node
         return self._node
 
     def _take_command(self, got: Received) -> None:
@@ -361,6 +366,7 @@ def ros2_driver(name: str, host: PolicyHost, timer: Timer | None = None) -> Ros2
             "Python PolicyHost(ros2=Ros2Settings(...))"
         )
     message_store()
+    gid_of("")  # raises without xxhash
     called = name.removeprefix(ROS2_SCHEME) or "ros2"
     policy = Ros2Policy(called, host.ros2)
     checked_manifest(name, _builtins(policy))

@@ -337,6 +337,7 @@ def test_settings_are_checked_before_anything_opens() -> None:
             "ros2_listen": "tcp/127.0.0.1:7448",
         },
         "the last is 232": {"ros2_domain": 232, "jobs": 2},
+        "it has one name": {"ros2_dialect": "ros2dds", "ros2_namespace": "/a/b"},
         "has no domains": {"ros2_dialect": "ros2dds", "jobs": 2},
         "write it as 512x288": {"ros2_camera": "big"},
         "write it as 360, 360@20": {"ros2_scan": "0"},
