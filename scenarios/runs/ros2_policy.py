@@ -328,7 +328,11 @@ class Ros2Policy:
             names = ", ".join(sorted({end.in_words for end in others})[:8])
             return f"none of the nodes {names} publishes {here} in domain {settings.domain}"
         answered = "no command came with the stamp of the observation"
-        return answered if settings.wait == "stamped" else f"no message came on {here}"
+        return (
+            answered
+            if settings.wait == "stamped"
+            else f"no message of at most {LARGEST_B} bytes came on {here}"
+        )
 
 
 class Ros2Driver(PolicyCaller):
