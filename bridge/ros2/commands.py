@@ -20,6 +20,8 @@ TWIST, TWIST_STAMPED = COMMAND_TYPES = TAKEN[CMD_VEL]
 (PATH,) = TAKEN[PLAN]
 _TWIST_B: Final = 52
 """Size of a Twist in bytes, by which it is known where keys do not name the type."""
+_WALL_NS: Final = 10**18
+"""Stamps above are of a wall clock, in nanoseconds."""
 _MOST_POINTS: Final = 32
 """Largest number of points of a plan that are recorded."""
 _FRAMES: Final = ("", "map", "odom")
@@ -72,6 +74,10 @@ def judged(
             "both must be finite numbers"
         )
     stamp_ns = 0 if name == TWIST else ns_of(sent.header.stamp)
+    if tick_ns < stamp_ns <= _WALL_NS:
+        return Judged(
+            fault=f"{got.by} stamps {CMD_VEL} ahead of /clock: give it the time of the observation"
+        )
     if stamp_ns > tick_ns:
         return Judged(
             fault=f"{got.by} stamps {CMD_VEL} {stamp_ns / 1e9:.2f} s, and /clock is at "

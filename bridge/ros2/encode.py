@@ -457,13 +457,13 @@ class EpisodeStream:
 
     def __init__(self, episode: str, seed: int, elapsed_s: float = 0.0) -> None:
         self._episode = episode, seed
-        self._elapsed_s = elapsed_s
+        self.elapsed_s = elapsed_s
         self._sent = SentGoal()
         self.tick = -1
 
     def time_ns(self, tick: int) -> int:
         """Return the time of a tick in nanoseconds."""
-        return stamp_ns(tick, self._elapsed_s)
+        return stamp_ns(tick, self.elapsed_s)
 
     def begun(self) -> Iterator[tuple[str, Any]]:
         """Yield topic and message of the start."""

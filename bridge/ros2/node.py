@@ -174,6 +174,7 @@ class Ros2Node:
                 self._by_gid[gid_of(token)] = end
             else:
                 self._others.pop(token, None)
+                self._by_gid.pop(gid_of(token), None)
             if self._in_network(end):
                 self.tokens_changed_s = time.monotonic()
             self.changed.notify_all()

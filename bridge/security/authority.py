@@ -128,9 +128,17 @@ def _issue(
         _write(made / CERTIFICATE, builder.sign(signing_key, SHA256()).public_bytes(Encoding.PEM))
         _write(made / KEY, _pem(key))
         if role == "ros2":
-            reached = identity_in(folder / "coordinator").hosts
-            config = _ros2_session_config(folder / role, (*reached, "HOST")[0])
+            config = _ros2_session_config(folder / role, _host_of_runs(folder))
             _write(made / ROS2_CONFIG, config.encode())
+
+
+def _host_of_runs(folder: Path) -> str:
+    """Return the coordinator's first host for an endpoint, "HOST" if it is unknown."""
+    try:
+        host = (*identity_in(folder / "coordinator").hosts, "HOST")[0]
+    except AccessError:
+        return "HOST"
+    return f"[{host}]" if ":" in host else host
 
 
 def _ros2_session_config(folder: Path, host: str) -> str:
@@ -147,6 +155,7 @@ def _ros2_session_config(folder: Path, host: str) -> str:
   mode: "client",
   connect: {{ endpoints: ["tls/{host}:7447"], timeout_ms: -1 }},
   scouting: {{ multicast: {{ enabled: false }} }},
+  timestamping: {{ enabled: true }},
   transport: {{
     link: {{
       tls: {{

@@ -131,6 +131,10 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True):
                 f"--ros2-namespace '{self.namespace}': use / and names of letters, digits and _, "
                 f"like /robot1"
             )
+        if self.dialect == "ros2dds" and len(parts) > 1:
+            raise UsageError(
+                f"--ros2-namespace '{self.namespace}': with --ros2-dialect ros2dds it has one name"
+            )
 
     def manifest(self, name: str) -> Manifest:
         """Return the manifest of the policy: the sensors that are published."""

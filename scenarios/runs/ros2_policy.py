@@ -5,7 +5,8 @@ answers an observation:
 
 next        the first one that arrives after the observation was sent
 stamped     the first TwistStamped with the stamp of the observation
-rate        at most one for each observation; without one the last command holds for a while
+rate        the newest one, at most one for each observation; without one the last command holds
+            for a while
 
 A message that is not understood is reported once and never drives the robot.
 """
@@ -33,9 +34,9 @@ from bridge.ros2.commands import (
     plan_in_robot_frame,
 )
 from bridge.ros2.encode import TOPICS
-from bridge.ros2.node import NAME, Network, Ros2Node
+from bridge.ros2.node import Network, Ros2Node
 from bridge.ros2.types import message_store
-from bridge.ros2.wire import Endpoint, full_topic, type_hash
+from bridge.ros2.wire import Endpoint, full_topic, gid_of, type_hash
 from bridge.session import Session, open_session
 from cosim.core.clock import Clock
 from cosim.core.errors import EngineError, MachineError, PolicyError, UsageError
@@ -49,6 +50,8 @@ from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, ROS2_SCHEME, Ros2Settings
 
 JOINED_S: Final = 1.0
 """Time without new publishers and subscriptions after which all nodes count as started."""
+SETTLED_S: Final = 10.0
+"""Time in seconds after which nodes count as started even if publishers still come and go."""
 SETTLE_S: Final = 0.3
 """Time in seconds for nodes to notice that /clock was set back."""
 GONE_S: Final = 3.0
@@ -60,7 +63,9 @@ _SILENT_PERIODS: Final = 2.0
 _LOOK_S: Final = 0.25
 """Longest time in seconds between two looks at the nodes around."""
 _MOST_QUEUED: Final = 1024
-"""Largest number of unread messages; older ones are dropped."""
+"""Largest number of unread messages. Further ones are dropped, with the rule `rate` the oldest."""
+_elapsed_s: Final[dict[int, float]] = {}
+"""Time in seconds of all episodes of this process, by domain, for a monotonic /clock."""
 _EARLY_S: Final = 1.0
 """Time in seconds before the run's timeout at which the policy reports why it has no command."""
 
@@ -78,32 +83,29 @@ class Ros2Policy:
         self._session: Session | None = None
         self._node: Ros2Node | None = None
         self._queue: deque[Received] = deque(maxlen=_MOST_QUEUED)
+        self._absent_s: float | None = None
         self._plan: Received | None = None
         self._remarks: dict[str, None] = {}
         self._controller: tuple[bytes, str] | None = None
         self._stream: encode.EpisodeStream | None = None
-        self._elapsed_s = 0.0
-        self._last: tuple[Command, int] = STILL, 0
-        self._heard_s = 0.0
+        self._last: tuple[Command, int] | None = None
+        self._waits_s = 0.0
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Wait for a node that publishes /cmd_vel, and announce the episode to it."""
         node = self._joined()
-        before = self._stream
-        if before is not None and self.settings.clock == "monotonic":
-            self._elapsed_s += Clock().time_s(before.tick + 1)
-        self._stream = encode.EpisodeStream(episode_id, seed, self._elapsed_s)
+        monotonic = self.settings.clock == "monotonic"
+        elapsed_s = _elapsed_s.get(self.settings.domain, 0.0) if monotonic else 0.0
+        self._stream = encode.EpisodeStream(episode_id, seed, elapsed_s)
         self._controller = None
-        self._last = STILL, 0
+        self._last = self._absent_s = None
         self.took_ms = []
         self._await_controller(node)
         for topic, sent in self._stream.begun():
             node.publish(topic, sent)
-        if before is not None:
-            time.sleep(SETTLE_S)
+        time.sleep(SETTLE_S)
         self._queue.clear()
         self._plan = None
-        self._heard_s = time.monotonic()
 
     def act(self, seen: Observation) -> Command:
         """Publish an observation and return the command that answers it."""
@@ -111,11 +113,15 @@ class Ros2Policy:
         node, stream = self._joined(), self._stream
         assert stream is not None, "reset comes first"
         first = stream.tick < 0
-        self._refuse_another(self._queue)
-        self._queue.clear()
+        _elapsed_s[self.settings.domain] = stream.elapsed_s + Clock().time_s(seen.tick + 1)
+        if self.settings.wait != "rate":
+            self._refuse_another(self._queue)
+            self._queue.clear()
         for topic, sent in stream.observed(seen, node.has_subscriber):
             node.publish(topic, sent)
         now_ns = stream.time_ns(seen.tick)
+        if first:
+            self._waits_s = time.monotonic()
         if self.settings.wait == "rate":
             command = self._held(node, seen.tick, now_ns)
         else:
@@ -133,16 +139,25 @@ class Ros2Policy:
         """Return the node, which joins the network at the first call."""
         if self._node is None:
             settings = self.settings
-            self._session = open_session(settings.connection)
+            session = open_session(settings.connection)
             network = Network(
                 settings.domain, settings.namespace, settings.distro, settings.dialect
             )
-            self._node = node = Ros2Node(self._session, network)
-            for topic in TOPICS.values():
-                node.advertise(topic.name, topic.type, topic.qos)
-            node.subscribe(CMD_VEL, COMMAND_TYPES, self._queue.append)
-            node.subscribe(PLAN, (PATH,), self._take_plan)
+            try:
+                node = Ros2Node(session, network)
+                for topic in TOPICS.values():
+                    node.advertise(topic.name, topic.type, topic.qos)
+                node.subscribe(CMD_VEL, COMMAND_TYPES, self._take_command)
+                node.subscribe(PLAN, (PATH,), self._take_plan)
+            except BaseException:
+                session.close()
+                raise
+            self._session, self._node = session, node
         return self._node
+
+    def _take_command(self, got: Received) -> None:
+        if self.settings.wait == "rate" or len(self._queue) < _MOST_QUEUED:
+            self._queue.append(got)
 
     def _take_plan(self, got: Received) -> None:
         self._plan = got
@@ -151,37 +166,49 @@ class Ros2Policy:
         """Wait for the command that answers the observation. Raises PolicyFault without one."""
         began_s = time.monotonic()
         allowed_s = self._allowed_s(first)
-        seen_s = began_s
         while True:
-            now_s = time.monotonic()
-            if (left_s := began_s + allowed_s - now_s) <= 0.0:
+            if (left_s := began_s + allowed_s - time.monotonic()) <= 0.0:
                 raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
             node.wait_for(lambda: self._queue, min(left_s, _LOOK_S))
             while self._queue:
                 if (command := self._accepted(self._queue.popleft(), now_ns)) is not None:
                     return command
-            if node.publishers_of(CMD_VEL):
-                seen_s = now_s
-            elif now_s - seen_s > GONE_S:
-                name = "the node" if self._controller is None else self._controller[1]
-                raise PolicyFault(f"is gone: {name} published {CMD_VEL}, and has left")
+            self._refuse_gone(node)
 
     def _held(self, node: Ros2Node, at_tick: int, now_ns: int) -> Command:
-        """Return a command if one comes within two periods, else the last one while it holds."""
-        now_s = time.monotonic()
-        until_s = now_s + _SILENT_PERIODS / self.settings.rate_hz
+        """Return the newest command if one comes within two periods, else the last one while it
+        holds. Raises PolicyFault."""
+        until_s = time.monotonic() + _SILENT_PERIODS / self.settings.rate_hz
         while (left_s := until_s - time.monotonic()) > 0.0:
             node.wait_for(lambda: self._queue, left_s)
-            while self._queue:
-                if (command := self._accepted(self._queue.popleft(), now_ns)) is not None:
-                    self._last = command, at_tick
-                    self._heard_s = time.monotonic()
-                    return command
-        allowed_s = self._allowed_s(False)
-        if time.monotonic() - self._heard_s > allowed_s:
+            if (command := self._newest(now_ns)) is not None:
+                self._last = command, at_tick
+                self._waits_s, self._absent_s = time.monotonic(), None
+                return command
+        self._refuse_gone(node)
+        allowed_s = self._allowed_s(self._last is None)
+        if time.monotonic() - self._waits_s > allowed_s:
             raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
-        command, tick = self._last
+        command, tick = self._last or (STILL, at_tick)
         return command if Clock().time_s(at_tick - tick) <= HOLD_S else STILL
+
+    def _newest(self, now_ns: int) -> Command | None:
+        """Take all messages that have come, and return the newest command."""
+        newest = None
+        for _ in range(len(self._queue)):
+            newest = self._accepted(self._queue.popleft(), now_ns) or newest
+        return newest
+
+    def _refuse_gone(self, node: Ros2Node) -> None:
+        """Raise PolicyFault if no node has published /cmd_vel for a while."""
+        now_s = time.monotonic()
+        if node.publishers_of(CMD_VEL):
+            self._absent_s = None
+        elif self._absent_s is None:
+            self._absent_s = now_s
+        elif now_s - self._absent_s > GONE_S:
+            name = "the node" if self._controller is None else self._controller[1]
+            raise PolicyFault(f"is gone: {name} published {CMD_VEL}, and has left")
 
     def _allowed_s(self, first: bool) -> float:
         """Return the timeout of an answer, before that of the run."""
@@ -236,12 +263,16 @@ class Ros2Policy:
             log_event("ros2 message refused", WARNING, why=words)
 
     def _await_controller(self, node: Ros2Node) -> None:
-        """Wait until a node publishes /cmd_vel and no further entity comes. Raises PolicyFault."""
+        """Wait until a node publishes /cmd_vel and no further entity comes, or for a while longer.
+
+        Raises PolicyFault.
+        """
         began_s = time.monotonic()
         allowed_s = self._allowed_s(True)
 
         def ready() -> bool:
-            settled = time.monotonic() - node.tokens_changed_s > JOINED_S
+            now_s = time.monotonic()
+            settled = now_s - node.tokens_changed_s > JOINED_S or now_s - began_s > SETTLED_S
             return settled and bool(self._controllers(node))
 
         while not ready():
@@ -265,7 +296,11 @@ class Ros2Policy:
 
     def _diagnosis(self, node: Ros2Node) -> str:
         """Return why there is no command, as far as the nodes around and their messages show."""
-        others = [end for end in node.others if end.node != NAME]
+        there = node.others
+        runs = {
+            end.session for end in there if end.kind == "MP" and end.topic.endswith(encode.EPISODE)
+        }
+        others = [end for end in there if end.session not in runs]
         settings = self.settings
         here = full_topic(settings.namespace, CMD_VEL)
         found: list[str] = list(self._remarks)
@@ -293,7 +328,11 @@ class Ros2Policy:
             names = ", ".join(sorted({end.in_words for end in others})[:8])
             return f"none of the nodes {names} publishes {here} in domain {settings.domain}"
         answered = "no command came with the stamp of the observation"
-        return answered if settings.wait == "stamped" else f"no message came on {here}"
+        return (
+            answered
+            if settings.wait == "stamped"
+            else f"no message of at most {LARGEST_B} bytes came on {here}"
+        )
 
 
 class Ros2Driver(PolicyCaller):
@@ -331,6 +370,7 @@ def ros2_driver(name: str, host: PolicyHost, timer: Timer | None = None) -> Ros2
             "Python PolicyHost(ros2=Ros2Settings(...))"
         )
     message_store()
+    gid_of("")  # raises without xxhash
     called = name.removeprefix(ROS2_SCHEME) or "ros2"
     policy = Ros2Policy(called, host.ros2)
     checked_manifest(name, _builtins(policy))

@@ -41,6 +41,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nodes of a test start together, and are lost soon."""
     monkeypatch.setattr(ros2_policy, "JOINED_S", 0.2)
     monkeypatch.setattr(ros2_policy, "GONE_S", 0.3)
+    monkeypatch.setattr(ros2_policy, "SETTLE_S", 0.1)
 
 
 def seen_at(tick: int, **more: Any) -> Observation:
@@ -95,14 +96,20 @@ def test_a_node_drives_in_lockstep(at: str) -> None:
 
 
 def test_a_monotonic_clock_never_goes_back(at: str) -> None:
-    """With --ros2-clock monotonic the next episode continues the time of the last one."""
-    with driven(at, clock="monotonic") as driver, Peer(at) as peer:
-        for episode in ("k1", "k2"):
-            driver.reset(episode, 7)
-            for tick in (0, 2):
-                driver.act(seen_at(tick))
-        clock = [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
-        assert clock == sorted(set(clock)) and len(clock) == 6
+    """With --ros2-clock monotonic the next episode continues the time of the last one, also with a
+    new driver, as after a crash."""
+    clock = []
+    for episodes in (("k1", "k2"), ("k3",)):
+        with (
+            driven(at, clock="monotonic", domain=7) as driver,
+            Peer(at, network=Network(7)) as peer,
+        ):
+            for episode in episodes:
+                driver.reset(episode, 7)
+                for tick in (0, 2):
+                    driver.act(seen_at(tick))
+            clock += [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
+    assert clock == sorted(set(clock)) and len(clock) == 9
 
 
 def test_stamped_waits_for_the_command_of_the_picture(at: str) -> None:
@@ -134,6 +141,44 @@ def test_rate_holds_a_command_for_half_a_second(at: str) -> None:
         driver.reset("k1", 7)
         speeds = [driver.act(seen_at(tick)).v_mps for tick in (0, 5, 10, 11)]
         assert speeds == [1.0, 1.0, 1.0, 0.0]
+
+
+def test_rate_takes_the_newest_command(at: str) -> None:
+    """Of a burst, the last command drives; one that came before the observation is not lost."""
+
+    def once(peer: Peer, seen: Seen) -> None:
+        if len(peer.seen["/odom"]) == 1:
+            answers(peer, seen)
+
+    with driven(at, wait="rate") as driver, Peer(at, once) as peer:
+        driver.reset("k1", 7)
+        driver.act(seen_at(0))
+        queue = driver.policy._queue  # type: ignore[attr-defined]
+        for v_mps in (0.4, 0.5, 0.6):
+            peer.node.publish(CMD_VEL, twist(Command(v_mps, 0.0)))
+        wait_until(lambda: len(queue) == 3)
+        assert driver.act(seen_at(2)).v_mps == 0.6
+
+
+def test_rate_waits_for_a_first_command_and_notices_that_a_node_left(at: str) -> None:
+    """The first command has the start timeout; a node that left is named before the timeout."""
+
+    def slow(peer: Peer, seen: Seen) -> None:
+        if seen.time_ns == 10**9 + 6 * 10**8:
+            answers(peer, seen)
+
+    more = {"wait": "rate", "answer_s": 0.4, "start_s": 30.0}
+    with driven(at, **more) as driver, Peer(at, slow) as peer:
+        driver.reset("k1", 7)
+        assert [driver.act(seen_at(tick)).v_mps for tick in range(0, 14, 2)] == 6 * [0.0] + [1.0]
+        driver.policy.settings = msgspec.structs.replace(  # type: ignore[attr-defined]
+            driver.policy.settings,  # type: ignore[attr-defined]
+            answer_s=30.0,
+        )
+        peer.close()
+        with pytest.raises(PolicyError, match="is gone: /driver published /cmd_vel"):
+            for tick in range(14, 200, 2):
+                driver.act(seen_at(tick))
 
 
 @pytest.mark.parametrize(
@@ -292,6 +337,7 @@ def test_settings_are_checked_before_anything_opens() -> None:
             "ros2_listen": "tcp/127.0.0.1:7448",
         },
         "the last is 232": {"ros2_domain": 232, "jobs": 2},
+        "it has one name": {"ros2_dialect": "ros2dds", "ros2_namespace": "/a/b"},
         "has no domains": {"ros2_dialect": "ros2dds", "jobs": 2},
         "write it as 512x288": {"ros2_camera": "big"},
         "write it as 360, 360@20": {"ros2_scan": "0"},

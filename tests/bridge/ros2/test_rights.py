@@ -149,8 +149,22 @@ def test_without_the_certificate_of_a_node_nothing_is_heard(certs: Path, hub: Hu
 
 
 def test_the_configuration_for_nodes_is_one_that_zenoh_reads(certs: Path, hub: Hub) -> None:
-    """`session.json5` of the role opens a session to the run's machine, once its port is set."""
+    """`session.json5` of the role opens a session to the run's machine, once its port is set. It
+    has timestamps, which publishers with a history need."""
     path = certs / "ros2" / "session.json5"
     path.write_text(path.read_text().replace(":7447", f":{hub.at.rpartition(':')[2]}"))
-    with zenoh.open(zenoh.Config.from_file(path)) as guest:
+    config = zenoh.Config.from_file(path)
+    assert config.get_json("timestamping/enabled") == "true"
+    with zenoh.open(config) as guest:
         assert [str(one.ok.key_expr) for one in guest.liveliness().get("@ros2_lv/**") if one.ok]
+
+
+@pytest.mark.parametrize("host", ["fd00::7", ""])
+def test_the_configuration_for_nodes_names_a_host_in_every_case(tmp_path: Path, host: str) -> None:
+    """An IPv6 address has brackets, and without a coordinator's certificate there is a word to
+    replace."""
+    make_authority(tmp_path / "certs", [host or "localhost"], 365)
+    if not host:
+        (tmp_path / "certs" / "coordinator" / "key.pem").unlink()
+    text = (issue(tmp_path / "certs", "ros2", [], 365) / "session.json5").read_text()
+    assert f'"tls/{f"[{host}]" if host else "HOST"}:7447"' in text

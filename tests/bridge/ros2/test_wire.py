@@ -241,6 +241,7 @@ def test_what_is_no_command_is_named_and_never_driven() -> None:
         "--ros2-distro humble": verdict(good._replace(hash=types.NO_HASH)),
         "not of Humble": verdict(good, distro="humble"),
         "use_sim_time": verdict(twist(1.0, 0.0, 1_790_000_000 * 10**9)),
+        "ahead of /clock": verdict(twist(1.0, 0.0, NOW_NS + 1)),
         "without the attachment": verdict(good._replace(attachment=None)),
         "not a geometry_msgs/msg/Twist": verdict(good._replace(payload=good.payload[:20])),
         "has no stamp": verdict(good, "stamped"),
