@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bridge.ros2.encode import BASE, header, ns_of
-from bridge.ros2.types import NO_HASH, decode, message
+from bridge.ros2.encode import ns_of
+from bridge.ros2.types import NO_HASH, decode
 from bridge.ros2.wire import Attachment
 from cosim.core.geometry import Floats
 from cosim.core.state import Command
@@ -141,30 +140,3 @@ def plan_in_robot_frame(payload: bytes, pose: Odometry) -> Floats | None:
     offset = points[chosen] - (pose.x_m, pose.y_m)
     ahead_left: Floats = offset @ np.array([[cos, -sin], [sin, cos]])
     return ahead_left
-
-
-def stamped_command(command: Command, time_ns: int) -> Any:
-    """Return a command as a geometry_msgs/msg/TwistStamped in `base_link`."""
-    linear = message("geometry_msgs/msg/Vector3", command.v_mps, 0.0, 0.0)
-    angular = message("geometry_msgs/msg/Vector3", 0.0, 0.0, command.w_radps)
-    return message(TWIST_STAMPED, header(time_ns, BASE), message(TWIST, linear, angular))
-
-
-def waypoint_path(points: Floats | NDArray[np.float32], time_ns: int) -> Any:
-    """Return waypoints, (N, 2) or (N, 4) in the robot's frame, as a nav_msgs/msg/Path in
-    `base_link`."""
-    at = header(time_ns, BASE)
-    level = message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
-    poses = [
-        message(
-            "geometry_msgs/msg/PoseStamped",
-            at,
-            message(
-                "geometry_msgs/msg/Pose",
-                message("geometry_msgs/msg/Point", float(x), float(y), 0.0),
-                level,
-            ),
-        )
-        for x, y in points[:, :2].tolist()
-    ]
-    return message(PATH, at, poses)

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from bridge.ros2.types import message
 from bridge.ros2.wire import Qos
 from cosim.core.clock import Clock
+from cosim.core.geometry import Floats
+from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import Calibration
 from cosim.spec.goal import Instruction, PointGoal
@@ -175,9 +177,7 @@ def static_tf(seen: Observation, time_ns: int) -> Any:
 
 def odometry(seen: Observation, time_ns: int) -> Any:
     """Return the message of /odom: the estimated pose, and the robot's own speeds."""
-    twist = message(
-        "geometry_msgs/msg/Twist", _vector(seen.v_mps, 0, 0), _vector(0, 0, seen.w_radps)
-    )
+    twist = _twist(seen.v_mps, seen.w_radps)
     unknown = np.zeros(36)
     return message(
         "nav_msgs/msg/Odometry",
@@ -194,10 +194,31 @@ def initial_pose(seen: Observation, time_ns: int) -> Any:
     return message("geometry_msgs/msg/PoseWithCovarianceStamped", header(time_ns, _MAP), pose)
 
 
+def _twist(v_mps: float, w_radps: float) -> Any:
+    return message("geometry_msgs/msg/Twist", _vector(v_mps, 0, 0), _vector(0, 0, w_radps))
+
+
+def stamped_command(command: Command, time_ns: int) -> Any:
+    """Return a command as a geometry_msgs/msg/TwistStamped in `base_link`."""
+    twist = _twist(command.v_mps, command.w_radps)
+    return message("geometry_msgs/msg/TwistStamped", header(time_ns, BASE), twist)
+
+
+def waypoint_path(points: Floats | NDArray[np.float32], time_ns: int) -> Any:
+    """Return waypoints, (N, 2) or (N, 4) in the robot's frame, as a nav_msgs/msg/Path in
+    `base_link`."""
+    at = header(time_ns, BASE)
+    poses = [
+        message("geometry_msgs/msg/PoseStamped", at, _pose(Odometry(x, y, 0.0)))
+        for x, y in points[:, :2].tolist()
+    ]
+    return message("nav_msgs/msg/Path", at, poses)
+
+
 def imu(reading: Imu, time_ns: int) -> Any:
     """Return a sensor_msgs/msg/Imu without an orientation."""
     unknown, none = np.zeros(9), np.array([-1.0] + 8 * [0.0])
-    level = message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+    level = _yaw(0.0)
     return message(
         "sensor_msgs/msg/Imu",
         header(time_ns, IMU),

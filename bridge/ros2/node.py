@@ -59,7 +59,6 @@ class Ros2Node:
         self._session = session
         self._dialect = DIALECTS[network.dialect]
         self._publishers: dict[str, _Publisher] = {}
-        self._leave: list[Callable[[], None]] = []
         self._others: dict[str, Endpoint] = {}
         self._by_gid: dict[bytes, Endpoint] = {}
         self._entities = 0
@@ -125,12 +124,6 @@ class Ros2Node:
         """Return the publishers of a topic in this network."""
         return self._others_at(topic, "MP")
 
-    def close(self) -> None:
-        """Remove the tokens; the session stays open."""
-        for leave in self._leave:
-            leave()
-        self._leave.clear()
-
     def _others_at(self, topic: str, kind: Kind) -> list[Endpoint]:
         full = full_topic(self.network.namespace, topic)
         return [
@@ -161,7 +154,7 @@ class Ros2Node:
     def _show(self, end: Endpoint) -> str:
         """Declare the token of an entity, and return it."""
         token = self._dialect.token(end)
-        self._leave.append(self._session.stand(token))
+        self._session.stand(token)
         return token
 
     def _token(self, token: str, alive: bool) -> None:

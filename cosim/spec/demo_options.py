@@ -38,7 +38,7 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
         random.
     format: form of the data set: LeRobot, or a ROS 2 bag of each episode.
     unsolved: also record episodes that the expert fails, up to the first reset of the robot.
-    scan, imu, people: sensors that are recorded beside the pictures, as in a manifest.
+    scan, imu, people: sensors that are recorded with the pictures, as in a manifest.
 
     Raises SpecError.
     """

@@ -119,7 +119,7 @@ def test_tracks_do_not_tell_event_pedestrians_from_others() -> None:
 
 def test_neighbours_swap_ids_and_the_lost_get_new_ones() -> None:
     """With a switch at every observation two people 0.5 m apart exchange ids; after 1 s out of
-    sight a person has a new id, before that the old one. Rare observations lose nobody in sight."""
+    sight a person has a new id, before that the old one. Rare observations lose no person in sight."""
     street = walking(PersonKind.CROWD)
     both = Street(0, People.of(("a", "b"), [(3, 8), (3, 8.5)], [0, 0], [0, 0], ("stand",) * 2))
     swaps = TrackNoise(position_m=0.0, miss=0.0, switch_hz=1e9)

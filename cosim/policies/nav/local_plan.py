@@ -79,7 +79,7 @@ def local_plan(
     half_width_m: half of the robot's width.
     margin_m: least distance from the robot's side to an obstacle; where the robot is nearer, it may
         stay as near as it is.
-    side: side of the last plan, which is kept if both are about equal.
+    side: side of the last plan, which is preferred if both are about equal.
     movers: moving bodies; each is where it will be when the robot arrives.
     v_mps: speed of the robot.
     """

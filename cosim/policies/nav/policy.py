@@ -132,7 +132,7 @@ class Nav:
     def _free_turn(self, robot: Robot) -> Command:
         """Return a slow turn to the side of the plan, or to the other one; none without room.
 
-        Without a side it is the one with more room. It is kept until the robot has moved.
+        Without a side it is the one with more room. It stays the same until the robot has moved.
         """
         sides = _LOOK_ASIDE_M * np.array([(math.cos(_ASIDE_RAD), math.sin(_ASIDE_RAD))] * 2)
         sides[1, 1] *= -1.0

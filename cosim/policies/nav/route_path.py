@@ -23,7 +23,7 @@ _TURN_M: Final = 1.8
 _PASSED_M: Final = 0.75
 """Distance in metres from the path within which pixels are those of the path so far."""
 _BESIDE_M: Final = 2.0
-"""Distance in metres of the pixels that determine the direction of the route beside the robot."""
+"""Distance in metres of the pixels that determine the direction of the route at the robot."""
 _FEWEST_PX: Final = 3
 """Number of pixels around a point below which the route has ended."""
 _SMOOTH: Final = 0.6
@@ -33,7 +33,7 @@ _SMOOTH: Final = 0.6
 def path_to(goal: Goal | None, direction_rad: float) -> Floats:
     """Return the route ahead, (N, 2) metres in the robot's frame, at distances of STEP_M.
 
-    direction_rad: direction of the route beside the robot, in its frame.
+    direction_rad: direction of the route at the robot, in its frame.
     Raises ValueError for a goal that is neither a route patch nor a point.
     """
     if isinstance(goal, RoutePatch):
@@ -44,7 +44,7 @@ def path_to(goal: Goal | None, direction_rad: float) -> Floats:
 
 
 def _along_patch(patch: RoutePatch, direction_rad: float) -> Floats:
-    """Return (N, 2) points on the route of a patch, from the one beside the robot on."""
+    """Return (N, 2) points on the route of a patch, from the one next to the robot on."""
     rows, columns = np.nonzero(patch.pixels)
     middle = 0.5 * (PATCH_PX - 1)
     on_route = PATCH_M * np.column_stack([middle - rows, middle - columns])

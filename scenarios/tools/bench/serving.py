@@ -17,8 +17,8 @@ from typing import Any, Final
 import numpy as np
 
 from bridge.policy_server import serve
-from bridge.ros2.commands import TWIST_STAMPED, Received, stamped_command
-from bridge.ros2.encode import ns_of
+from bridge.ros2.commands import TWIST_STAMPED, Received
+from bridge.ros2.encode import ns_of, stamped_command
 from bridge.ros2.node import Network, Ros2Node
 from bridge.ros2.types import decode
 from bridge.session import open_session

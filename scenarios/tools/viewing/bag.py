@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from bridge.ros2 import encode
-from bridge.ros2.commands import PATH, TWIST_STAMPED, stamped_command, waypoint_path
+from bridge.ros2.commands import PATH, TWIST_STAMPED
 from bridge.ros2.types import encode as encoded
 from bridge.ros2.types import message_store
 from cosim.core.errors import UsageError, unwritable
@@ -145,9 +145,9 @@ class _Tape:
 
     def answer(self, command: Command, time_ns: int) -> None:
         """Write an answer of the policy."""
-        self.write(CMD_VEL, stamped_command(command, time_ns), time_ns)
+        self.write(CMD_VEL, encode.stamped_command(command, time_ns), time_ns)
         if isinstance(command, WaypointCommand):
-            self.write(PLAN, waypoint_path(command.waypoints, time_ns), time_ns)
+            self.write(PLAN, encode.waypoint_path(command.waypoints, time_ns), time_ns)
 
 
 def _qos(*, latched: bool) -> Any:

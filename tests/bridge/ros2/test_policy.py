@@ -295,7 +295,7 @@ def test_two_nodes_do_not_drive_together(at: str) -> None:
 
 
 def test_a_flood_of_commands_and_long_messages_does_not_stop_the_drive(at: str) -> None:
-    """A thousand commands after each answer, and megabytes that the hub drops: the drive goes on."""
+    """A thousand commands after each answer, and megabytes that the hub drops: the drive continues."""
 
     def flood(peer: Peer, seen: Seen) -> None:
         answers(peer, seen)
