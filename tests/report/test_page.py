@@ -86,6 +86,25 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
 
 
+def test_figures_of_the_paper_are_below_the_heads_of_their_metrics(tmp_path: Path) -> None:
+    """A row of long ways has a cell for each column; V of the paper is below V, and it has no
+    falls."""
+    way = short_way("s-000", suite="long-horizon", ends_on_failure=False, structure="route")
+    runs = read_runs([run_of(tmp_path / "run", ["goal"], scenarios=[way])])
+    (long,) = [table for table in tables_of(runs) if table.title == "Long ways"]
+    for row in long.paper.values():
+        assert len(row) == len(long.heads)
+    places = zip(long.heads, long.paper["ViNT"], strict=True)
+    assert [*places][:6] == [
+        ("FC", 21.20),
+        ("C", 4.29),
+        ("OL", 16.90),
+        ("F", 0.00),
+        ("FL", None),
+        ("V", 1.11),
+    ]
+
+
 def test_a_row_names_a_robot_other_than_the_default(tmp_path: Path) -> None:
     """The note of a row in the tables names the scout, and not the courier."""
     ways = [short_way("s-0"), short_way("s-1", robot="scout")]
