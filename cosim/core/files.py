@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import secrets
@@ -23,6 +24,8 @@ _LOCK_FILE: Final = ".held"
 """File in a temporary folder that its process locks."""
 _OLD: Final = ".old"
 """Folder in a temporary folder that holds the replaced folder."""
+_OCCUPIED: Final = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
+"""Errors of renaming a folder to a name that is in use. By now it may be free again."""
 _IN_USE_S: Final = 3600.0
 """Age in seconds below which an unfinished file or unlocked folder counts as in use."""
 
@@ -120,11 +123,13 @@ def atomic_folder(
             try:
                 made.rename(target)
                 return
-            except OSError:
-                if existing == "refuse" or not target.exists():
+            except OSError as error:
+                if existing == "refuse" or error.errno not in _OCCUPIED:
                     raise
             if existing == "keep":
-                return
+                if target.exists():
+                    return
+                continue
             shutil.rmtree(old, ignore_errors=True)
             old.parent.mkdir(exist_ok=True)
             with suppress(FileNotFoundError):

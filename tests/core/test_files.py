@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -200,6 +201,28 @@ while True:
         "other",
     }
     assert len({(tmp_path / "town" / name).read_text() for name in "ab"}) == 1
+
+
+@pytest.mark.parametrize("existing", ["replace", "keep"])
+def test_a_folder_appears_though_another_process_removes_the_old_one_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, existing: Literal["replace", "keep"]
+) -> None:
+    """Also where it is gone right after it was in the way."""
+    (tmp_path / "town").mkdir()
+    (tmp_path / "town" / "old").touch()
+    rename = Path.rename
+
+    def rename_then_remove(path: Path, target: Path) -> Path:
+        try:
+            return rename(path, target)
+        except OSError:
+            shutil.rmtree(tmp_path / "town")
+            raise
+
+    monkeypatch.setattr(Path, "rename", rename_then_remove)
+    with atomic_folder(tmp_path / "town", existing=existing) as folder:
+        (folder / "new").touch()
+    assert [path.name for path in tmp_path.glob("town/*")] == ["new"]
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
