@@ -61,6 +61,8 @@ def bundle_in_words(folder: Path) -> str:
     return f"ONNX bundle, {found}" + (f"; from {origin}" if origin else "")
 
 
+_BUNDLED = "cosim.policies."
+"""Start of the names of modules of bundled policies."""
 _MOST_PX = 4096
 """Largest side of a camera image in pixels."""
 LONGEST_NAME = 100
@@ -176,16 +178,20 @@ def _by_digest(name: str, make: Callable[[], _Digested], timer: Timer | None) ->
 def source_hash(policy: Policy) -> str:
     """Return a hash of the files that define the policy's class and base classes; "" if unreadable.
 
-    Imported modules and weight files are not included; the manifest's version identifies those.
+    Of a bundled class, all modules in its folder are included. Other imported modules and weight
+    files are not; the manifest's version identifies those.
     """
     digest = hashlib.blake2b(digest_size=8)
     read = False
     for one in type(policy).__mro__:
         try:
-            source = Path(inspect.getfile(one)).read_bytes()
+            file = Path(inspect.getfile(one))
+            folder = file.parent.glob("*.py") if one.__module__.startswith(_BUNDLED) else ()
+            sources = [(path.name, path.read_bytes()) for path in (file, *sorted(folder))]
         except (OSError, TypeError):  # built in, or made without a file
             continue
-        digest.update(f"{one.__module__}\0{len(source)}\0".encode() + source)
+        for name, source in sources:
+            digest.update(f"{one.__module__}\0{name}\0{len(source)}\0".encode() + source)
         read = True
     return digest.hexdigest() if read else ""
 

@@ -3,7 +3,9 @@ code does."""
 
 from __future__ import annotations
 
+import inspect
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +15,8 @@ import pytest
 from cosim.core.errors import UsageError
 from cosim.episode.policy_caller import PolicyCall
 from cosim.policies import POLICIES
-from cosim.policies.load import load_policy
+from cosim.policies.load import load_policy, source_hash
+from cosim.policies.privileged.route import Route
 from cosim.policies.user_module import importable_name
 
 GOOD = """
@@ -318,3 +321,16 @@ def test_every_policy_of_ours_has_its_own_hash() -> None:
     """They are told apart by their files."""
     assert all(load_policy(name).source_hash for name in POLICIES)
     assert load_policy("route").source_hash != load_policy("orca").source_hash
+
+
+def test_a_bundled_policy_has_another_hash_when_a_module_in_its_folder_is_edited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not only the file of its class."""
+    route = Route()
+    copied = shutil.copytree(Path(inspect.getfile(type(route))).parent, tmp_path / "privileged")
+    monkeypatch.setattr(inspect, "getfile", lambda _: str(copied / "route.py"))
+    before = source_hash(route)
+    planner = copied / "route_planner.py"
+    planner.write_text(planner.read_text() + "# edited")
+    assert source_hash(route) != before

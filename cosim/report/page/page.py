@@ -182,7 +182,7 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> dict[str, Any]:
     if alike:
         shared["versions"] = ", ".join(f"{name} {versions[0][name]}" for name in alike)
     for fact, one in zip(facts, versions, strict=True):
-        fact |= {name: one.get(name, "not told") for name in packages if name not in alike}
+        fact |= {name: one.get(name, "unknown") for name in packages if name not in alike}
     return {
         "shared": shared,
         "differing": {
@@ -200,7 +200,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
     wall = (
         f"{duration(sum(wall_times_s))} in all, {np.median(wall_times_s):.1f} s the median episode"
         if wall_times_s
-        else "not told"
+        else "unknown"
     )
     took_ms = median_answer_ms(run.records)
     decoys = int(is_decoy(run.table).sum())
@@ -209,7 +209,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
     called = policy_in_words(spec.manifest.name, run.records[0].manifest.privileged)
     return {
         "policy": f"{called} {spec.manifest.version} ({spec.policy})",
-        "its source": spec.setup.policy_source or "not told",
+        "its source": spec.setup.policy_source or "unknown",
         "suite": f"{spec.suite} {spec.suite_version}, {spec.setup.suite_hash}",
         "scenarios": f"{len(spec.scenarios)} scheduled, {len(run.records)} ended{of_these}",
         "metric schema": str(run.table["metric_schema"].iloc[0]),
@@ -221,7 +221,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         "drawn by": spec.setup.renderer,
         "goal": spec.manifest.goal,
         "odometry": spec.manifest.odometry,
-        "an answer took": "not told" if took_ms is None else f"{milliseconds(took_ms)}, the median",
+        "an answer took": "unknown" if took_ms is None else f"{milliseconds(took_ms)}, the median",
         "latency": "of each answer, measured"
         if spec.setup.real_time
         else f"{spec.setup.latency_ms:g} ms",
