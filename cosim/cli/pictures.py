@@ -31,7 +31,11 @@ if TYPE_CHECKING:
 export_app = typer.Typer()
 
 
-@export_app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim export lh-011-00 street.glb`")
+@export_app.command(
+    rich_help_panel=LOOK,
+    epilog="Examples:  \n`cosim export lh-011-00 street.glb`  \n"
+    "`cosim export lh-011-00 street.glb --run runs/mine --at 20`",
+)
 def export(
     scenario: Annotated[str, typer.Argument(help="A scenario's id (`cosim list long-horizon`).")],
     output: Annotated[
@@ -43,17 +47,33 @@ def export(
             help="Where the scenario is: a suite or a suite's .json file; by default looked up."
         ),
     ] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="A run folder with the scenario, in place of a suite."),
+    ] = None,
+    at: Annotated[
+        float, typer.Option(min=0.0, help="With --run: the robot as it was after these seconds.")
+    ] = 0.0,
 ) -> None:
-    """Export the street along a scenario's route as glTF, with buildings, trees and furniture."""
+    """Export the street along a scenario's route as glTF: buildings, trees, furniture, robot."""
     check_output(output, "glTF", (".glb",))
-    from cosim.spec.selection import select_scenarios
-    from scenarios.suites.catalog import holding, load_suite
-    from scenarios.tools.viewing.export import export_street
+    if run is None and at:
+        raise UsageError("--at needs --run RUN: the robot is at its start otherwise")
+    if run is not None and suite is not None:
+        raise UsageError("--run and --suite both say where the scenario is: give one of them")
+    from scenarios.tools.viewing.export import export_street, recorded_robot
 
-    (one,) = select_scenarios(holding(scenario) if suite is None else load_suite(suite), [scenario])
     instead = replacement_note(output)
     with doing("reading the scenario") as progress:
-        tiles = export_street(one, output, progress)
+        if run is None:
+            from cosim.spec.selection import select_scenarios
+            from scenarios.suites.catalog import holding, load_suite
+
+            found = holding(scenario) if suite is None else load_suite(suite)
+            (one,), robot = select_scenarios(found, [scenario]), None
+        else:
+            one, robot = recorded_robot(run, scenario, at)
+        tiles = export_street(one, output, robot, progress)
     size = f"{tiles} tiles, {output.stat().st_size / 1e6:.1f} MB"
     out.print(f"Street: {output} ({one.id}, {size}){instead}", soft_wrap=True, highlight=False)
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
-from cosim.core.geometry import Floats, box_disk_gap
+from cosim.core.geometry import Floats, Pose, box_disk_gap
 from cosim.core.npz import npz_names, read_npz
-from cosim.core.state import PERSON_RADIUS_M, People, RobotState
+from cosim.core.state import PERSON_RADIUS_M, LegState, People, RobotState
 from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
 from cosim.results.traffic import RoadState
@@ -255,6 +255,17 @@ class Log:
     def on_legs(self) -> bool:
         """Return whether the robot has legs."""
         return self.legs.shape[1:] > (0,)
+
+    def robot(self, tick: int) -> RobotState:
+        """Return the robot's pose at the end of a tick, with attitude and joints if it has legs.
+
+        Heights are recorded of robots with legs only.
+        """
+        pose = Pose(*self.pose[tick].tolist())
+        if not self.on_legs:
+            return RobotState(pose)
+        _, z_m, roll, pitch, *angles = self.legs[tick].tolist()
+        return RobotState(pose, z_m=z_m, legs=LegState(roll, pitch, tuple(angles)))
 
     def same(self, tick: Tick) -> bool:
         """Return whether a replayed tick equals the recorded one, bit for bit.

@@ -13,7 +13,7 @@ from trimesh.visual.material import PBRMaterial
 from cosim.core.progress import Progress, ignore
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import Barrier
-from physics.ground.mesh import Mesh, join
+from physics.ground.mesh import Mesh, Part, join
 from physics.ground.tiles import Key
 from physics.street import props
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
@@ -23,7 +23,9 @@ from physics.street.surface import Patch, Surface, grounded_obstacles
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Colour, linear_to_srgb, srgb_to_linear
 
-_GROUPS: Final = ("surfaces", "buildings", "trees", "furniture", "signals", "barriers", "obstacles")
+_GROUPS: Final = (
+    *("surfaces", "buildings", "trees", "furniture", "signals", "barriers", "obstacles", "robot"),
+)
 """Nodes below the root; their children have names such as "sidewalk:brick:2"."""
 _LAYERS_PX: Final = 256
 """Size in pixels of the texture layers whose mean colours are used."""
@@ -35,8 +37,12 @@ def as_gltf(
     barriers: Sequence[Barrier] = (),
     progress: Progress = ignore,
     obstacles: Sequence[Obstacle] = (),
+    robot: Sequence[Part] = (),
 ) -> bytes:
-    """Return a .glb file of tiles of a surface with barriers and obstacles."""
+    """Return a .glb file of tiles of a surface with barriers, obstacles and a robot.
+
+    robot: parts in the map's frame, each with a colour.
+    """
     parts = _Parts()
     for n, key in enumerate(keys):
         progress("building tiles", n / len(keys))
@@ -55,6 +61,9 @@ def as_gltf(
         )
     for prop, z in grounded_obstacles(obstacles, surface):
         parts.add_prop("obstacles", prop, z)
+    for part in robot:
+        assert part.colour is not None
+        parts.add("robot", "robot:body", part.mesh, part.colour)
     progress("writing")
     written: bytes = parts.scene().export(file_type="glb", include_normals=True)
     return written

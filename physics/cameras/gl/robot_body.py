@@ -6,29 +6,51 @@ import xml.etree.ElementTree as xml
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
+from cosim.core.geometry import Floats
+from cosim.core.state import RobotState
+from cosim.spec.robot import Robot
+from physics.cameras.posture import posture_of
 from physics.ground.mesh import Mesh, Part
-from physics.robots.kinematics import link_tree, origin_of
+from physics.robots import urdf_path
+from physics.robots.kinematics import link_tree, origin_of, turned
 from physics.robots.shapes import shape_of
+from physics.street.surface import Surface
 
 _GREY = (0.6, 0.6, 0.6)
+_ZERO: Final[Mapping[str, float]] = MappingProxyType({})
+"""Joint angles of a robot whose joints are all at zero."""
 
 
-def robot_parts(urdf: Path) -> tuple[Part, ...]:
-    """Return the visible parts of a robot in its base link's frame, with joints at zero.
+def robot_parts(urdf: Path, angles_rad: Mapping[str, float] = _ZERO) -> tuple[Part, ...]:
+    """Return the visible parts of a robot in its base link's frame.
+
+    angles_rad: joint angles; joints without one are at zero.
 
     Raises SpecError for an unknown shape.
     """
-    places = link_tree(urdf).places({})
-    parts = []
-    for link, shapes in link_parts(urdf).items():
-        turn, shift = places[link]
-        for mesh, colour, *_ in shapes:
-            vertices = mesh.vertices @ turn.T + shift
-            parts.append(Part(Mesh(vertices, mesh.normals @ turn.T, mesh.triangles), colour))
-    return tuple(parts)
+    places = link_tree(urdf).places(angles_rad)
+    return tuple(
+        _turned(part, *places[link]) for link, parts in link_parts(urdf).items() for part in parts
+    )
+
+
+def parts_in_place(surface: Surface, model: Robot, robot: RobotState) -> tuple[Part, ...]:
+    """Return the visible parts of a robot in the map's frame."""
+    posture = posture_of(surface, model, robot)
+    turn = turned(posture.roll_rad, posture.pitch_rad, posture.heading_rad)
+    parts = robot_parts(urdf_path(model), posture.angles_rad)
+    return tuple(_turned(part, turn, np.array(posture.at_m)) for part in parts)
+
+
+def _turned(part: Part, turn: Floats, shift: Floats) -> Part:
+    mesh = part.mesh
+    moved = Mesh(mesh.vertices @ turn.T + shift, mesh.normals @ turn.T, mesh.triangles)
+    return Part(moved, part.colour)
 
 
 @lru_cache(maxsize=8)

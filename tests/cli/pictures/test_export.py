@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 import shapely
 
+from cosim.core.geometry import Pose
+from cosim.core.state import RobotState
 from cosim.place.walk_graph import WalkGraph
+from cosim.results.log import Log
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Barrier, City, Scenario, Suite, write_suite
+from physics.cameras.gl.robot_body import parts_in_place
 from physics.ground.materials import APPEARANCE_OVERRIDES, PAVINGS
 from physics.ground.tiles import SURFACES, ground_kind, tile_bounds, tiles_touching
 from physics.street.gltf import as_gltf
@@ -128,6 +133,49 @@ def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim
     assert {parents[name] for name in ("prop:tree", "prop:tree/1")} == {"trees"} and len(
         scenario.route
     ) > 50
+    assert robot_of(tmp_path / "street.glb").mean(axis=0)[:2] == pytest.approx(route[0], abs=0.3)
+
+
+def robot_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
+    """(N, 3) vertices of the robot in a file, with z up."""
+    import trimesh
+
+    scene = trimesh.load_scene(path)
+    parents = scene.graph.transforms.parents
+    found = [
+        trimesh.transform_points(scene.geometry[name].vertices, at)
+        for node in scene.graph.nodes_geometry
+        for at, name in [scene.graph[node]]
+        if parents[node] == "robot"
+    ]
+    x, up, back = np.concatenate(found).T
+    return np.column_stack([x, -back, up])
+
+
+@pytest.mark.engine
+def test_the_robot_of_a_run_is_exported_with_its_legs(
+    street: StreetSurface, tmp_path: Path, cosim: Cosim
+) -> None:
+    """It is where it was, on its feet, which are not where they are at rest."""
+    words = ("unit", "--policy", "straight", "--robot", "dog", "--scenario", "crosswalk-050")
+    assert cosim("run", *words, "--out", "dog", cwd=tmp_path).returncode == 0
+    said = cosim("export", "crosswalk-050", "dog.glb", "--run", "dog", "--at", "4", cwd=tmp_path)
+    assert said.returncode == 0, said.stderr
+    body = robot_of(tmp_path / "dog.glb")
+    log = Log.load(tmp_path / "dog" / "episodes" / "crosswalk-050" / "trajectory.npz")
+    assert body.mean(axis=0)[:2] == pytest.approx(log.pose[79, :2], abs=0.1)
+    recorded = parts_in_place(street, robot_called("dog"), log.robot(79))
+    assert body.min(axis=0)[2] == pytest.approx(
+        min(part.mesh.vertices[:, 2].min() for part in recorded), abs=1e-3
+    )
+    stood = parts_in_place(street, robot_called("dog"), RobotState(Pose(0.0, 0.0, 0.0)))
+    lifted = [
+        one.mesh.vertices[:, 2].min() - other.mesh.vertices[:, 2].min()
+        for one, other in zip(recorded, stood, strict=True)
+    ]
+    assert np.ptp(lifted) > 0.03
+    late = cosim("export", "crosswalk-050", "late.glb", "--run", "dog", "--at", "999", cwd=tmp_path)
+    assert late.returncode == 2 and "'crosswalk-050' ended after" in late.stderr
 
 
 def test_what_cannot_be_exported_is_told_before_anything_is_built(
@@ -142,6 +190,10 @@ def test_what_cannot_be_exported_is_told_before_anything_is_built(
             "a.obj: cannot be written as glTF; use a name that ends in .glb",
         ),
         ("lh-011-00", "no/a.glb"): (3, "no/a.glb: cannot be written: no folder no"),
+    }
+    asked |= {
+        ("lh-011-00", "a.glb", "--at", "3"): (2, "--at needs --run RUN"),
+        ("lh-011-00", "a.glb", "--run", "no"): (2, "no"),
     }
     for words, (code, message) in asked.items():
         said = cosim("export", *words, cwd=tmp_path)
