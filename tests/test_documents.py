@@ -275,21 +275,22 @@ def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
 
 
 def test_the_results_of_the_readme_are_those_of_the_baselines() -> None:
-    """Nine policies; each figure with an interval is in a row of the same policy on the page of all
-    results, or in the row of D below it."""
+    """Twelve policies; each figure with an interval is in a row of the same policy on the page of
+    all results, or in the row of D below it."""
     rows = [
         line.strip("| ").split(" | ")
         for line in text_of("README.md").splitlines()
-        if "| camera |" in line
+        if re.search(r"^\| `.*\| (camera|lidar, route|people) \|", line)
     ]
     page = text_of("docs/baselines.md").splitlines()
     results = text_of("README.md").partition("## Results")[2].partition("## ")[0]
-    assert len(rows) == 5 and len(re.findall(r"^\| `", results, re.MULTILINE)) == 9
-    for name, _, *figures in rows:
+    assert len(rows) == 8 and len(re.findall(r"^\| `", results, re.MULTILINE)) == 12
+    for words, sees, *figures in rows:
+        name = words.partition("` ")[0].partition("`,")[0].partition("`;")[0].strip("`")
         tested = [
             line + below
             for line, below in pairwise(page)
-            if line.startswith(f"| {name}, camera") and "(" in line
+            if line.startswith(f"| `{name}`, {sees.partition(',')[0]}") and "(" in line
         ]
         measured = [figure for figure in figures if "(" in figure]
         assert measured, name
