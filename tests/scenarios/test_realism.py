@@ -19,7 +19,12 @@ from physics.dynamics.world import BulletWorld
 from physics.ground.tiles import tiles_within
 from scenarios.places.nets import surface_of_place
 from scenarios.suites.catalog import load_suite
-from scenarios.tools.bench.detectors import FASTEST_DET, decode_fastest
+from scenarios.tools.bench.detectors import (
+    DETECTORS,
+    FASTEST_DET,
+    REAL_HEIGHTS_PX,
+    decode_fastest,
+)
 from scenarios.tools.bench.realism import (
     ALL,
     CAMERA,
@@ -101,6 +106,14 @@ def test_boxes_of_fastest_det_are_decoded() -> None:
     assert middle == pytest.approx([200.0, 50.0]) and size == pytest.approx(
         np.array([440.0, 220.0]) / (1.0 + np.exp(2.0)), rel=1e-5
     )
+
+
+def test_the_number_expected_of_real_people_follows_their_heights() -> None:
+    """Heights below the least class count 0; each other one counts the recall of its class."""
+    one = DETECTORS["YOLOX-nano"]
+    heights = np.array([10.0, *REAL_HEIGHTS_PX, 300.0])
+    assert one.expected(heights) == pytest.approx(sum(one.real_recall) + one.real_recall[-1])
+    assert all(len(other.real_recall) == len(REAL_HEIGHTS_PX) for other in DETECTORS.values())
 
 
 def test_routes_of_the_splits_are_of_their_split() -> None:
@@ -207,6 +220,6 @@ def test_the_command_counts_and_writes_pictures(cosim: Cosim, tmp_path: Path) ->
     refused = cosim(*common, "--compare", str(before))
     assert refused.returncode == 2 and "is no realism.json" in refused.stderr
     refused = cosim(*common, "--split", "held-out")
-    assert refused.returncode == 2 and "val, test" in refused.stderr
+    assert refused.returncode == 2 and "Valid choices: test, val" in refused.stderr
     refused = cosim("bench", "realism", "--weights", str(tmp_path / "none"))
     assert refused.returncode == 2 and "no folder" in refused.stderr

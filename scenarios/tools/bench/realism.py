@@ -10,7 +10,6 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -126,6 +125,7 @@ class Detections:
     """Counts of one detector's boxes.
 
     people: found and all people by class of size.
+    expected: how many real people of the same heights would be found.
     boxes: number of boxes.
     false: boxes without a person, by what they show (`Things.under`).
     """
@@ -133,6 +133,7 @@ class Detections:
     people: dict[str, list[int]] = field(
         default_factory=lambda: {name: [0, 0] for name in SIZES_PX}
     )
+    expected: dict[str, float] = field(default_factory=lambda: dict.fromkeys(SIZES_PX, 0.0))
     boxes: int = 0
     false: Counter[str] = field(default_factory=Counter)
 
@@ -199,10 +200,7 @@ def measure_realism(
     out: folder for pictures with boxes, and for all counts as realism.json.
     """
     street = network_graph(ESPNET_GRAPH, weights)
-    detectors = {
-        name: partial(one.detect, network=network_graph(one.file, weights))
-        for name, one in DETECTORS.items()
-    }
+    graphs = {name: network_graph(one.file, weights) for name, one in DETECTORS.items()}
     found = []
     for place, split in itertools.product(places, splits):
         counts = Realism(place or CITY, split)
@@ -212,8 +210,8 @@ def measure_realism(
             number = counts.frames[ALL]
             rgb, labels = picture.frame.rgb, picture.frame.labels
             counts.frames.update(picture.conditions)
-            for detector, detect in detectors.items():
-                boxes = detect(rgb)
+            for detector, graph in graphs.items():
+                boxes = DETECTORS[detector].detect(rgb, graph)
                 judged = count_boxes(counts, detector, boxes, picture)
                 if out is not None and number % each == 0:
                     path = out / f"{name}-{number:03}-{detector}.png"
@@ -238,7 +236,10 @@ def as_json(one: Realism) -> dict[str, Any]:
         "detected": {
             name: {
                 condition: {
-                    "people": {size: {"found": a, "of": b} for size, (a, b) in got.people.items()},
+                    "people": {
+                        size: {"found": a, "expected": got.expected[size], "of": b}
+                        for size, (a, b) in got.people.items()
+                    },
                     "boxes": got.boxes,
                     "false": dict(got.false.most_common()),
                 }
@@ -275,6 +276,9 @@ def figures_of(one: Mapping[str, Any]) -> dict[str, str]:
             where = name if condition == ALL else f"{name}, {condition}"
             for size, people in got["people"].items():
                 rows[f"{where}: people {size}, found"] = _share_of(people["found"], people["of"])
+                rows[f"{where}: people {size}, if real"] = _share_of(
+                    round(people["expected"]), people["of"]
+                )
             rows[f"{where}: false boxes"] = _share_of(sum(got["false"].values()), got["boxes"])
     for what, word in (("iou", "IoU"), ("recall", "recall")):
         for name, value in one[what].items():
@@ -355,6 +359,7 @@ def count_boxes(
             rows = seen.whole & (heights >= least) & (heights < most)
             got.people[name][0] += int((rows & found).sum())
             got.people[name][1] += int(rows.sum())
+            got.expected[name] += DETECTORS[detector].expected(heights[rows])
         got.boxes += len(boxes)
         got.false += under
     return found, false
