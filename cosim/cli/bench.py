@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from cosim.core.geometry import Floats
     from scenarios.tools.bench.figures import Figure
     from scenarios.tools.bench.people import Comparison, MeanSd
-    from scenarios.tools.bench.realism import Realism
 
 
 _SHARE = [*tables.figures("count"), *tables.labels("of"), *tables.figures("share", "target")]
@@ -285,35 +284,35 @@ def _percentiles(values: Floats, percent: Sequence[float]) -> str:
 
 def bench_realism(
     places: Sequence[str],
+    splits: Sequence[str],
     frames: int,
     appearance: Appearance,
     weights: Path | None,
     folder: Path | None,
+    before: Path | None,
 ) -> None:
-    """Compare what networks see in pictures with the labels, and print the shares."""
-    from scenarios.tools.bench.realism import CLASSES, SIZES_PX, measure_realism
+    """Compare what networks see in pictures with the labels, and print the shares.
 
+    before: realism.json of another run, whose figures are shown in columns of their own.
+    """
+    from cosim.spec.scenario import split_called
+    from scenarios.tools.bench.realism import as_json, figures_of, measure_realism, read_realism
+
+    named = [one for one in map(split_called, splits) if one is not None]
     if weights is not None and not weights.is_dir():
         raise UsageError(f"--weights {weights}: no folder; give the one with the networks' files")
+    earlier = [] if before is None else read_realism(before)
     with doing("driving") as progress:
-        found = measure_realism(places or ("",), frames, appearance, weights, folder, progress)
-    rows: list[tuple[str, ...]] = [("frames", *(str(one.frames) for one in found))]
-    rows += [
-        (f"people {size}, found", *(_found_of(one, size) for one in found)) for size in SIZES_PX
-    ]
-    rows.append(
-        ("false boxes of all boxes", *(f"{one.false} of {one.detections}" for one in found))
-    )
-    rows += [(f"IoU of {name}", *(f"{one.iou[name]:.2f}" for one in found)) for name in CLASSES]
-    heads = tables.figures(*(one.place for one in found))
-    tables.show(out, [*tables.names("YOLOX-nano, ESPNetv2"), *heads], rows)
+        found = measure_realism(
+            places or ("",), named, frames, appearance, weights, folder, progress
+        )
+    columns = {f"{one['place']}, {one['split']}, before": figures_of(one) for one in earlier}
+    columns |= {f"{one.place}, {one.split}": figures_of(as_json(one)) for one in found}
+    names = dict.fromkeys(name for figures in columns.values() for name in figures)
+    rows = [(name, *(figures.get(name, "") for figures in columns.values())) for name in names]
+    tables.show(out, [*tables.names(""), *tables.figures(*columns)], rows)
     if folder is not None:
         out.print(f"Pictures with boxes, and realism.json: {folder}", highlight=False)
-
-
-def _found_of(one: Realism, size: str) -> str:
-    found, of = one.people[size]
-    return f"{found} of {of}" + (f" ({found / of:.2f})" if of else "")
 
 
 bench_app = typer.Typer()
@@ -351,9 +350,9 @@ def bench(
     compare: Annotated[
         Path | None,
         typer.Option(
-            metavar="CHECKOUT",
-            help="For `environment` and `camera`: measure this checkout in turns, too, and show "
-            "the ratios.",
+            metavar="PATH",
+            help="For `environment` and `camera`: a checkout, measured in turns, too, with the "
+            "ratios. For `realism`: realism.json of another run, shown beside this one.",
         ),
     ] = None,
     rounds: Annotated[
@@ -435,7 +434,7 @@ def bench(
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="For `realism`: files of YOLOX-nano and ESPNetv2, as of the policy `follow`.",
+            help="For `realism`: files of YOLOX-nano, FastestDet and ESPNetv2.",
         ),
     ] = None,
     places: Annotated[
@@ -446,7 +445,17 @@ def bench(
             help="For `realism`: a map; default: the cities of `long-horizon`; repeatable.",
         ),
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="For `realism`: frames of each place.")] = 100,
+    split: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SPLIT",
+            help="For `realism`: routes of val, on which looks are tuned, or of test, which are "
+            "held out; default: val; repeatable.",
+        ),
+    ] = None,
+    frames: Annotated[
+        int, typer.Option(min=1, help="For `realism`: frames of each place and split.")
+    ] = 80,
     appearance: Appears = "splats",
 ) -> None:
     """Measure the speed of an environment process or of cameras, behaviour in traffic, how far a
@@ -476,7 +485,7 @@ def bench(
         bench_people(jobs)
         return
     if what == "realism":
-        bench_realism(places or (), frames, appearance, weights, folder)
+        bench_realism(places or (), split or ("val",), frames, appearance, weights, folder, compare)
         return
     if what == "exploit":
         named, sought, goals = (

@@ -5,21 +5,35 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose
-from cosim.core.state import LABELS, People, RobotState, Street
+from cosim.core.state import LABELS, Frame, People, RobotState, Street
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City
 from physics.cameras.gl.camera import GlCamera
-from physics.cameras.view import robot_shot
+from physics.cameras.view import robot_shot, shot
 from physics.dynamics.world import BulletWorld
+from physics.ground.tiles import tiles_within
 from scenarios.places.nets import surface_of_place
+from scenarios.suites.catalog import load_suite
+from scenarios.tools.bench.detectors import (
+    DETECTORS,
+    FASTEST_DET,
+    REAL_HEIGHTS_PX,
+    decode_fastest,
+)
 from scenarios.tools.bench.realism import (
+    ALL,
     CAMERA,
+    CITY,
+    CITY_ROUTES,
+    Picture,
     Realism,
     SeenPeople,
+    Things,
     count_boxes,
     count_classes,
     seen_people,
@@ -28,6 +42,16 @@ from tests.conftest import Cosim
 from tests.support.follow_weights import make_weights
 
 BLANK = np.zeros((288, 512), dtype=np.uint8)
+
+
+class Named(Things):
+    """Calls everything a thing."""
+
+    def __init__(self) -> None:
+        pass
+
+    def under(self, frame: Frame, box: object) -> str:
+        return "thing"
 
 
 def test_boxes_are_counted() -> None:
@@ -45,17 +69,61 @@ def test_boxes_are_counted() -> None:
         ],
         dtype=float,
     )
+    frame = Frame(np.zeros((288, 512, 3), dtype=np.uint8), labels)
     counts = Realism("here")
-    found, false = count_boxes(counts, boxes, seen, labels)
+    found, false = count_boxes(
+        counts, "YOLOX-nano", boxes, Picture(frame, seen, Named(), (ALL, "fog"))
+    )
     assert found.tolist() == [True, False, False, True]
     assert false.tolist() == [False, False, False, False, True, True]
-    assert counts.people == {"taller than 60 px": [1, 1], "24 to 60 px": [0, 1]}
-    assert (counts.detections, counts.false) == (6, 2)
+    for condition in (ALL, "fog"):
+        got = counts.detected["YOLOX-nano"][condition]
+        assert got.people == {"taller than 60 px": [1, 1], "24 to 60 px": [0, 1]}
+        assert (got.boxes, got.false) == (6, {"thing": 2})
     none = SeenPeople(np.zeros((0, 4)), np.zeros(0, dtype=bool))
-    count_boxes(counts, boxes[4:5], none, labels)
-    count_boxes(counts, np.zeros((0, 4)), seen, labels)
-    assert (counts.detections, counts.false) == (7, 3)
-    assert counts.people["taller than 60 px"] == [1, 2]
+    count_boxes(counts, "YOLOX-nano", boxes[4:5], Picture(frame, none, Named(), (ALL,)))
+    count_boxes(counts, "YOLOX-nano", np.zeros((0, 4)), Picture(frame, seen, Named(), (ALL,)))
+    got = counts.detected["YOLOX-nano"][ALL]
+    assert (got.boxes, got.false) == (7, {"thing": 3})
+    assert got.people["taller than 60 px"] == [1, 2]
+    assert counts.detected["YOLOX-nano"]["night"].boxes == 0
+    assert counts.detected["FastestDet"][ALL].boxes == 0
+
+
+def test_boxes_of_fastest_det_are_decoded() -> None:
+    """A sure person in a cell is one box around it; other classes and unsure cells are none."""
+    output = np.zeros((85, 22, 22), dtype=np.float32)
+    output[:, 5, 10] = output[:, 5, 11] = output[:, 20, 3] = output[:, 1, 1] = 0.01
+    output[[0, 5], 5, 10] = 0.9
+    output[[0, 5], 5, 11] = 0.8  # the same person again
+    output[[0, 7], 20, 3] = 0.9  # another class
+    output[[0, 5], 1, 1] = 0.6  # unsure
+    output[1:3, 5, 10] = output[1:3, 5, 11] = 0.0
+    output[1, 5, 11] = np.arctanh(-0.9)
+    output[3:5, 5, 10:12] = -2.0
+    (box,) = decode_fastest(output, 440, 220)
+    middle, size = 0.5 * (box[:2] + box[2:]), box[2:] - box[:2]
+    assert middle == pytest.approx([200.0, 50.0]) and size == pytest.approx(
+        np.array([440.0, 220.0]) / (1.0 + np.exp(2.0)), rel=1e-5
+    )
+
+
+def test_the_number_expected_of_real_people_follows_their_heights() -> None:
+    """Heights below the least class count 0; each other one counts the recall of its class."""
+    one = DETECTORS["YOLOX-nano"]
+    heights = np.array([10.0, *REAL_HEIGHTS_PX, 300.0])
+    assert one.expected(heights) == pytest.approx(sum(one.real_recall) + one.real_recall[-1])
+    assert all(len(other.real_recall) == len(REAL_HEIGHTS_PX) for other in DETECTORS.values())
+
+
+def test_routes_of_the_splits_are_of_their_split() -> None:
+    """No route on which looks are tuned is in a city of the held-out ones."""
+    by_id = {one.id: one for one in load_suite(CITY).scenarios}
+    places = {}
+    for split, ids in CITY_ROUTES.items():
+        assert {by_id[name].split for name in ids} == {split}
+        places[split] = {by_id[name].place for name in ids}
+    assert not places["val"] & places["test"]
 
 
 def test_classes_are_compared_by_pixels() -> None:
@@ -70,7 +138,8 @@ def test_classes_are_compared_by_pixels() -> None:
     count_classes(counts, kinds, labels)
     assert counts.iou["sky"] == pytest.approx(2 / 3)
     assert counts.iou["walkable"] == 1.0 and counts.iou["building"] == 0.0
-    assert np.isnan(counts.iou["person"])
+    assert counts.recall["sky"] == 1.0 and counts.recall["building"] == 0.0
+    assert np.isnan(counts.iou["person"]) and np.isnan(counts.recall["person"])
 
 
 @pytest.mark.engine
@@ -104,17 +173,53 @@ def test_people_are_found_in_the_labels() -> None:
 
 
 @pytest.mark.engine
-def test_the_command_counts_and_writes_pictures(cosim: Cosim, tmp_path: Path) -> None:
-    """A frame of a city gives a table, a picture and the same numbers as JSON."""
-    weights = make_weights(tmp_path)
-    out = tmp_path / "out"
-    done = cosim(
-        *("bench", "realism", "--frames", "1", "--weights", str(weights), "--out", str(out))
+def test_what_a_false_box_shows_is_named() -> None:
+    """Boxes on a tree's crown, on its trunk and on the sky are told apart."""
+    surface = surface_of_place(City(seed=7, size_m=300.0))
+    tree, foot_m = next(
+        (prop, z)
+        for key in tiles_within(150.0, 150.0, 150.0)
+        for prop, z in surface.chunk(key).props
+        if prop.kind == "tree" and np.hypot(prop.x_m - 150.0, prop.y_m - 150.0) < 120.0
     )
+    eye = np.array([tree.x_m - 8.0, tree.y_m, foot_m + 1.5])
+    taken = shot(eye, eye + np.array([1.0, 0.0, 0.25]), (512, 288), 60.0)
+    with BulletWorld(surface) as world, GlCamera(world, CAMERA, depth=True) as camera:
+        frame = camera.picture(eye, taken.target_m, Street(0), size=taken.size, fov_deg=60.0)
+    scenario = load_suite(CITY).scenarios[0]
+    things = Things(surface, msgspec.structs.replace(scenario, obstacles=()), taken)
+
+    def at(height_m: float) -> np.ndarray:
+        right, above, ahead = taken.axes
+        ray = np.array([tree.x_m, tree.y_m, foot_m + height_m]) - eye
+        wide, tall = taken.half_picture
+        u = 256.0 * (1.0 + ray @ right / (ray @ ahead) / wide)
+        v = 144.0 * (1.0 - ray @ above / (ray @ ahead) / tall)
+        return np.array([u - 3.0, v - 3.0, u + 3.0, v + 3.0])
+
+    assert things.under(frame, at(1.0)) == "tree"
+    assert things.under(frame, at(4.0)) == "crown"
+    assert things.under(frame, np.array([0.0, 0.0, 12.0, 6.0])) in ("sky", "building")
+
+
+@pytest.mark.engine
+def test_the_command_counts_and_writes_pictures(cosim: Cosim, tmp_path: Path) -> None:
+    """A frame of a city gives a table, a picture of each detector and the numbers as JSON."""
+    weights = make_weights(tmp_path, FASTEST_DET)
+    out = tmp_path / "out"
+    before = tmp_path / "before.json"
+    common = ("bench", "realism", "--frames", "1", "--weights", str(weights))
+    done = cosim(*common, "--out", str(out))
     assert done.returncode == 0, done.stderr
     (found,) = json.loads((out / "realism.json").read_text())
-    assert found["frames"] == 1 and 0.3 < found["iou"]["walkable"] <= 1.0
-    assert len(list(out.glob("*.png"))) == 1
+    assert found["frames"] == {"all": 1} and 0.3 < found["iou"]["walkable"] <= 1.0
+    assert set(found["detected"]) == {"YOLOX-nano", "FastestDet"} and found["split"] == "val"
+    assert len(list(out.glob("*.png"))) == 2
     assert f"{found['iou']['sky']:.2f}" in done.stdout
+    before.write_text("[{}]")
+    refused = cosim(*common, "--compare", str(before))
+    assert refused.returncode == 2 and "is no realism.json" in refused.stderr
+    refused = cosim(*common, "--split", "held-out")
+    assert refused.returncode == 2 and "Valid choices: test, val" in refused.stderr
     refused = cosim("bench", "realism", "--weights", str(tmp_path / "none"))
     assert refused.returncode == 2 and "no folder" in refused.stderr

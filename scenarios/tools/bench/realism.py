@@ -1,6 +1,6 @@
 """Measures what networks trained on real streets see in pictures: `cosim bench realism`.
 
-Frames are taken while the oracle drives routes with a crowd. YOLOX-nano's people and ESPNetv2's
+Frames are taken while the oracle drives routes with a crowd. The boxes of detectors and ESPNetv2's
 classes are compared with the labels of the same pictures.
 """
 
@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -18,37 +19,62 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.errors import MapError, SpecError
+from cosim.core.errors import MapError, SpecError, UsageError
 from cosim.core.geometry import Floats
 from cosim.core.progress import Progress
 from cosim.core.state import LABELS, Frame, People
-from cosim.policies.follow.networks import ESPNET_GRAPH, YOLOX_NANO
-from cosim.policies.follow.policy import detect_people
+from cosim.policies.follow.networks import ESPNET_GRAPH
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.inputs import PictureInput
 from cosim.policies.onnx.pictures import picture_tensor
-from cosim.policies.onnx.weights import NetworkFile, weights_file
 from cosim.spec.camera import CameraSpec
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import Appearance
-from cosim.spec.scenario import CrowdSpec, Scenario
+from cosim.spec.scenario import CrowdSpec, Scenario, Split
+from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, robot_shot
+from physics.ground.tiles import tiles_within
+from physics.street.furniture import Prop
+from physics.street.surface import Surface, grounded_obstacles
 from scenarios.episodes.episode import Episode
 from scenarios.places.nets import surface_of_place
 from scenarios.suites.catalog import load_suite
 from scenarios.suites.sample import suite_on_map
+from scenarios.tools.bench.detectors import DETECTORS, network_graph
 
 CITY: Final = "long-horizon"
 """Suite whose routes are driven without a place: generated cities."""
+CITY_ROUTES: Final[Mapping[Split, tuple[str, ...]]] = MappingProxyType(
+    {
+        "val": tuple(f"lh-{seed:03}-00" for seed in (1, 9, 17, 21, 29, 33, 45, 57)),
+        "test": tuple(f"lh-{seed}-00" for seed in (7001, 7004, 7006, 7009, 7012, 7015, 7019, 7020)),
+    }
+)
+"""Routes of `CITY` by split. Looks are tuned on val; no tuning uses the cities of test."""
+PLACE_SEEDS: Final[Mapping[Split, range]] = MappingProxyType(
+    {"val": range(20), "test": range(100, 120)}
+)
+"""Seeds from which routes on a named place are drawn, by split."""
 CAMERA: Final = CameraSpec(512, 288, 60.0, depth=True)
-EACH_S: Final = 2.0
+FIRST_S: Final = 2.0
+"""Time of a route's first frame in seconds."""
+EACH_S: Final = 4.0
 """Seconds between frames."""
-ROUTES: Final = 5
+ROUTES: Final = 8
 """Least number of routes over which frames are spread."""
 SIZES_PX: Final = {"taller than 60 px": (60.0, np.inf), "24 to 60 px": (24.0, 60.0)}
 """Classes of people by the height of what is seen of them, in pixels."""
+CONDITIONS: Final[Mapping[str, Callable[[Scenario], bool]]] = MappingProxyType(
+    {
+        "all": lambda scenario: True,
+        "fog": lambda scenario: scenario.light.fog_m is not None,
+        "night": lambda scenario: sky_of(scenario.light, 0).lamps > 0.5,
+    }
+)
+"""Conditions of a frame's scenario; boxes are counted for each of them apart."""
+ALL: Final = "all"
 CLASSES: Final = {
     "person": ((11,), ("person",)),
     "sky": ((10,), ("sky",)),
@@ -75,6 +101,14 @@ _STREET_INPUT: Final = PictureInput(
 )
 
 
+_NAMES: Final = {number: name for name, number in LABELS.items()}
+_PROP_M: Final = 3.0
+"""Largest distance on the ground between a prop's place and its pixels, in metres."""
+_CROWN_M: Final = 2.0
+"""Height in metres above a tree's foot from which it is a crown."""
+_TREE: Final = "tree"
+
+
 class SeenPeople(NamedTuple):
     """People in a picture.
 
@@ -87,63 +121,106 @@ class SeenPeople(NamedTuple):
 
 
 @dataclass
-class Realism:
-    """Counts over the frames of a place.
+class Detections:
+    """Counts of one detector's boxes.
 
     people: found and all people by class of size.
-    detections, false: boxes, and those without a person.
-    common, joined: pixels that network and labels call the same class, and that either calls so.
+    expected: how many real people of the same heights would be found.
+    boxes: number of boxes.
+    false: boxes without a person, by what they show (`Things.under`).
     """
 
-    place: str
-    frames: int = 0
     people: dict[str, list[int]] = field(
         default_factory=lambda: {name: [0, 0] for name in SIZES_PX}
     )
-    detections: int = 0
-    false: int = 0
+    expected: dict[str, float] = field(default_factory=lambda: dict.fromkeys(SIZES_PX, 0.0))
+    boxes: int = 0
+    false: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass
+class Realism:
+    """Counts over the frames of a place.
+
+    frames: number of frames of each condition.
+    detected: counts by detector and condition.
+    common, joined, labelled: pixels that network and labels call the same class, that either
+        calls so, and that the labels call so.
+    """
+
+    place: str
+    split: Split = "val"
+    frames: Counter[str] = field(default_factory=Counter)
+    detected: dict[str, dict[str, Detections]] = field(
+        default_factory=lambda: {
+            name: {condition: Detections() for condition in CONDITIONS} for name in DETECTORS
+        }
+    )
     common: Counter[str] = field(default_factory=Counter)
     joined: Counter[str] = field(default_factory=Counter)
+    labelled: Counter[str] = field(default_factory=Counter)
 
     @property
     def iou(self) -> dict[str, float]:
         """Intersection over union of each class, over all frames; NaN if it never occurs."""
-        return {
-            name: self.common[name] / self.joined[name] if self.joined[name] else float("nan")
-            for name in CLASSES
-        }
+        return {name: _ratio(self.common[name], self.joined[name]) for name in CLASSES}
+
+    @property
+    def recall(self) -> dict[str, float]:
+        """Share of each class's pixels that the network calls so; NaN if it never occurs."""
+        return {name: _ratio(self.common[name], self.labelled[name]) for name in CLASSES}
+
+
+class Picture(NamedTuple):
+    """A frame with what the simulation knows about it.
+
+    things: names what a box shows
+    conditions: those of `CONDITIONS` that hold
+    """
+
+    frame: Frame
+    seen: SeenPeople
+    things: Things
+    conditions: tuple[str, ...]
 
 
 def measure_realism(
     places: Sequence[str],
+    splits: Sequence[Split],
     frames: int,
     appearance: Appearance,
     weights: Path | None,
     out: Path | None,
     progress: Progress,
 ) -> list[Realism]:
-    """Return the counts of each place; "" is generated cities.
+    """Return the counts of each place and split; the place "" is generated cities.
 
-    frames: number of frames of each place, fewer if its routes are too short.
-    weights: folder of both networks, by default as for the policy `follow`.
+    frames: number of frames of each, fewer if its routes are too short.
+    weights: folder of the networks' files, by default as for the policy `follow`.
     out: folder for pictures with boxes, and for all counts as realism.json.
     """
-    street, people = (_graph(one, weights) for one in (ESPNET_GRAPH, YOLOX_NANO))
+    street = network_graph(ESPNET_GRAPH, weights)
+    graphs = {name: network_graph(one.file, weights) for name, one in DETECTORS.items()}
     found = []
-    for place in places:
-        name = place or CITY
-        counts = Realism(name)
+    for place, split in itertools.product(places, splits):
+        counts = Realism(place or CITY, split)
         each = max(1, frames // _PICTURES)
-        for picture, seen in _frames(place, frames, appearance, progress):
-            boxes = detect_people(picture.rgb, people)
-            judged = count_boxes(counts, boxes, seen, picture.labels)
-            count_classes(counts, street_kinds(picture.rgb, street), picture.labels)
-            if out is not None and counts.frames % each == 0:
-                _write(out, f"{name}-{counts.frames:03}.png", picture.rgb, boxes, seen, judged)
-            counts.frames += 1
-            progress(f"{name}: {counts.frames} frames", counts.frames / frames)
+        name = f"{counts.place}-{split}"
+        for picture in _pictures(place, split, frames, appearance, progress):
+            number = counts.frames[ALL]
+            rgb, labels = picture.frame.rgb, picture.frame.labels
+            counts.frames.update(picture.conditions)
+            for detector, graph in graphs.items():
+                boxes = DETECTORS[detector].detect(rgb, graph)
+                judged = count_boxes(counts, detector, boxes, picture)
+                if out is not None and number % each == 0:
+                    path = out / f"{name}-{number:03}-{detector}.png"
+                    _write(path, rgb, boxes, picture.seen, judged)
+            count_classes(counts, street_kinds(rgb, street), labels)
+            progress(f"{name}: {number + 1} frames", (number + 1) / frames)
         found.append(counts)
     if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
         (out / "realism.json").write_bytes(
             msgspec.json.format(msgspec.json.encode([as_json(one) for one in found]), indent=1)
         )
@@ -154,33 +231,118 @@ def as_json(one: Realism) -> dict[str, Any]:
     """Return the counts of a place as values of JSON."""
     return {
         "place": one.place,
-        "frames": one.frames,
-        "people": {name: {"found": a, "of": b} for name, (a, b) in one.people.items()},
-        "detections": one.detections,
-        "false": one.false,
+        "split": one.split,
+        "frames": dict(one.frames),
+        "detected": {
+            name: {
+                condition: {
+                    "people": {
+                        size: {"found": a, "expected": got.expected[size], "of": b}
+                        for size, (a, b) in got.people.items()
+                    },
+                    "boxes": got.boxes,
+                    "false": dict(got.false.most_common()),
+                }
+                for condition, got in by_condition.items()
+                if one.frames[condition]
+            }
+            for name, by_condition in one.detected.items()
+        },
         "iou": one.iou,
+        "recall": one.recall,
     }
 
 
+def read_realism(path: Path) -> list[dict[str, Any]]:
+    """Read the counts of another run, as written to realism.json. Raises UsageError."""
+    try:
+        found = msgspec.json.decode(path.read_bytes())
+        for one in found:
+            figures_of(one)
+    except OSError as error:
+        raise UsageError(f"--compare {path}: cannot be read: {error.strerror}") from error
+    except (msgspec.DecodeError, TypeError, KeyError, AttributeError) as error:
+        raise UsageError(
+            f"--compare {path}: is no realism.json of `cosim bench realism --out FOLDER`"
+        ) from error
+    return list(found)
+
+
+def figures_of(one: Mapping[str, Any]) -> dict[str, str]:
+    """Return the rows of a place's table, in order, from its values of JSON."""
+    rows = {"frames": str(one["frames"][ALL])}
+    for name, by_condition in one["detected"].items():
+        for condition, got in by_condition.items():
+            where = name if condition == ALL else f"{name}, {condition}"
+            for size, people in got["people"].items():
+                rows[f"{where}: people {size}, found"] = _share_of(people["found"], people["of"])
+                rows[f"{where}: people {size}, if real"] = _share_of(
+                    round(people["expected"]), people["of"]
+                )
+            rows[f"{where}: false boxes"] = _share_of(sum(got["false"].values()), got["boxes"])
+    for what, word in (("iou", "IoU"), ("recall", "recall")):
+        for name, value in one[what].items():
+            rows[f"ESPNetv2: {word} of {name}"] = "" if value is None else f"{value:.2f}"
+    for name, by_condition in one["detected"].items():
+        wrong = by_condition[ALL]["false"]
+        rows |= {f"{name}: false on {what}": str(wrong[what]) for what in sorted(wrong)}
+    return rows
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
+
+def _share_of(part: int, whole: int) -> str:
+    return f"{part} of {whole}" + (f" ({part / whole:.2f})" if whole else "")
+
+
+class Things:
+    """Names what a box in a picture shows: a label, or the kind of street furniture."""
+
+    def __init__(self, surface: Surface, scenario: Scenario, taken: Shot) -> None:
+        self._surface = surface
+        self._taken = taken
+        self._obstacles = grounded_obstacles(scenario.obstacles, surface)
+
+    def under(self, frame: Frame, box: Floats) -> str:
+        """Return the most frequent label in a box's inner part (4,); for props their kind.
+
+        A tree is its crown where the box's middle is `_CROWN_M` above its foot.
+        """
+        assert frame.labels is not None
+        left, top, right, bottom = _inner(box, frame.labels.shape)
+        inner = frame.labels[top:bottom, left:right]
+        label = _NAMES[int(np.bincount(inner.ravel(), minlength=1).argmax())]
+        if label != "prop":
+            return label
+        v, u = np.nonzero(inner == LABELS["prop"])
+        at = np.median(_on_map(frame, self._taken, v + top, u + left), axis=0)
+        near = self._nearest(at)
+        if near is None:
+            return label
+        prop, foot_m = near
+        return "crown" if prop.kind == _TREE and at[2] - foot_m > _CROWN_M else prop.kind
+
+    def _nearest(self, at: Floats) -> tuple[Prop, float] | None:
+        """Return the prop nearest to a point (3,) of the map and the height of its foot."""
+        x, y = float(at[0]), float(at[1])
+        keys = tiles_within(x, y, _PROP_M)
+        props = [*self._obstacles, *(one for key in keys for one in self._surface.chunk(key).props)]
+        if not props:
+            return None
+        away = [float(np.hypot(prop.x_m - x, prop.y_m - y)) for prop, _ in props]
+        best = int(np.argmin(away))
+        return props[best] if away[best] < _PROP_M else None
+
+
 def count_boxes(
-    counts: Realism, boxes: Floats, seen: SeenPeople, labels: NDArray[np.uint8] | None
+    counts: Realism, detector: str, boxes: Floats, picture: Picture
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Count detected boxes (M, 4). Returns who is found (N,), and which boxes are false (M,)."""
+    seen, labels = picture.seen, picture.frame.labels
     assert labels is not None
-    overlap = _overlaps(seen.boxes, boxes)
-    found = np.zeros(len(seen.boxes), dtype=bool)
-    free = np.ones(len(boxes), dtype=bool)
-    for at in np.argsort(-overlap, axis=None, kind="stable"):
-        who, box = divmod(int(at), len(boxes))
-        if overlap[who, box] < _SAME:
-            break
-        if free[box] and not found[who]:
-            found[who], free[box] = True, False
-    heights = seen.boxes[:, 3] - seen.boxes[:, 1]
-    for name, (least, most) in SIZES_PX.items():
-        rows = seen.whole & (heights >= least) & (heights < most)
-        counts.people[name][0] += int((rows & found).sum())
-        counts.people[name][1] += int(rows.sum())
+    found, overlap = _matched(seen.boxes, boxes)
     nearest = overlap.max(axis=0, initial=0.0)
     false = np.array(
         [
@@ -189,8 +351,17 @@ def count_boxes(
         ],
         dtype=bool,
     )
-    counts.detections += len(boxes)
-    counts.false += int(false.sum())
+    under = Counter(picture.things.under(picture.frame, box) for box in boxes[false])
+    heights = seen.boxes[:, 3] - seen.boxes[:, 1]
+    for condition in picture.conditions:
+        got = counts.detected[detector][condition]
+        for name, (least, most) in SIZES_PX.items():
+            rows = seen.whole & (heights >= least) & (heights < most)
+            got.people[name][0] += int((rows & found).sum())
+            got.people[name][1] += int(rows.sum())
+            got.expected[name] += DETECTORS[detector].expected(heights[rows])
+        got.boxes += len(boxes)
+        got.false += under
     return found, false
 
 
@@ -209,6 +380,7 @@ def count_classes(
         exact = np.isin(there, [LABELS[label] for label in ours])
         counts.common[name] += int((network & exact).sum())
         counts.joined[name] += int((network | exact).sum())
+        counts.labelled[name] += int(exact.sum())
 
 
 def street_kinds(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.intp]:
@@ -221,16 +393,13 @@ def street_kinds(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.intp]:
 def seen_people(frame: Frame, people: People, taken: Shot) -> SeenPeople:
     """Return the people in a picture, by their pixels' places on the ground."""
     assert frame.labels is not None and frame.depth is not None
-    height, width = frame.labels.shape
+    height = frame.labels.shape[0]
     v, u = np.nonzero(frame.labels == LABELS["person"])
     if not len(v) or not len(people.xy):
         return SeenPeople(np.zeros((0, 4)), np.zeros(0, dtype=bool))
-    wide, tall = taken.half_picture
+    tall = taken.half_picture[1]
     depth = frame.depth[v, u].astype(float)
-    aside = (2.0 * (u + 0.5) / width - 1.0) * wide * depth
-    up = (1.0 - 2.0 * (v + 0.5) / height) * tall * depth
-    right, above, ahead = taken.axes
-    at = taken.eye_m + aside[:, None] * right + up[:, None] * above + depth[:, None] * ahead
+    at = _on_map(frame, taken, v, u)
     away = np.hypot(*(at[:, None, :2] - people.xy[None]).transpose(2, 0, 1))
     owner = away.argmin(axis=1)
     near = away.min(axis=1) < _APART_M
@@ -245,21 +414,27 @@ def seen_people(frame: Frame, people: People, taken: Shot) -> SeenPeople:
     return SeenPeople(np.array(boxes, dtype=float).reshape(-1, 4), np.array(whole, dtype=bool))
 
 
-def _graph(network: NetworkFile, weights: Path | None) -> Graph:
-    """Return a network's graph. Raises UsageError if its file is missing or differs."""
-    beside = () if weights is None else (weights,)
-    path = weights_file("follow", network.name, network.facts, network.source, beside)
-    network.check(path, path.read_bytes())
-    return Graph(path)
+def _on_map(frame: Frame, taken: Shot, v: NDArray[np.intp], u: NDArray[np.intp]) -> Floats:
+    """Return (N, 3) points of the map that pixels in rows `v` and columns `u` show."""
+    assert frame.depth is not None
+    height, width = frame.depth.shape
+    wide, tall = taken.half_picture
+    depth = frame.depth[v, u].astype(float)
+    aside = (2.0 * (u + 0.5) / width - 1.0) * wide * depth
+    up = (1.0 - 2.0 * (v + 0.5) / height) * tall * depth
+    right, above, ahead = taken.axes
+    return np.asarray(
+        taken.eye_m + aside[:, None] * right + up[:, None] * above + depth[:, None] * ahead
+    )
 
 
-def _frames(
-    place: str, frames: int, appearance: Appearance, progress: Progress
-) -> Iterator[tuple[Frame, SeenPeople]]:
+def _pictures(
+    place: str, split: Split, frames: int, appearance: Appearance, progress: Progress
+) -> Iterator[Picture]:
     """Yield pictures while routes of a place are driven, the same number on each."""
     left = frames
     each = -(-frames // ROUTES)
-    for scenario in _scenarios(place):
+    for scenario in _scenarios(place, split):
         for one in itertools.islice(_driven(scenario, appearance, progress), min(each, left)):
             left -= 1
             yield one
@@ -267,12 +442,13 @@ def _frames(
             return
 
 
-def _scenarios(place: str) -> Iterator[Scenario]:
+def _scenarios(place: str, split: Split) -> Iterator[Scenario]:
     """Yield routes with a crowd: of a suite, or drawn on a place; short ones where it is small."""
     if not place:
-        yield from load_suite(CITY).scenarios[::4]
+        by_id = {one.id: one for one in load_suite(CITY).scenarios}
+        yield from (by_id[name] for name in CITY_ROUTES[split])
         return
-    for seed in range(4 * ROUTES):
+    for seed in PLACE_SEEDS[split]:
         try:
             yield from suite_on_map("long-horizon", place, seed, 1).scenarios
         except (SpecError, MapError):
@@ -282,13 +458,12 @@ def _scenarios(place: str) -> Iterator[Scenario]:
                 )
 
 
-def _driven(
-    scenario: Scenario, appearance: Appearance, progress: Progress
-) -> Iterator[tuple[Frame, SeenPeople]]:
+def _driven(scenario: Scenario, appearance: Appearance, progress: Progress) -> Iterator[Picture]:
     driver = load_policy(_DRIVER)
     surface = surface_of_place(scenario.place)
     robot_model = robot_called(scenario.robot)
     options = EpisodeOptions(appearance=appearance)
+    conditions = tuple(name for name, holds in CONDITIONS.items() if holds(scenario))
     progress(f"starting {scenario.id}")
     with (
         Episode(scenario, driver.manifest, options) as episode,
@@ -296,15 +471,42 @@ def _driven(
     ):
         driver.reset(episode.id, episode.seed)
         observation = episode.reset()
-        next_s = 0.0
+        next_s = FIRST_S
         while not episode.over:
             if episode.time_s >= next_s:
                 next_s = episode.time_s + EACH_S
                 robot, street = episode.moment.robot, episode.moment.street
                 frame = camera.render(robot, street)
                 taken = robot_shot(surface, robot_model, CAMERA, robot)
-                yield frame, seen_people(frame, street.people, taken)
+                seen = seen_people(frame, street.people, taken)
+                yield Picture(frame, seen, Things(surface, scenario, taken), conditions)
             observation = episode.advance(driver.act(observation))
+
+
+def _matched(people: Floats, boxes: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Match people (N, 4) with boxes (M, 4), the largest overlap first.
+
+    Returns who is found (N,), and all overlaps (N, M).
+    """
+    overlap = _overlaps(people, boxes)
+    found = np.zeros(len(people), dtype=bool)
+    free = np.ones(len(boxes), dtype=bool)
+    for at in np.argsort(-overlap, axis=None, kind="stable"):
+        who, box = divmod(int(at), len(boxes))
+        if overlap[who, box] < _SAME:
+            break
+        if free[box] and not found[who]:
+            found[who], free[box] = True, False
+    return found, overlap
+
+
+def _inner(box: Floats, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """Return the middle two thirds of a box (4,) inside a picture, at least one pixel."""
+    left, top, right, bottom = np.asarray(box, dtype=float).tolist()
+    aside, down = (right - left) / 6.0, (bottom - top) / 6.0
+    x0 = min(max(int(left + aside), 0), shape[1] - 1)
+    y0 = min(max(int(top + down), 0), shape[0] - 1)
+    return x0, y0, max(int(right - aside), x0 + 1), max(int(bottom - down), y0 + 1)
 
 
 def _overlaps(one: Floats, other: Floats) -> Floats:
@@ -324,8 +526,7 @@ def _share(mask: NDArray[np.bool_], box: Floats) -> float:
 
 
 def _write(
-    out: Path,
-    name: str,
+    path: Path,
     rgb: NDArray[np.uint8],
     boxes: Floats,
     seen: SeenPeople,
@@ -341,8 +542,8 @@ def _write(
         cv2.rectangle(drawn, *_corners(box), colour, 1)
     for box in boxes[false]:
         cv2.rectangle(drawn, *_corners(box), (0, 0, 255), 1)
-    out.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(out / name), drawn)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), drawn)
 
 
 def _corners(box: Floats) -> tuple[tuple[int, int], tuple[int, int]]:
