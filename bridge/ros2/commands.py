@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from bridge.ros2.encode import ns_of
-from bridge.ros2.types import NO_HASH, decode
+from bridge.ros2.messages import ns_of
+from bridge.ros2.types import NO_HASH, from_cdr
 from bridge.ros2.wire import Attachment
 from cosim.core.geometry import Floats
 from cosim.core.state import Command
@@ -62,7 +62,7 @@ def judged(
         return Judged(fault=f"{got.by} {fault}")
     name = got.type or (TWIST if len(got.payload) <= _TWIST_B else TWIST_STAMPED)
     try:
-        sent = decode(got.payload, name)
+        sent = from_cdr(got.payload, name)
     except ValueError as error:
         return Judged(fault=f"{got.by} sends {CMD_VEL} with bytes that are {error}"[:400])
     twist = sent if name == TWIST else sent.twist
@@ -126,7 +126,7 @@ def plan_in_robot_frame(payload: bytes, pose: Odometry) -> Floats | None:
     steps of the path.
     """
     try:
-        path = decode(payload, PATH)
+        path = from_cdr(payload, PATH)
     except ValueError:
         return None
     if path.header.frame_id.strip("/") not in _FRAMES or not path.poses:

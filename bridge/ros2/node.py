@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from bridge.ros2.commands import Received
-from bridge.ros2.types import encode
+from bridge.ros2.types import to_cdr
 from bridge.ros2.wire import (
     DIALECTS,
     Attachment,
@@ -90,7 +90,7 @@ class Ros2Node:
         attached = b""
         if self._dialect.attached:
             attached = Attachment(publisher.numbers[0], time.time_ns(), publisher.gid).data
-        self._session.publish(publisher.key, encode(sent), attached)
+        self._session.publish(publisher.key, to_cdr(sent), attached)
 
     def has_subscriber(self, topic: str) -> bool:
         """Return whether another node subscribes to an advertised topic."""

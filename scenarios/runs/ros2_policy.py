@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Final, cast
 import numpy as np
 
 from bridge.policy_server import PolicyFault
-from bridge.ros2 import encode
+from bridge.ros2 import messages
 from bridge.ros2.commands import (
     COMMAND_TYPES,
     PATH,
@@ -33,7 +33,7 @@ from bridge.ros2.commands import (
     judged,
     plan_in_robot_frame,
 )
-from bridge.ros2.encode import TOPICS
+from bridge.ros2.messages import EPISODE, TOPICS
 from bridge.ros2.node import Network, Ros2Node
 from bridge.ros2.types import message_store
 from bridge.ros2.wire import Endpoint, full_topic, gid_of, type_hash
@@ -87,7 +87,7 @@ class Ros2Policy:
         self._plan: Received | None = None
         self._remarks: dict[str, None] = {}
         self._controller: tuple[bytes, str] | None = None
-        self._stream: encode.EpisodeStream | None = None
+        self._stream: messages.EpisodeStream | None = None
         self._last: tuple[Command, int] | None = None
         self._waits_s = 0.0
 
@@ -96,7 +96,7 @@ class Ros2Policy:
         node = self._joined()
         monotonic = self.settings.clock == "monotonic"
         elapsed_s = _elapsed_s.get(self.settings.domain, 0.0) if monotonic else 0.0
-        self._stream = encode.EpisodeStream(episode_id, seed, elapsed_s)
+        self._stream = messages.EpisodeStream(episode_id, seed, elapsed_s)
         self._controller = None
         self._last = self._absent_s = None
         self.took_ms = []
@@ -249,7 +249,7 @@ class Ros2Policy:
         got, self._plan = self._plan, None
         if got is None or len(got.payload) > LARGEST_B or (got.type and got.type != PATH):
             return command
-        points = plan_in_robot_frame(got.payload, encode.pose_of(seen))
+        points = plan_in_robot_frame(got.payload, messages.pose_of(seen))
         if points is None:
             self._remark(f"{got.by} sends a {PLAN} that is empty, malformed or not in map or odom")
             return command
@@ -298,7 +298,9 @@ class Ros2Policy:
         """Return why there is no command, as far as the nodes around and their messages show."""
         there = node.others
         runs = {
-            end.session for end in there if end.kind == "MP" and end.topic.endswith(encode.EPISODE)
+            end.session
+            for end in there
+            if end.kind == "MP" and end.topic.endswith(messages.EPISODE)
         }
         others = [end for end in there if end.session not in runs]
         settings = self.settings

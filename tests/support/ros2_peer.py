@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple, Self
 
-from bridge.ros2 import encode, types
+from bridge.ros2 import messages, types
 from bridge.ros2.commands import TWIST, TWIST_STAMPED, Received
 from bridge.ros2.node import Network, Ros2Node
 from bridge.session import Session, open_session
@@ -49,7 +49,7 @@ def twist(command: Command) -> Any:
 
 def stamped(command: Command, time_ns: int) -> Any:
     """Return a command as a TwistStamped."""
-    return types.message(TWIST_STAMPED, encode.header(time_ns, encode.BASE), twist(command))
+    return types.message(TWIST_STAMPED, messages.header(time_ns, messages.BASE), twist(command))
 
 
 Answer = Callable[["Peer", Seen], None]
@@ -92,7 +92,7 @@ class Peer:
             )  # type: ignore[misc]
 
     def _take(self, topic: str, got: Received) -> None:
-        message = types.decode(got.payload, SENT[topic])
+        message = types.from_cdr(got.payload, SENT[topic])
         self.seen[topic].append(message)
         with self._lock:
             if topic == "/goal_pose":
@@ -102,8 +102,8 @@ class Peer:
             if self._unanswered is not None and self.goal is not None:
                 odometry, self._unanswered = self._unanswered, None
                 at, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
-                time_ns = encode.ns_of(odometry.header.stamp)
-                self._answer(self, Seen(time_ns, at.x, at.y, encode.heading_of(turn), self.goal))
+                time_ns = messages.ns_of(odometry.header.stamp)
+                self._answer(self, Seen(time_ns, at.x, at.y, messages.heading_of(turn), self.goal))
 
     def close(self) -> None:
         with self._lock:

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from bridge.ros2 import encode
+from bridge.ros2 import messages
 from bridge.ros2.commands import TWIST, TWIST_STAMPED
 from bridge.ros2.node import Network
 from bridge.session import open_session
@@ -82,9 +82,9 @@ def test_a_node_drives_in_lockstep(at: str) -> None:
                 command = driver.act(seen_at(tick))
                 assert command == steer(Seen(0, 0.1 * tick, 0.0, 0.0, (10.0, 1.0)))
         assert driver.runs == "ros2, next" and driver.clock["answer_median_ms"] > 0.0
-        stamps = [encode.ns_of(one.header.stamp) for one in peer.seen["/odom"]]
+        stamps = [messages.ns_of(one.header.stamp) for one in peer.seen["/odom"]]
         assert stamps == 2 * [10**9, 11 * 10**8, 12 * 10**8]
-        clock = [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
+        clock = [messages.ns_of(one.clock) for one in peer.seen["/clock"]]
         assert clock == 2 * [10**9 + 5 * 10**7 * tick for tick in range(5)]
         told = [msgspec.json.decode(one.data) for one in peer.seen["/cosim/episode"]]
         assert [(one["episode"], one["seed"], one["reset"]) for one in told] == [
@@ -108,7 +108,7 @@ def test_a_monotonic_clock_never_goes_back(at: str) -> None:
                 driver.reset(episode, 7)
                 for tick in (0, 2):
                     driver.act(seen_at(tick))
-            clock += [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
+            clock += [messages.ns_of(one.clock) for one in peer.seen["/clock"]]
     assert clock == sorted(set(clock)) and len(clock) == 9
 
 
@@ -317,7 +317,7 @@ def test_a_late_node_gets_the_latched_topics(at: str) -> None:
         driver.act(seen_at(0))
         with open_session(Connection(role="worker", connect=at)) as session:
             began_s = time.monotonic()
-            for topic in (encode.STATIC, encode.GOAL, encode.EPISODE):
+            for topic in (messages.STATIC, messages.GOAL, messages.EPISODE):
                 session.listen(
                     f"0{topic}/*/*",
                     lambda key, payload, _: late.update({key: payload}),
