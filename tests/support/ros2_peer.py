@@ -77,6 +77,8 @@ class Peer:
         network: Network = Network(),  # noqa: B008
         type_name: str = TWIST,
         name: str = "driver",
+        *,
+        reads: bool = True,
     ) -> None:
         self.session = _opened(endpoint)
         self.node = Ros2Node(self.session, network, name)
@@ -84,8 +86,13 @@ class Peer:
         self.goal: tuple[float, float] | None = None
         self._answer = answer
         self._lock = threading.Lock()
+        self._closed = False
         self._unanswered: Any = None
         self.node.advertise(CMD_VEL, type_name)
+        if reads:
+            self.subscribe()
+
+    def subscribe(self) -> None:
         for topic in ("/clock", "/cosim/episode", "/goal_pose", "/odom"):
             self.node.subscribe(
                 topic, (SENT[topic],), lambda got, topic=topic: self._take(topic, got)
@@ -99,7 +106,7 @@ class Peer:
                 self.goal = message.pose.position.x, message.pose.position.y
             if topic == "/odom":
                 self._unanswered = message
-            if self._unanswered is not None and self.goal is not None:
+            if self._unanswered is not None and self.goal is not None and not self._closed:
                 odometry, self._unanswered = self._unanswered, None
                 at, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
                 time_ns = messages.ns_of(odometry.header.stamp)
@@ -107,7 +114,8 @@ class Peer:
 
     def close(self) -> None:
         with self._lock:
-            self.session.close()
+            self._closed = True
+        self.session.close()
 
     def __enter__(self) -> Self:
         return self
