@@ -323,7 +323,8 @@ def test_a_restarted_node_is_not_two_nodes(at: str, dialect: Any) -> None:
             driver.reset("k1", 7)
             driver.act(seen_at(0))
         with Peer(at, network=network, name="driver"):
-            wait_until(lambda: driver.policy._node.subscriptions_arrived())  # type: ignore
+            node = driver.policy._node  # type: ignore[attr-defined]
+            wait_until(lambda: node.has_subscriber("/odom") and node.subscriptions_arrived())
             with pytest.raises(PolicyError, match=r"is gone: .* has left, and .* publishes it now"):
                 driver.act(seen_at(2, goal=PointGoal(5.0, 1.0)))
             driver.reset("k2", 7)
