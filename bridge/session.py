@@ -275,8 +275,8 @@ class Session:
 
     def has_subscriber(self, key: str) -> bool:
         """Return whether a subscription has arrived for an advertised key without a history."""
-        publisher = self._publishers[key]
-        return isinstance(publisher, zenoh.Publisher) and publisher.matching_status.matching
+        publisher: Any = self._publishers[key]  # Zenoh's stubs give a wrong type of its status
+        return isinstance(publisher, zenoh.Publisher) and bool(publisher.matching_status.matching)
 
     def listen(
         self,

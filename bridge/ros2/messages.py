@@ -122,13 +122,6 @@ def _quaternion(axes: NDArray[np.float64]) -> Any:
     return message("geometry_msgs/msg/Quaternion", float(x), float(y), float(z), float(w))
 
 
-def heading_of(turn: Any) -> float:
-    """Return the heading of a quaternion in radians."""
-    return math.atan2(
-        2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
-    )
-
-
 def _transform(time_ns: int, frame: str, child: str, at: Any, turn: Any) -> Any:
     return message(
         "geometry_msgs/msg/TransformStamped",

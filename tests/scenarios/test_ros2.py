@@ -28,7 +28,7 @@ from scenarios.runs.run import run
 from scenarios.tools.viewing.bag import write_bag
 from tests.conftest import ROOT
 from tests.support.plain import free_port
-from tests.support.ros2_peer import Seen, steer
+from tests.support.ros2_peer import Seen, heading_of, steer
 
 pytestmark = pytest.mark.engine
 SEEDED = EpisodeOptions(seed=1)
@@ -49,7 +49,7 @@ class Same:
         self.sent, *_ = messages.new_goal(seen, self.sent, 0)
         pose = messages.odometry(seen, 0).pose.pose
         assert self.sent.point is not None
-        turn = messages.heading_of(pose.orientation)
+        turn = heading_of(pose.orientation)
         return steer(Seen(0, pose.position.x, pose.position.y, turn, self.sent.point))
 
 

@@ -40,6 +40,13 @@ def steer(seen: Seen) -> Command:
     return Command(1.0 if abs(bearing) < 0.5 else 0.2, bearing)
 
 
+def heading_of(turn: Any) -> float:
+    """Return the heading of a quaternion in radians."""
+    return math.atan2(
+        2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
+    )
+
+
 def twist(command: Command) -> Any:
     """Return a command as a Twist."""
     linear = types.message("geometry_msgs/msg/Vector3", command.v_mps, 0.0, 0.0)
@@ -110,7 +117,7 @@ class Peer:
                 odometry, self._unanswered = self._unanswered, None
                 at, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
                 time_ns = messages.ns_of(odometry.header.stamp)
-                self._answer(self, Seen(time_ns, at.x, at.y, messages.heading_of(turn), self.goal))
+                self._answer(self, Seen(time_ns, at.x, at.y, heading_of(turn), self.goal))
 
     def close(self) -> None:
         with self._lock:
