@@ -275,8 +275,11 @@ class Session:
 
     def has_subscriber(self, key: str) -> bool:
         """Return whether a subscription has arrived for an advertised key without a history."""
-        publisher: Any = self._publishers[key]  # Zenoh's stubs give a wrong type of its status
-        return isinstance(publisher, zenoh.Publisher) and bool(publisher.matching_status.matching)
+        publisher = self._publishers[key]
+        if not isinstance(publisher, zenoh.Publisher):
+            return False
+        status: Any = publisher.matching_status  # a bool in Zenoh's stubs
+        return bool(status.matching)
 
     def listen(
         self,
