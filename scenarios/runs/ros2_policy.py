@@ -262,22 +262,38 @@ class Ros2Policy:
             if not got.sender:
                 there = list(node.publishers_of(CMD_VEL).values())
                 if not self._attached and len(there) > 1:
-                    raise PolicyFault(f"is {_two(there[0], there[1])}")
+                    raise PolicyFault(self._several(node, there))
             elif self._controller is not None and got.sender != self._controller.gid:
                 raise PolicyFault(self._another(node, got))
+
+    def _several(self, node: Ros2Node, there: list[Endpoint]) -> str:
+        """Return what is wrong with a command of one of several publishers."""
+        controller = self._controller
+        if controller is not None and self._has_left(node, controller.gid):
+            new = [end for end in there if end.in_words != controller.by] or there
+            return self._replaced(controller.by, new[0].in_words)
+        return f"is {_two(there[0], there[1])}"
+
+    def _has_left(self, node: Ros2Node, gid: bytes) -> bool:
+        """Return whether the token of a publisher is gone, or disappears now."""
+        node.wait_for(lambda: gid not in node.publishers_of(CMD_VEL), _LEAVING_S)
+        return gid not in node.publishers_of(CMD_VEL)
+
+    @staticmethod
+    def _replaced(by: str, other: str) -> str:
+        return (
+            f"is gone: {by} published {CMD_VEL} and has left, and {other} publishes it now. An "
+            "episode has one publisher: restart a node between runs"
+        )
 
     def _another(self, node: Ros2Node, got: Received) -> str:
         """Return what is wrong with a command of another publisher: the first one has left, or
         there are two."""
         assert self._controller is not None
         gid, by = self._controller
-        node.wait_for(lambda: gid not in node.publishers_of(CMD_VEL), _LEAVING_S)
+        if self._has_left(node, gid):
+            return self._replaced(by, got.by)
         there = node.publishers_of(CMD_VEL)
-        if gid not in there:
-            return (
-                f"is gone: {by} published {CMD_VEL} and has left, and {got.by} publishes it now. "
-                "An episode has one publisher: restart a node between runs"
-            )
         if got.sender in there:
             return f"is {_two(there[gid], there[got.sender])}"
         return (

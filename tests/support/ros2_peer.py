@@ -88,7 +88,7 @@ class Peer:
         reads: bool = True,
     ) -> None:
         self.session = _opened(endpoint)
-        self.node = Ros2Node(self.session, network, name)
+        self.node = Ros2Node(self.session, network, name, ordered=True)
         self.seen: dict[str, list[Any]] = {topic: [] for topic in SENT}
         self.goal: tuple[float, float] | None = None
         self._answer = answer
