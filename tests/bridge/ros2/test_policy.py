@@ -369,7 +369,7 @@ def test_a_long_plan_is_recorded_and_one_too_long_is_reported(at: str, capfd: An
             peer.node.publish(PLAN, one)
         answers(peer, seen)
 
-    with driven(at) as driver, Peer(at, sends) as peer:
+    with driven(at, answer_s=30.0) as driver, Peer(at, sends) as peer:
         peer.node.advertise(PLAN, PATH)
         driver.reset("k1", 7)
         ticks = iter(range(0, 2000, 2))
