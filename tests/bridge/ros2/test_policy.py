@@ -374,6 +374,7 @@ def test_a_long_plan_is_recorded_and_one_too_long_is_reported(at: str, capfd: An
         driver.reset("k1", 7)
         ticks = iter(range(0, 2000, 2))
         wait_until(lambda: isinstance(driver.act(seen_at(next(ticks))), WaypointCommand))
+        driver.act(seen_at(next(ticks)))  # the node sends its second plan
         wait_until(lambda: driver.policy._remarks.words)  # type: ignore[attr-defined]
         assert not isinstance(driver.act(seen_at(next(ticks))), WaypointCommand)
     assert capfd.readouterr().err.count("a message has at most 1048576") == 1
