@@ -213,14 +213,21 @@ class Session:
 
         return leave
 
-    def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
-        """Call `changed(key, alive)` for every liveliness token at a key, now and later."""
+    def watch(
+        self, key: str, changed: Callable[[str, bool], None], *, ordered: bool = False
+    ) -> None:
+        """Call `changed(key, alive)` for every liveliness token at a key, now and later.
+
+        ordered: See `listen`.
+        """
 
         def received(sample: zenoh.Sample) -> None:
             changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         self._subscribers.append(
-            self._session.liveliness().declare_subscriber(key, received, history=True)
+            self._session.liveliness().declare_subscriber(
+                key, _handler(received, ordered), history=True
+            )
         )
 
     def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
@@ -266,12 +273,27 @@ class Session:
             ),
         )
 
+    def has_subscriber(self, key: str) -> bool:
+        """Return whether a subscription has arrived for an advertised key without a history."""
+        publisher = self._publishers[key]
+        if not isinstance(publisher, zenoh.Publisher):
+            return False
+        status: Any = publisher.matching_status  # a bool in Zenoh's stubs
+        return bool(status.matching)
+
     def listen(
-        self, key: str, handler: Callable[[str, bytes, bytes], None], *, history: bool = False
+        self,
+        key: str,
+        handler: Callable[[str, bytes, bytes], None],
+        *,
+        history: bool = False,
+        ordered: bool = False,
     ) -> None:
         """Call `handler(key, payload, attachment)` for every publication on a key expression.
 
         history: Query latched messages too.
+        ordered: Call in the thread of Zenoh that receives, which must not block, in the order of
+            arrival of all keys and tokens. Otherwise each subscription has a thread of its own.
         """
 
         def received(sample: zenoh.Sample) -> None:
@@ -292,7 +314,9 @@ class Session:
                 )
             )
         else:
-            self._subscribers.append(self._session.declare_subscriber(key, received))
+            self._subscribers.append(
+                self._session.declare_subscriber(key, _handler(received, ordered))
+            )
 
     def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryResult:
         """Send one query and return its first result."""
@@ -356,6 +380,11 @@ class Session:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _handler(received: Callable[[zenoh.Sample], None], ordered: bool) -> Any:
+    """Return Zenoh's handler of a subscription. ordered: See `Session.listen`."""
+    return zenoh.handlers.Callback(received, indirect=False) if ordered else received
 
 
 def _objection(query: zenoh.Query, key: str, *, found: bool) -> str:

@@ -100,12 +100,12 @@ def message(name: str, *fields: Any) -> Any:
     return message_store().types[name](*fields)
 
 
-def encode(sent: Any) -> bytes:
+def to_cdr(sent: Any) -> bytes:
     """Return a message as CDR: little-endian XCDR1 with its header. Padding is zero."""
     return bytes(message_store().serialize_cdr(sent, sent.__msgtype__))
 
 
-def decode(payload: bytes, name: str) -> Any:
+def from_cdr(payload: bytes, name: str) -> Any:
     """Return the message in CDR bytes. Raises ValueError if they are not of the type."""
     try:
         return message_store().deserialize_cdr(payload, name)

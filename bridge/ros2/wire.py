@@ -24,11 +24,10 @@ _SECTION: Final = "§"
 
 
 class Qos(NamedTuple):
-    """Quality of service. latched: transient local durability."""
+    """Quality of service, always reliable. latched: transient local durability."""
 
     depth: int = 10
     latched: bool = False
-    reliable: bool = True
 
     @property
     def text(self) -> str:
@@ -37,8 +36,7 @@ class Qos(NamedTuple):
         >>> Qos().text, Qos(depth=1, latched=True).text
         ('::,10:,:,:,,', ':1:,1:,:,:,,')
         """
-        reliability = "" if self.reliable else "2"
-        return f"{reliability}:{'1' if self.latched else ''}:,{self.depth}:,:,:,,"
+        return f":{'1' if self.latched else ''}:,{self.depth}:,:,:,,"
 
 
 class Endpoint(NamedTuple):

@@ -94,7 +94,7 @@ _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
 }
 """Roles allowed at each hub."""
 _LARGEST_B: Final = {
-    64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim", *_ROS2_TAKEN),
+    64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
     1 << 20: (f"{_ENV}/director",),
     1 << 10: (
         "cosim/*/status",
@@ -102,7 +102,9 @@ _LARGEST_B: Final = {
         *(f"{_ENV}/{key}" for key in ("status", "log", "camera")),
     ),
 }
-"""Size limit in bytes by key; larger messages are dropped. Others have the session's limit."""
+"""Size limit in bytes by key; larger messages are dropped. Others have the session's limit.
+
+Those of ROS 2 nodes reach the environment process, which reports what is too large."""
 _ALL: Final = (
     "put",
     "delete",

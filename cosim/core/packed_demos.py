@@ -14,11 +14,15 @@ one for each picture, ordered by episode and time:
 | disturbed | (N,) bool                | whether another command was driven (`--noise`)            |
 | episode   | (N,) int32               | number of the episode, from 0                             |
 | frame     | (N,) int32               | number of the picture in its episode, from 0              |
+| scan      | (N, rings, rays) float32 | distances of the lidar, m; its range without a return     |
+| imu       | (N, 6) float32           | angular speed rad/s and specific force m/s2: x, y, z each |
+| people    | (N, 32, 5) float32       | nearest people: 1, x, y, vx, vy, the robot's axes; else 0 |
 | meta      | () str                   | JSON, see `Packed.meta`                                   |
 
-Waypoints are metres in the robot's frame at the picture. Those after `driven` extrapolate the
-expert's command, because the episode ended or the drive was disturbed. A picture is taken frame /
-rate_hz seconds after the episode's start.
+The file has scan, imu and people only if the data set has them. Waypoints are metres in the robot's
+frame at the picture. Those after `driven` extrapolate the expert's command, because the episode
+ended or the drive was disturbed. A picture is taken frame / rate_hz seconds after the episode's
+start.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,13 +45,23 @@ _FORMAT: Final = 1
 """Version of the file format."""
 
 
+SENSORS: Final = ("scan", "imu", "people")
+"""Names of the arrays that a file may lack."""
+
+
+def _nothing() -> NDArray[np.float32]:
+    return np.zeros((0, 0), np.float32)
+
+
 @dataclass(frozen=True)
 class Packed:
     """Demonstrations in memory, with the arrays of the file.
 
+    scan, imu, people: sensors, empty (0, 0) arrays without them.
     meta: rate_hz and waypoint_s; goal, the name of its protocol or "none"; camera, as in
-        `CameraSpec`; robot. policy, noise and learner are lists with one value for each data set.
-        structures and scenarios are lists with the structure and the id of each episode's scenario.
+        `CameraSpec`; robot; lidar, imu and people, the settings of the sensors. policy, noise and
+        learner are lists with one value for each data set. structures and scenarios are lists with
+        the structure and the id of each episode's scenario.
     """
 
     frames: NDArray[np.uint8]
@@ -60,6 +74,9 @@ class Packed:
     episode: NDArray[np.int32]
     frame: NDArray[np.int32]
     meta: dict[str, Any]
+    scan: NDArray[np.float32] = field(default_factory=_nothing)
+    imu: NDArray[np.float32] = field(default_factory=_nothing)
+    people: NDArray[np.float32] = field(default_factory=_nothing)
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -87,7 +104,11 @@ class Packed:
 
     def save(self, path: Path) -> None:
         """Write the file atomically. Raises MachineError."""
-        arrays = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "meta"}
+        arrays = {
+            one.name: getattr(self, one.name)
+            for one in fields(self)
+            if one.name != "meta" and (one.name not in SENSORS or getattr(self, one.name).size)
+        }
         meta = json.dumps({"format": _FORMAT, **self.meta}, sort_keys=True)
         try:
             with atomic_file(path) as part, part.open("wb") as file:
@@ -114,7 +135,11 @@ def read_packed(path: Path) -> Packed:
     try:
         with np.load(path, allow_pickle=False) as held:
             meta = json.loads(str(held["meta"]))
-            arrays = {one.name: held[one.name] for one in fields(Packed) if one.name != "meta"}
+            arrays = {
+                one.name: held[one.name]
+                for one in fields(Packed)
+                if one.name != "meta" and (one.name not in SENSORS or one.name in held)
+            }
         if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
             raise ValueError("its arrays are of different lengths, or of another format")
     except (OSError, *NPZ_ERRORS) as error:

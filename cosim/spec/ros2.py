@@ -69,8 +69,8 @@ TAKEN: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     }
 )
 """Types of each topic that is read."""
-LARGEST_B: Final = 64 << 10
-"""Largest message in bytes that is read."""
+LARGEST_B: Final = 1 << 20
+"""Largest message in bytes that is read: a plan of 10,000 poses fits."""
 _CAMERA: Final = re.compile(r"(\d{1,4})x(\d{1,4})(?:@(\d{1,3}(?:\.\d+)?))?")
 _SCAN: Final = re.compile(r"(\d{1,5})(?:x(\d{1,3}))?(?:@(\d{1,3}(?:\.\d+)?))?")
 

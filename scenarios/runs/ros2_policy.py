@@ -8,35 +8,38 @@ stamped     the first TwistStamped with the stamp of the observation
 rate        the newest one, at most one for each observation; without one the last command holds
             for a while
 
-A message that is not understood is reported once and never drives the robot.
+A message that is not understood never drives the robot. Each kind of fault is reported once in an
+episode. Nor do two publishers drive together: their episode crashes.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections import deque
 from collections.abc import Iterable
 from logging import WARNING
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, NamedTuple, cast
 
 import numpy as np
 
 from bridge.policy_server import PolicyFault
-from bridge.ros2 import encode
+from bridge.ros2 import messages
 from bridge.ros2.commands import (
     COMMAND_TYPES,
     PATH,
-    Judged,
+    Fault,
+    Inbox,
     Received,
+    Remarks,
+    fault_of_form,
     hash_fault,
     judged,
-    plan_in_robot_frame,
+    plan_points,
 )
-from bridge.ros2.encode import TOPICS
+from bridge.ros2.messages import TOPICS
 from bridge.ros2.node import Network, Ros2Node
 from bridge.ros2.types import message_store
-from bridge.ros2.wire import Endpoint, full_topic, gid_of, type_hash
+from bridge.ros2.wire import DIALECTS, Endpoint, full_topic, gid_of, type_hash
 from bridge.session import Session, open_session
 from cosim.core.clock import Clock
 from cosim.core.errors import EngineError, MachineError, PolicyError, UsageError
@@ -46,7 +49,7 @@ from cosim.episode.interfaces import Observation
 from cosim.episode.policy_caller import PolicyCaller, Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.options import PolicyHost, PolicyProcess
-from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, ROS2_SCHEME, Ros2Settings
+from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, ROS2_SCHEME, TAKEN, Ros2Settings
 
 JOINED_S: Final = 1.0
 """Time without new publishers and subscriptions after which all nodes count as started."""
@@ -62,12 +65,19 @@ _SILENT_PERIODS: Final = 2.0
 """Periods of the policy, in seconds of the machine, that the rule `rate` waits for a command."""
 _LOOK_S: Final = 0.25
 """Longest time in seconds between two looks at the nodes around."""
-_MOST_QUEUED: Final = 1024
-"""Largest number of unread messages. Further ones are dropped, with the rule `rate` the oldest."""
+_LEAVING_S: Final = 0.5
+"""Time in seconds for the token of a publisher to disappear after another one took its place."""
 _elapsed_s: Final[dict[int, float]] = {}
 """Time in seconds of all episodes of this process, by domain, for a monotonic /clock."""
 _EARLY_S: Final = 1.0
 """Time in seconds before the run's timeout at which the policy reports why it has no command."""
+
+
+class _Controller(NamedTuple):
+    """The publisher of an episode's commands. by: its node in words."""
+
+    gid: bytes
+    by: str
 
 
 class Ros2Policy:
@@ -82,12 +92,12 @@ class Ros2Policy:
         self.took_ms: list[float] = []
         self._session: Session | None = None
         self._node: Ros2Node | None = None
-        self._queue: deque[Received] = deque(maxlen=_MOST_QUEUED)
+        self._inbox = Inbox(newest=settings.wait == "rate")
         self._absent_s: float | None = None
         self._plan: Received | None = None
-        self._remarks: dict[str, None] = {}
-        self._controller: tuple[bytes, str] | None = None
-        self._stream: encode.EpisodeStream | None = None
+        self._remarks = Remarks()
+        self._controller: _Controller | None = None
+        self._stream: messages.EpisodeStream | None = None
         self._last: tuple[Command, int] | None = None
         self._waits_s = 0.0
 
@@ -96,15 +106,16 @@ class Ros2Policy:
         node = self._joined()
         monotonic = self.settings.clock == "monotonic"
         elapsed_s = _elapsed_s.get(self.settings.domain, 0.0) if monotonic else 0.0
-        self._stream = encode.EpisodeStream(episode_id, seed, elapsed_s)
+        self._stream = messages.EpisodeStream(episode_id, seed, elapsed_s)
         self._controller = None
         self._last = self._absent_s = None
         self.took_ms = []
+        self._report_repeated()
         self._await_controller(node)
         for topic, sent in self._stream.begun():
             node.publish(topic, sent)
         time.sleep(SETTLE_S)
-        self._queue.clear()
+        self._inbox.take_all()
         self._plan = None
 
     def act(self, seen: Observation) -> Command:
@@ -115,8 +126,7 @@ class Ros2Policy:
         first = stream.tick < 0
         _elapsed_s[self.settings.domain] = stream.elapsed_s + Clock().time_s(seen.tick + 1)
         if self.settings.wait != "rate":
-            self._refuse_another(self._queue)
-            self._queue.clear()
+            self._refuse_another(node, self._inbox.take_all())
         for topic, sent in stream.observed(seen, node.has_subscriber):
             node.publish(topic, sent)
         now_ns = stream.time_ns(seen.tick)
@@ -131,6 +141,7 @@ class Ros2Policy:
 
     def close(self) -> None:
         """Remove the node from the network."""
+        self._report_repeated()
         if self._session is not None:
             self._session.close()
         self._session = self._node = None
@@ -147,7 +158,7 @@ class Ros2Policy:
                 node = Ros2Node(session, network)
                 for topic in TOPICS.values():
                     node.advertise(topic.name, topic.type, topic.qos)
-                node.subscribe(CMD_VEL, COMMAND_TYPES, self._take_command)
+                node.subscribe(CMD_VEL, COMMAND_TYPES, self._inbox.put)
                 node.subscribe(PLAN, (PATH,), self._take_plan)
             except BaseException:
                 session.close()
@@ -155,12 +166,12 @@ class Ros2Policy:
             self._session, self._node = session, node
         return self._node
 
-    def _take_command(self, got: Received) -> None:
-        if self.settings.wait == "rate" or len(self._queue) < _MOST_QUEUED:
-            self._queue.append(got)
-
     def _take_plan(self, got: Received) -> None:
-        self._plan = got
+        """Hold a plan until the next answer; one that is too long does not replace another."""
+        if (fault := self._fault_of_form(got, PLAN)) is None:
+            self._plan = got
+        else:
+            self._remark(fault)
 
     def _next(self, node: Ros2Node, now_ns: int, first: bool) -> Command:
         """Wait for the command that answers the observation. Raises PolicyFault without one."""
@@ -169,9 +180,9 @@ class Ros2Policy:
         while True:
             if (left_s := began_s + allowed_s - time.monotonic()) <= 0.0:
                 raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
-            node.wait_for(lambda: self._queue, min(left_s, _LOOK_S))
-            while self._queue:
-                if (command := self._accepted(self._queue.popleft(), now_ns)) is not None:
+            node.wait_for(lambda: len(self._inbox), min(left_s, _LOOK_S))
+            while (got := self._inbox.take()) is not None:
+                if (command := self._accepted(node, got, now_ns)) is not None:
                     return command
             self._refuse_gone(node)
 
@@ -180,8 +191,8 @@ class Ros2Policy:
         holds. Raises PolicyFault."""
         until_s = time.monotonic() + _SILENT_PERIODS / self.settings.rate_hz
         while (left_s := until_s - time.monotonic()) > 0.0:
-            node.wait_for(lambda: self._queue, left_s)
-            if (command := self._newest(now_ns)) is not None:
+            node.wait_for(lambda: len(self._inbox), left_s)
+            if (command := self._newest(node, now_ns)) is not None:
                 self._last = command, at_tick
                 self._waits_s, self._absent_s = time.monotonic(), None
                 return command
@@ -192,11 +203,11 @@ class Ros2Policy:
         command, tick = self._last or (STILL, at_tick)
         return command if Clock().time_s(at_tick - tick) <= HOLD_S else STILL
 
-    def _newest(self, now_ns: int) -> Command | None:
+    def _newest(self, node: Ros2Node, now_ns: int) -> Command | None:
         """Take all messages that have come, and return the newest command."""
         newest = None
-        for _ in range(len(self._queue)):
-            newest = self._accepted(self._queue.popleft(), now_ns) or newest
+        for got in self._inbox.take_all():
+            newest = self._accepted(node, got, now_ns) or newest
         return newest
 
     def _refuse_gone(self, node: Ros2Node) -> None:
@@ -207,7 +218,7 @@ class Ros2Policy:
         elif self._absent_s is None:
             self._absent_s = now_s
         elif now_s - self._absent_s > GONE_S:
-            name = "the node" if self._controller is None else self._controller[1]
+            name = "the node" if self._controller is None else self._controller.by
             raise PolicyFault(f"is gone: {name} published {CMD_VEL}, and has left")
 
     def _allowed_s(self, first: bool) -> float:
@@ -215,74 +226,136 @@ class Ros2Policy:
         whole_s = self.settings.start_s if first else self.settings.answer_s
         return max(whole_s - _EARLY_S, 0.5 * whole_s)
 
-    def _accepted(self, got: Received, now_ns: int) -> Command | None:
+    @property
+    def _attached(self) -> bool:
+        """Whether messages have an attachment with the gid of their publisher."""
+        return DIALECTS[self.settings.dialect].attached
+
+    def _wanted_hash(self, name: str, topic: str) -> str:
+        """Return the hash of a type that is read on a topic, else ""."""
+        return type_hash(name, self.settings.distro) if name in TAKEN[topic] else ""
+
+    def _fault_of_form(self, got: Received, topic: str) -> Fault | None:
+        wanted_hash = self._wanted_hash(got.type, topic)
+        return fault_of_form(got, topic, wanted_hash, attached=self._attached)
+
+    def _accepted(self, node: Ros2Node, got: Received, now_ns: int) -> Command | None:
         """Return the command of a message; None, with a remark, if it is refused."""
-        found: Judged = judged(
-            got,
-            self.settings.wait,
-            now_ns,
-            type_hash(got.type, self.settings.distro) if got.type in COMMAND_TYPES else "",
-            attached=self.settings.dialect == "rmw_zenoh",
-        )
-        if found.fault:
+        wanted_hash = self._wanted_hash(got.type, CMD_VEL)
+        found = judged(got, self.settings.wait, now_ns, wanted_hash, attached=self._attached)
+        if found.fault is not None:
             self._remark(found.fault)
         if found.command is not None:
-            self._refuse_another([got])
-            if self._controller is None and got.attachment is not None:
-                self._controller = got.attachment.gid, got.by
+            self._refuse_another(node, [got])
+            if self._controller is None and got.sender:
+                self._controller = _Controller(got.sender, got.by)
         return found.command
 
-    def _refuse_another(self, messages: Iterable[Received]) -> None:
-        """Raise PolicyFault if a message comes from another node than the episode's commands."""
-        for got in tuple(messages):
-            if self._controller is None or got.attachment is None or got.type not in COMMAND_TYPES:
+    def _refuse_another(self, node: Ros2Node, received: Iterable[Received]) -> None:
+        """Raise PolicyFault if a message is not of the publisher of the episode's commands.
+
+        Without attachments it is also raised if several publishers are there.
+        """
+        for got in received:
+            if got.type and got.type not in COMMAND_TYPES:
                 continue
-            gid, by = self._controller
-            if got.attachment.gid != gid:
-                raise PolicyFault(
-                    f"is two nodes, {by} and {got.by}, which both publish {CMD_VEL}: stop one, or "
-                    "mix their commands in a node of your own"
-                )
+            if not got.sender:
+                there = list(node.publishers_of(CMD_VEL).values())
+                if not self._attached and len(there) > 1:
+                    raise PolicyFault(self._several(node, there))
+            elif self._controller is not None and got.sender != self._controller.gid:
+                raise PolicyFault(self._another(node, got))
+
+    def _several(self, node: Ros2Node, there: list[Endpoint]) -> str:
+        """Return what is wrong with a command of one of several publishers."""
+        controller = self._controller
+        if controller is not None and self._has_left(node, controller.gid):
+            new = [end for end in there if end.in_words != controller.by] or there
+            return self._replaced(controller.by, new[0].in_words)
+        return f"is {_two(there[0], there[1])}"
+
+    def _has_left(self, node: Ros2Node, gid: bytes) -> bool:
+        """Return whether the token of a publisher is gone, or disappears now."""
+        node.wait_for(lambda: gid not in node.publishers_of(CMD_VEL), _LEAVING_S)
+        return gid not in node.publishers_of(CMD_VEL)
+
+    @staticmethod
+    def _replaced(by: str, other: str) -> str:
+        return (
+            f"is gone: {by} published {CMD_VEL} and has left, and {other} publishes it now. An "
+            "episode has one publisher: restart a node between runs"
+        )
+
+    def _another(self, node: Ros2Node, got: Received) -> str:
+        """Return what is wrong with a command of another publisher: the first one has left, or
+        there are two."""
+        assert self._controller is not None
+        gid, by = self._controller
+        if self._has_left(node, gid):
+            return self._replaced(by, got.by)
+        there = node.publishers_of(CMD_VEL)
+        if got.sender in there:
+            return f"is {_two(there[gid], there[got.sender])}"
+        return (
+            f"is two publishers of {CMD_VEL}, {by} and {got.by}: stop one, or mix their commands "
+            "in a node of your own"
+        )
 
     def _with_plan(self, command: Command, seen: Observation) -> Command:
         """Return a command with the points of the latest plan, for the record."""
         got, self._plan = self._plan, None
-        if got is None or len(got.payload) > LARGEST_B or (got.type and got.type != PATH):
+        if got is None:
             return command
-        points = plan_in_robot_frame(got.payload, encode.pose_of(seen))
-        if points is None:
-            self._remark(f"{got.by} sends a {PLAN} that is empty, malformed or not in map or odom")
+        wanted_hash = self._wanted_hash(got.type, PLAN)
+        points = plan_points(got, messages.pose_of(seen), wanted_hash, attached=self._attached)
+        if isinstance(points, Fault):
+            self._remark(points)
             return command
         return WaypointCommand(command.v_mps, command.w_radps, points.astype(np.float32), 0)
 
-    def _remark(self, words: str) -> None:
-        """Report a refused message, each kind once."""
-        if words not in self._remarks and len(self._remarks) < 32:
-            self._remarks[words] = None
-            print(f"ros2: {words}", file=sys.stderr, flush=True)
-            log_event("ros2 message refused", WARNING, why=words)
+    def _remark(self, fault: Fault) -> None:
+        """Count a fault, and report it if it is the first of its kind in the episode."""
+        if self._remarks.add(fault):
+            _report(fault.words)
+
+    def _report_repeated(self) -> None:
+        """Report the numbers of the last episode's faults, and forget them."""
+        for words in self._remarks.ended():
+            _report(words)
 
     def _await_controller(self, node: Ros2Node) -> None:
-        """Wait until a node publishes /cmd_vel and no further entity comes, or for a while longer.
+        """Wait until one node publishes /cmd_vel and subscriptions have arrived.
 
-        Raises PolicyFault.
+        Nodes count as started if no further entity comes for a second. After ten, subscriptions are
+        no longer waited for: a controller may read other topics. Raises PolicyFault.
         """
         began_s = time.monotonic()
         allowed_s = self._allowed_s(True)
 
         def ready() -> bool:
             now_s = time.monotonic()
-            settled = now_s - node.tokens_changed_s > JOINED_S or now_s - began_s > SETTLED_S
-            return settled and bool(self._controllers(node))
+            several = len(node.publishers_of(CMD_VEL)) > 1
+            if not self._controllers(node) or (several and not self._attached):
+                return False
+            if now_s - began_s > SETTLED_S:
+                return True
+            reads = self.settings.wait == "rate" or node.subscriptions_arrived()
+            return reads and now_s - node.tokens_changed_s > JOINED_S
 
-        while not ready():
-            if time.monotonic() - began_s > allowed_s:
+        while not ready():  # outside the node's lock, which receiving threads need
+            there = list(node.publishers_of(CMD_VEL).values())
+            waited_s = time.monotonic() - began_s
+            if len(there) > 1 and not self._attached and waited_s > min(SETTLED_S, allowed_s):
+                raise PolicyFault(f"is {_two(there[0], there[1])}")
+            if waited_s > allowed_s:
                 raise PolicyFault(f"is missing after {allowed_s:.0f} s: {self._diagnosis(node)}")
-            node.wait_for(ready, _LOOK_S)
+            node.wait_for_tokens(_LOOK_S)
+        if len(there := self._controllers(node)) > 1:
+            self._remark(Fault(CMD_VEL, "publishers", f"there are {_two(there[0], there[1])}"))
 
     def _controllers(self, node: Ros2Node) -> list[Endpoint]:
         """Return the publishers of /cmd_vel with a type that is read."""
-        return [end for end in node.publishers_of(CMD_VEL) if not self._unreadable(end)]
+        return [end for end in node.publishers_of(CMD_VEL).values() if not self._unreadable(end)]
 
     def _unreadable(self, end: Endpoint) -> str:
         """Return why the commands of a publisher cannot be read, "" if they can."""
@@ -298,12 +371,14 @@ class Ros2Policy:
         """Return why there is no command, as far as the nodes around and their messages show."""
         there = node.others
         runs = {
-            end.session for end in there if end.kind == "MP" and end.topic.endswith(encode.EPISODE)
+            end.session
+            for end in there
+            if end.kind == "MP" and end.topic.endswith(messages.EPISODE)
         }
         others = [end for end in there if end.session not in runs]
         settings = self.settings
         here = full_topic(settings.namespace, CMD_VEL)
-        found: list[str] = list(self._remarks)
+        found = self._remarks.words
         for end in others:
             if end.kind != "MP" or not end.topic.endswith(CMD_VEL):
                 continue
@@ -333,6 +408,23 @@ class Ros2Policy:
             if settings.wait == "stamped"
             else f"no message of at most {LARGEST_B} bytes came on {here}"
         )
+
+
+def _two(one: Endpoint, other: Endpoint) -> str:
+    """Name two publishers of commands, with a remedy."""
+    names = one.in_words, other.in_words
+    if names[0] == names[1]:
+        names = (f"{names[0]} of session {one.session[:8]}", f"of session {other.session[:8]}")
+    return (
+        f"two publishers of {CMD_VEL}, {names[0]} and {names[1]}: stop one, or mix their commands "
+        "in a node of your own"
+    )
+
+
+def _report(words: str) -> None:
+    """Print a line about refused messages, and log it."""
+    print(f"ros2: {words}", file=sys.stderr, flush=True)
+    log_event("ros2 message refused", WARNING, why=words)
 
 
 class Ros2Driver(PolicyCaller):

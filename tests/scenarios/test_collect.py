@@ -229,15 +229,17 @@ def test_another_data_set_is_refused_in_its_folder(
     assert before == sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
 
 
-def test_recorded_sensors_are_columns_of_the_data_set(desk: Desk) -> None:
+def test_recorded_sensors_are_columns_of_the_data_set(desk: Desk, packed: Packed) -> None:
     """A row has the distances of the lidar, without a return its range, the inertial reading and
-    32 people."""
+    32 people; packed too."""
     held = read_data_set(desk.folder / "demos")
     scans, readings = held.rows["observation.scan"], held.rows["observation.imu"]
     assert scans.shape == (len(held), 60) and scans.min() > 0.0 and scans.max() == 20.0
     assert readings.shape == (len(held), 6) and abs(readings[:, 5].mean() - 9.81) < 0.2
     assert held.rows["observation.people"].shape == (len(held), 160)
     assert held.info["features"]["observation.imu"]["names"][2] == "gyro_z"
+    assert (packed.scan[:, 0] == scans).all() and (packed.imu == readings).all()
+    assert packed.people.shape == (len(held), 32, 5)
 
 
 def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(

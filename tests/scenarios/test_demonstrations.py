@@ -7,19 +7,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from cosim.core.errors import CosimError, RunError, SpecError
+from cosim.core.packed_demos import read_packed
 from cosim.core.state import Command
 from cosim.spec.camera import CameraSpec
 from cosim.spec.demo_options import DemoOptions, recording_manifest
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER
+from cosim.spec.sensors import PEOPLE_ROWS, ScanSpec
 from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pictures
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
 from scenarios.episodes.demonstrator import _Bursts
@@ -83,10 +87,12 @@ def episodes_of(demonstrations: Sequence[Demonstration]) -> list[Collected]:
     return found
 
 
-def written(folder: Path, demonstrations: Sequence[Demonstration]) -> Path:
+def written(
+    folder: Path, demonstrations: Sequence[Demonstration], about: dict[str, Any] = ABOUT
+) -> Path:
     folder.mkdir()
     write_lerobot(
-        folder, episodes_of(demonstrations), Filmed("front", (64, 48), FPS), "courier", ABOUT
+        folder, episodes_of(demonstrations), Filmed("front", (64, 48), FPS), "courier", about
     )
     return folder
 
@@ -221,6 +227,25 @@ def test_packed_rows_are_those_that_were_kept(
     assert np.bincount(packed.episode).tolist() == [*LENGTHS, *LENGTHS]
     assert packed.frames.shape == (2 * sum(LENGTHS), 24, 32, 3)
     assert packed.meta["scenarios"] == ["s-000", "s-001", "s-002"] * 2
+
+
+def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
+    """Distances by ring and ray, inertial readings and people come back from the file; data sets
+    with other sensors are not packed together."""
+    draws = np.random.default_rng(3)
+    shapes = {"scan": (2, 8), "imu": (6,), "people": (PEOPLE_ROWS, 5)}
+    sensors = {name: draws.random((7, *shape), np.float32) for name, shape in shapes.items()}
+    told = {**sensors, "scan": sensors["scan"].reshape(7, -1)}
+    lidar = msgspec.to_builtins(ScanSpec(rays=8, rings=2, elevation_deg=(-5.0, 5.0)))
+    about = {**ABOUT, "lidar": lidar, "imu": "exact", "people": "seen"}
+    folder = written(tmp_path / "one", [replace(shown(0, 7), **told)], about)
+    packed_sets([folder]).save(tmp_path / "demos.npz")
+    packed = read_packed(tmp_path / "demos.npz")
+    for name, readings in sensors.items():
+        np.testing.assert_array_equal(getattr(packed, name), readings)
+    assert (packed.meta["lidar"]["rings"], packed.meta["imu"]) == (2, "exact")
+    with pytest.raises(SpecError, match=r"lidar is .* here and None there"):
+        packed_sets([folder, written(tmp_path / "other", [shown(0, 3)])])
 
 
 def test_data_sets_that_do_not_fit_are_not_packed_together(data_set: Path, tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from typing import ClassVar
 import pytest
 from rosbags.rosbag2 import Reader
 
-from bridge.ros2 import encode
-from bridge.ros2.types import decode
+from bridge.ros2 import messages
+from bridge.ros2.types import from_cdr
 from cosim.core.errors import UsageError
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
@@ -28,7 +28,7 @@ from scenarios.runs.run import run
 from scenarios.tools.viewing.bag import write_bag
 from tests.conftest import ROOT
 from tests.support.plain import free_port
-from tests.support.ros2_peer import Seen, steer
+from tests.support.ros2_peer import Seen, heading_of, steer
 
 pytestmark = pytest.mark.engine
 SEEDED = EpisodeOptions(seed=1)
@@ -43,13 +43,13 @@ class Same:
     )
 
     def reset(self, episode_id: str, seed: int) -> None:
-        self.sent = encode.SentGoal()
+        self.sent = messages.SentGoal()
 
     def act(self, seen: Observation) -> Command:
-        self.sent, *_ = encode.new_goal(seen, self.sent, 0)
-        pose = encode.odometry(seen, 0).pose.pose
+        self.sent, *_ = messages.new_goal(seen, self.sent, 0)
+        pose = messages.odometry(seen, 0).pose.pose
         assert self.sent.point is not None
-        turn = encode.heading_of(pose.orientation)
+        turn = heading_of(pose.orientation)
         return steer(Seen(0, pose.position.x, pose.position.y, turn, self.sent.point))
 
 
@@ -106,17 +106,17 @@ def test_a_bag_is_the_episode_as_a_node_gets_it(here: Path, tmp_path: Path) -> N
     with Reader(tmp_path / "a") as bag:
         assert bag.message_count == count
         for connection, at_ns, data in bag.messages():
-            sent = decode(data, connection.msgtype)
+            sent = from_cdr(data, connection.msgtype)
             times.setdefault(connection.topic, []).append(at_ns)
             if connection.topic == "/clock":
-                assert encode.ns_of(sent.clock) == at_ns
+                assert messages.ns_of(sent.clock) == at_ns
             elif hasattr(sent, "header"):
-                assert encode.ns_of(sent.header.stamp) == at_ns <= times["/clock"][-1]
+                assert messages.ns_of(sent.header.stamp) == at_ns <= times["/clock"][-1]
             if connection.topic == CMD_VEL:
                 speeds.append((sent.twist.linear.x, sent.twist.angular.z))
-    observed = [encode.stamp_ns(int(tick)) for tick in log.answers[:, 0]]
+    observed = [messages.stamp_ns(int(tick)) for tick in log.answers[:, 0]]
     assert times["/camera/image_raw"] == times["/tf"] == times[CMD_VEL] == observed
     assert speeds == list(map(tuple, log.answers[:, 2:].tolist()))
-    assert times["/clock"] == [encode.stamp_ns(tick) for tick in range(len(times["/clock"]))]
+    assert times["/clock"] == [messages.stamp_ns(tick) for tick in range(len(times["/clock"]))]
     with pytest.raises(UsageError, match="is there already"):
         write_bag(here, NAME, tmp_path / "a")

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NamedTuple, Self
 
-from bridge.ros2 import encode, types
+from bridge.ros2 import messages, types
 from bridge.ros2.commands import TWIST, TWIST_STAMPED, Received
 from bridge.ros2.node import Network, Ros2Node
 from bridge.session import Session, open_session
@@ -40,6 +40,13 @@ def steer(seen: Seen) -> Command:
     return Command(1.0 if abs(bearing) < 0.5 else 0.2, bearing)
 
 
+def heading_of(turn: Any) -> float:
+    """Return the heading of a quaternion in radians."""
+    return math.atan2(
+        2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
+    )
+
+
 def twist(command: Command) -> Any:
     """Return a command as a Twist."""
     linear = types.message("geometry_msgs/msg/Vector3", command.v_mps, 0.0, 0.0)
@@ -49,7 +56,7 @@ def twist(command: Command) -> Any:
 
 def stamped(command: Command, time_ns: int) -> Any:
     """Return a command as a TwistStamped."""
-    return types.message(TWIST_STAMPED, encode.header(time_ns, encode.BASE), twist(command))
+    return types.message(TWIST_STAMPED, messages.header(time_ns, messages.BASE), twist(command))
 
 
 Answer = Callable[["Peer", Seen], None]
@@ -77,37 +84,45 @@ class Peer:
         network: Network = Network(),  # noqa: B008
         type_name: str = TWIST,
         name: str = "driver",
+        *,
+        reads: bool = True,
     ) -> None:
         self.session = _opened(endpoint)
-        self.node = Ros2Node(self.session, network, name)
+        self.node = Ros2Node(self.session, network, name, ordered=True)
         self.seen: dict[str, list[Any]] = {topic: [] for topic in SENT}
         self.goal: tuple[float, float] | None = None
         self._answer = answer
         self._lock = threading.Lock()
+        self._closed = False
         self._unanswered: Any = None
         self.node.advertise(CMD_VEL, type_name)
+        if reads:
+            self.subscribe()
+
+    def subscribe(self) -> None:
         for topic in ("/clock", "/cosim/episode", "/goal_pose", "/odom"):
             self.node.subscribe(
                 topic, (SENT[topic],), lambda got, topic=topic: self._take(topic, got)
             )  # type: ignore[misc]
 
     def _take(self, topic: str, got: Received) -> None:
-        message = types.decode(got.payload, SENT[topic])
+        message = types.from_cdr(got.payload, SENT[topic])
         self.seen[topic].append(message)
         with self._lock:
             if topic == "/goal_pose":
                 self.goal = message.pose.position.x, message.pose.position.y
             if topic == "/odom":
                 self._unanswered = message
-            if self._unanswered is not None and self.goal is not None:
+            if self._unanswered is not None and self.goal is not None and not self._closed:
                 odometry, self._unanswered = self._unanswered, None
                 at, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
-                time_ns = encode.ns_of(odometry.header.stamp)
-                self._answer(self, Seen(time_ns, at.x, at.y, encode.heading_of(turn), self.goal))
+                time_ns = messages.ns_of(odometry.header.stamp)
+                self._answer(self, Seen(time_ns, at.x, at.y, heading_of(turn), self.goal))
 
     def close(self) -> None:
         with self._lock:
-            self.session.close()
+            self._closed = True
+        self.session.close()
 
     def __enter__(self) -> Self:
         return self

@@ -18,9 +18,9 @@ import numpy as np
 
 from bridge.policy_server import serve
 from bridge.ros2.commands import TWIST_STAMPED, Received
-from bridge.ros2.encode import ns_of, stamped_command
+from bridge.ros2.messages import ns_of, stamped_command
 from bridge.ros2.node import Network, Ros2Node
-from bridge.ros2.types import decode
+from bridge.ros2.types import from_cdr
 from bridge.session import open_session
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
@@ -167,7 +167,7 @@ def answer_pictures(endpoint: str) -> None:
         picture = "/camera/image_raw"
 
         def answer(got: Received) -> None:
-            sent = decode(got.payload, SENT[picture])
+            sent = from_cdr(got.payload, SENT[picture])
             time_ns = ns_of(sent.header.stamp)
             node.publish(CMD_VEL, stamped_command(Command(1.0, 0.0), time_ns))
 

@@ -16,8 +16,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.core.errors import RunError, SpecError
-from cosim.core.packed_demos import Packed
+from cosim.core.packed_demos import SENSORS, Packed
 from cosim.core.progress import Progress, ignore
+from cosim.spec.sensors import PEOPLE_ROWS
 from scenarios.episodes.clip import read_pictures
 from scenarios.episodes.demonstration import glimpse
 from scenarios.tools.dataset.lerobot import CODEBASE_VERSION, Collected
@@ -172,6 +173,8 @@ def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = 
 
 _SAME: Final = ("rate_hz", "waypoint_s", "waypoints", "goal", "camera", "robot")
 """Requirement for data sets that are merged into one file."""
+_SENSORS: Final = {"lidar": None, "imu": "none", "people": "none"}
+"""Sensors that must be the same too, with the value of a data set that does not state them."""
 
 
 def packed_sets(
@@ -185,8 +188,8 @@ def packed_sets(
     """
     held = [read_data_set(folder) for folder in folders]
     for one, other in pairwise(held):
-        for name in _SAME:
-            mine, theirs = one.about[name], other.about[name]
+        for name in (*_SAME, *_SENSORS):
+            mine, theirs = _stated(one, name), _stated(other, name)
             if mine != theirs:
                 raise SpecError(
                     f"{one.folder} and {other.folder}: {name} is {mine} here and {theirs} there"
@@ -216,7 +219,7 @@ def packed_sets(
     first = np.cumsum([0, *(len(one.episodes) for one in held)])
     episode = [one.rows["episode_index"] + before for one, before in zip(held, first, strict=False)]
     listed = [episode for one in held for episode in one.episodes]
-    meta = {name: held[0].about[name] for name in _SAME} | {
+    meta = {name: _stated(held[0], name) for name in (*_SAME, *_SENSORS)} | {
         "policy": [one.about["policy"] for one in held],
         "noise": [one.about["noise"] for one in held],
         "learner": [one.about.get("learner", "") for one in held],
@@ -234,7 +237,24 @@ def packed_sets(
         episode=np.concatenate(episode).astype(np.int32),
         frame=column("frame_index").astype(np.int32),
         meta=meta,
+        **{
+            name: column(f"observation.{name}").reshape(count, *_shape(held[0], name))
+            for name in SENSORS
+            if f"observation.{name}" in held[0].rows
+        },
     )
+
+
+def _stated(held: DataSet, name: str) -> Any:
+    """Return an option of a collection."""
+    return held.about.get(name, _SENSORS[name]) if name in _SENSORS else held.about[name]
+
+
+def _shape(held: DataSet, name: str) -> tuple[int, ...]:
+    """Return the shape of a sensor's reading."""
+    if name == "scan":
+        return held.about["lidar"]["rings"], held.about["lidar"]["rays"]
+    return (PEOPLE_ROWS, -1) if name == "people" else (-1,)
 
 
 def _eye(held: DataSet) -> str:

@@ -1,6 +1,6 @@
 """Recording of an episode as rosbag2 in MCAP, for Foxglove, rviz and `ros2 bag play`.
 
-It has the topics and stamps that a ROS 2 node of the episode gets (`bridge.ros2.encode.TOPICS`),
+It has the topics and stamps that a ROS 2 node of the episode gets (`bridge.ros2.messages.TOPICS`),
 /cmd_vel with each answer of the policy, and /plan with its waypoints. The observations come from a
 replay, which must reach the recorded state hash. The same record gives the same bytes.
 """
@@ -11,10 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from bridge.ros2 import encode
+from bridge.ros2 import messages
 from bridge.ros2.commands import PATH, TWIST_STAMPED
-from bridge.ros2.types import encode as encoded
-from bridge.ros2.types import message_store
+from bridge.ros2.types import message_store, to_cdr
 from cosim.core.errors import UsageError, unwritable
 from cosim.core.files import atomic_folder
 from cosim.core.progress import Progress, ignore
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 
 _VERSION: Final = 9
 """Version of the bag's metadata."""
-_TYPES: Final = {name: row.type for name, row in encode.TOPICS.items()} | {
+_TYPES: Final = {name: row.type for name, row in messages.TOPICS.items()} | {
     CMD_VEL: TWIST_STAMPED,
     PLAN: PATH,
 }
@@ -100,7 +99,7 @@ def _write(
 
     progress("reading the street map, starting SUMO and PyBullet")
     episode, answers = observed_replay(told, manifest, camera)
-    stream = encode.EpisodeStream(episode.id, episode.seed)
+    stream = messages.EpisodeStream(episode.id, episode.seed)
     with Writer(path, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as writer, episode:
         tape = _Tape(writer)
         episode.watch(ReplayChecker(folder, told).watch)
@@ -110,7 +109,7 @@ def _write(
         while not episode.over:
             now_ns = stream.time_ns(seen.tick)
             for topic, sent in stream.observed(seen, lambda _: False):
-                at_ns = encode.ns_of(sent.clock) if topic == encode.CLOCK else now_ns
+                at_ns = messages.ns_of(sent.clock) if topic == messages.CLOCK else now_ns
                 tape.write(topic, sent, at_ns)
             command, delay = answers.at(seen.tick)
             tape.answer(command, now_ns)
@@ -133,21 +132,21 @@ class _Tape:
 
     def write(self, topic: str, sent: Any, time_ns: int) -> None:
         if topic not in self._connections:
-            row = encode.TOPICS.get(topic)
+            row = messages.TOPICS.get(topic)
             self._connections[topic] = self._writer.add_connection(
                 topic,
                 _TYPES[topic],
                 typestore=message_store(),
                 offered_qos_profiles=[_qos(latched=row is not None and row.qos.latched)],
             )
-        self._writer.write(self._connections[topic], time_ns, encoded(sent))
+        self._writer.write(self._connections[topic], time_ns, to_cdr(sent))
         self.count += 1
 
     def answer(self, command: Command, time_ns: int) -> None:
         """Write an answer of the policy."""
-        self.write(CMD_VEL, encode.stamped_command(command, time_ns), time_ns)
+        self.write(CMD_VEL, messages.stamped_command(command, time_ns), time_ns)
         if isinstance(command, WaypointCommand):
-            self.write(PLAN, encode.waypoint_path(command.waypoints, time_ns), time_ns)
+            self.write(PLAN, messages.waypoint_path(command.waypoints, time_ns), time_ns)
 
 
 def _qos(*, latched: bool) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -12,19 +13,19 @@ from typing import Any
 import msgspec
 import pytest
 
-from bridge.ros2 import encode
-from bridge.ros2.commands import TWIST, TWIST_STAMPED
+from bridge.ros2 import messages, types
+from bridge.ros2.commands import PATH, TWIST, TWIST_STAMPED
 from bridge.ros2.node import Network
 from bridge.session import open_session
 from cosim.core.errors import PolicyError, UsageError
-from cosim.core.state import Command
+from cosim.core.state import Command, WaypointCommand
 from cosim.episode.interfaces import Observation
 from cosim.spec.connection import Connection
 from cosim.spec.goal import PointGoal
 from cosim.spec.odometry import Odometry
 from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
-from cosim.spec.ros2 import CMD_VEL, Ros2Settings
+from cosim.spec.ros2 import CMD_VEL, PLAN, Ros2Settings
 from cosim.spec.run_config import RunConfig
 from scenarios.runs import ros2_policy
 from scenarios.runs.policy_host import policy_driver
@@ -82,9 +83,9 @@ def test_a_node_drives_in_lockstep(at: str) -> None:
                 command = driver.act(seen_at(tick))
                 assert command == steer(Seen(0, 0.1 * tick, 0.0, 0.0, (10.0, 1.0)))
         assert driver.runs == "ros2, next" and driver.clock["answer_median_ms"] > 0.0
-        stamps = [encode.ns_of(one.header.stamp) for one in peer.seen["/odom"]]
+        stamps = [messages.ns_of(one.header.stamp) for one in peer.seen["/odom"]]
         assert stamps == 2 * [10**9, 11 * 10**8, 12 * 10**8]
-        clock = [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
+        clock = [messages.ns_of(one.clock) for one in peer.seen["/clock"]]
         assert clock == 2 * [10**9 + 5 * 10**7 * tick for tick in range(5)]
         told = [msgspec.json.decode(one.data) for one in peer.seen["/cosim/episode"]]
         assert [(one["episode"], one["seed"], one["reset"]) for one in told] == [
@@ -108,7 +109,7 @@ def test_a_monotonic_clock_never_goes_back(at: str) -> None:
                 driver.reset(episode, 7)
                 for tick in (0, 2):
                     driver.act(seen_at(tick))
-            clock += [encode.ns_of(one.clock) for one in peer.seen["/clock"]]
+            clock += [messages.ns_of(one.clock) for one in peer.seen["/clock"]]
     assert clock == sorted(set(clock)) and len(clock) == 9
 
 
@@ -153,10 +154,10 @@ def test_rate_takes_the_newest_command(at: str) -> None:
     with driven(at, wait="rate") as driver, Peer(at, once) as peer:
         driver.reset("k1", 7)
         driver.act(seen_at(0))
-        queue = driver.policy._queue  # type: ignore[attr-defined]
+        inbox = driver.policy._inbox  # type: ignore[attr-defined]
         for v_mps in (0.4, 0.5, 0.6):
             peer.node.publish(CMD_VEL, twist(Command(v_mps, 0.0)))
-        wait_until(lambda: len(queue) == 3)
+        wait_until(lambda: len(inbox) == 3)
         assert driver.act(seen_at(2)).v_mps == 0.6
 
 
@@ -205,7 +206,7 @@ def test_what_is_no_command_is_a_crash_in_words(
         driver.reset("k1", 7)
         with pytest.raises(PolicyError, match=f"gave no command .* /driver .*{words}"):
             driver.act(seen_at(0))
-    assert capfd.readouterr().err.count(words) == 1
+        assert capfd.readouterr().err.count(words) == 1
 
 
 @pytest.mark.parametrize(
@@ -283,25 +284,119 @@ def test_a_lost_node_is_a_crash_and_a_new_one_drives_the_next_episode(at: str) -
             assert driver.act(seen_at(0)).v_mps == 1.0
 
 
-def test_two_nodes_do_not_drive_together(at: str) -> None:
-    """Commands of a second node crash the episode, and both are named."""
+def test_two_nodes_do_not_drive_together(at: str, capfd: Any) -> None:
+    """Two publishers are reported at the start; their commands crash the episode."""
+    both = r"two publishers of /cmd_vel, /(one|two) and /(one|two): stop one"
     with driven(at) as driver, Peer(at, name="one"), Peer(at, name="two"):
         driver.reset("k1", 7)
-        with pytest.raises(
-            PolicyError, match=r"is two nodes, /(one|two) and /(one|two), which both publish"
-        ):
+        assert re.search(f"there are {both}", capfd.readouterr().err)
+        with pytest.raises(PolicyError, match=f"is {both}"):
             for tick in range(0, 100, 2):
                 driver.act(seen_at(tick))
 
 
+def test_two_nodes_behind_dds_bridges_do_not_drive(at: str, monkeypatch: Any) -> None:
+    """Without attachments an episode does not start with two publishers, and a second one, even
+    without a command, crashes it."""
+    monkeypatch.setattr(ros2_policy, "SETTLED_S", 0.5)
+    network = Network(dialect="ros2dds")
+    with driven(at, dialect="ros2dds") as driver, Peer(at, network=network):
+        driver.reset("k1", 7)
+        driver.act(seen_at(0))
+        with Peer(at, lambda *_: None, network=network):
+            wait_until(lambda: len(driver.policy._node.publishers_of(CMD_VEL)) == 2)  # type: ignore
+            for call in (lambda: driver.act(seen_at(2)), lambda: driver.reset("k2", 7)):
+                with pytest.raises(PolicyError, match="is two publishers of /cmd_vel, a node of"):
+                    call()
+        wait_until(lambda: len(driver.policy._node.publishers_of(CMD_VEL)) == 1)  # type: ignore
+        driver.reset("k3", 7)
+        assert driver.act(seen_at(0)).v_mps == 1.0
+
+
+@pytest.mark.parametrize("dialect", ["rmw_zenoh", "ros2dds"])
+def test_a_restarted_node_is_not_two_nodes(at: str, dialect: Any) -> None:
+    """A node that leaves and comes back in an episode is reported as such; the next episode has the
+    new one."""
+    network = Network(dialect=dialect)
+    with driven(at, dialect=dialect) as driver:
+        with Peer(at, network=network, name="driver"):
+            driver.reset("k1", 7)
+            driver.act(seen_at(0))
+        with Peer(at, network=network, name="driver"):
+            node = driver.policy._node  # type: ignore[attr-defined]
+            wait_until(lambda: node.has_subscriber("/odom") and node.subscriptions_arrived())
+            with pytest.raises(PolicyError, match=r"is gone: .* has left, and .* publishes it now"):
+                driver.act(seen_at(2, goal=PointGoal(5.0, 1.0)))
+            driver.reset("k2", 7)
+            assert driver.act(seen_at(0)).v_mps == 1.0
+
+
+def test_a_kind_of_fault_is_reported_once_in_an_episode(at: str, capfd: Any) -> None:
+    """Messages with one kind of fault are one line and a count, in each episode again."""
+    bad = iter(range(1000))
+
+    def sends(peer: Peer, seen: Seen) -> None:
+        for _ in range(20):
+            peer.node.publish(CMD_VEL, twist(Command(math.inf, float(next(bad)))))
+        answers(peer, seen)
+
+    with driven(at) as driver, Peer(at, sends):
+        for episode in ("k1", "k2"):
+            driver.reset(episode, 7)
+            for tick in (0, 2):
+                driver.act(seen_at(tick))
+            lines = capfd.readouterr().err.splitlines()
+            assert sum("both must be finite" in line for line in lines) == 1 + (episode == "k2")
+        assert "40 messages in the episode: /driver sends /cmd_vel" in lines[0]
+
+
+def test_a_long_plan_is_recorded_and_one_too_long_is_reported(at: str, capfd: Any) -> None:
+    """A plan of 200 KiB is read. Of more than 1 MiB is said how long it is, while the node drives
+    on."""
+    where = types.message("geometry_msgs/msg/Point", 3.0, 0.0, 0.0)
+    turn = types.message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+    pose = types.message("geometry_msgs/msg/Pose", where, turn)
+
+    def plan(poses: int) -> Any:
+        header = messages.header(10**9, "odom")
+        stamped_pose = types.message("geometry_msgs/msg/PoseStamped", header, pose)
+        return types.message(PATH, header, poses * [stamped_pose])
+
+    plans = iter((plan(2500), plan(20_000)))
+
+    def sends(peer: Peer, seen: Seen) -> None:
+        if (one := next(plans, None)) is not None:
+            peer.node.publish(PLAN, one)
+        answers(peer, seen)
+
+    with driven(at, answer_s=30.0) as driver, Peer(at, sends) as peer:
+        peer.node.advertise(PLAN, PATH)
+        driver.reset("k1", 7)
+        ticks = iter(range(0, 2000, 2))
+        wait_until(lambda: isinstance(driver.act(seen_at(next(ticks))), WaypointCommand))
+        driver.act(seen_at(next(ticks)))  # the node sends its second plan
+        wait_until(lambda: driver.policy._remarks.words)  # type: ignore[attr-defined]
+        assert not isinstance(driver.act(seen_at(next(ticks))), WaypointCommand)
+    assert capfd.readouterr().err.count("a message has at most 1048576") == 1
+
+
+def test_an_episode_starts_when_a_node_reads(at: str) -> None:
+    """A node that publishes first and subscribes later does not miss the first observation."""
+    with driven(at, start_s=30.0) as driver, Peer(at, reads=False) as peer:
+        threading.Timer(1.0, peer.subscribe).start()
+        driver.reset("k1", 7)
+        assert driver.act(seen_at(0)).v_mps == 1.0
+
+
 def test_a_flood_of_commands_and_long_messages_does_not_stop_the_drive(at: str) -> None:
-    """A thousand commands after each answer, and megabytes that the hub drops: the drive continues."""
+    """A thousand commands after each answer, and megabytes: the drive continues."""
 
     def flood(peer: Peer, seen: Seen) -> None:
         answers(peer, seen)
         for _ in range(1000):
             answers(peer, seen)
-        peer.session.publish(peer.node._publishers[CMD_VEL].key, bytes(1 << 20))
+        for size_b in (1 << 20, 3 << 20):
+            peer.session.publish(peer.node._publishers[CMD_VEL].key, bytes(size_b))
 
     with driven(at) as driver, Peer(at, flood):
         driver.reset("k1", 7)
@@ -317,7 +412,7 @@ def test_a_late_node_gets_the_latched_topics(at: str) -> None:
         driver.act(seen_at(0))
         with open_session(Connection(role="worker", connect=at)) as session:
             began_s = time.monotonic()
-            for topic in (encode.STATIC, encode.GOAL, encode.EPISODE):
+            for topic in (messages.STATIC, messages.GOAL, messages.EPISODE):
                 session.listen(
                     f"0{topic}/*/*",
                     lambda key, payload, _: late.update({key: payload}),

@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from bridge.ros2 import encode, types
+from bridge.ros2 import messages, types
 from bridge.ros2.commands import (
+    PATH,
     TWIST,
     TWIST_STAMPED,
+    Fault,
+    Inbox,
     Received,
+    Remarks,
     judged,
-    plan_in_robot_frame,
+    plan_points,
 )
 from bridge.ros2.wire import (
     DIALECTS,
@@ -38,7 +42,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import Instruction, PointGoal
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER
-from cosim.spec.ros2 import LARGEST_B, SENT, TAKEN, Ros2Wait
+from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, SENT, TAKEN, Ros2Wait
 from cosim.spec.sensors import Imu, Scan, ScanSpec
 from tests.conftest import ROOT
 
@@ -51,7 +55,7 @@ LISTENER = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
 SPEC = CameraSpec(64, 40, depth=True)
 RGB = np.arange(40 * 64 * 3, dtype=np.uint8).reshape(40, 64, 3)
 DEPTH = np.linspace(0.5, 30.0, 40 * 64, dtype=np.float32).reshape(40, 64)
-NOW_NS = encode.stamp_ns(20)
+NOW_NS = messages.stamp_ns(20)
 
 
 def seen(**more: Any) -> Observation:
@@ -116,17 +120,19 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
     """All topics of an observation, as CDR and back: values, frames and stamps; the same bytes each
     time."""
     one = seen()
-    sent = {row.name: row.message(one, NOW_NS) for row in encode.TOPICS.values() if row.message}
+    sent = {row.name: row.message(one, NOW_NS) for row in messages.TOPICS.values() if row.message}
     assert sent.pop("/points") is None
-    sent["/goal_pose"] = encode.goal_pose(one, NOW_NS)
-    sent["/tf_static"] = encode.static_tf(one, NOW_NS)
-    sent["/initialpose"] = encode.initial_pose(one, NOW_NS)
+    sent["/goal_pose"] = messages.goal_pose(one, NOW_NS)
+    sent["/tf_static"] = messages.static_tf(one, NOW_NS)
+    sent["/initialpose"] = messages.initial_pose(one, NOW_NS)
     back = {}
     for name, message in sent.items():
-        data = types.encode(message)
-        assert data[:4] == b"\0\1\0\0" and data == types.encode(message)
-        back[name] = types.decode(data, SENT[name])
-        assert not hasattr(back[name], "header") or encode.ns_of(back[name].header.stamp) == NOW_NS
+        data = types.to_cdr(message)
+        assert data[:4] == b"\0\1\0\0" and data == types.to_cdr(message)
+        back[name] = types.from_cdr(data, SENT[name])
+        assert (
+            not hasattr(back[name], "header") or messages.ns_of(back[name].header.stamp) == NOW_NS
+        )
     image = back["/camera/image_raw"]
     assert (image.height, image.width, image.encoding, image.step) == (40, 64, "rgb8", 192)
     assert (image.data.reshape(40, 64, 3) == RGB).all()
@@ -151,9 +157,11 @@ def test_optical_frames_look_ahead() -> None:
     """The chain base_link -> camera_link -> optical frame of /tf_static is the calibration of the
     picture, and camera_link has x ahead."""
     one = seen()
-    frames = {frame.child_frame_id: frame for frame in encode.static_tf(one, NOW_NS).transforms}
-    assert list(frames) == ["odom", encode.CAMERA, encode.OPTICAL, encode.LIDAR, encode.IMU]
-    camera, optical = (_matrix(frames[name].transform) for name in (encode.CAMERA, encode.OPTICAL))
+    frames = {frame.child_frame_id: frame for frame in messages.static_tf(one, NOW_NS).transforms}
+    assert list(frames) == ["odom", messages.CAMERA, messages.OPTICAL, messages.LIDAR, messages.IMU]
+    camera, optical = (
+        _matrix(frames[name].transform) for name in (messages.CAMERA, messages.OPTICAL)
+    )
     assert one.camera is not None
     assert np.allclose(camera @ optical, one.camera.on_robot)
     assert camera[0, 0] > 0.9 and abs(camera[1, 0]) < 1e-9
@@ -177,8 +185,8 @@ def test_a_cloud_of_rings_has_the_points_of_the_scan() -> None:
     spec = ScanSpec(rays=16, rings=3, elevation_deg=(-10.0, 10.0))
     ranges = np.full((3, 16), 5.0, np.float32)
     ranges[1, 4] = np.inf
-    cloud = encode.point_cloud(Scan(ranges, spec), NOW_NS)
-    points = types.decode(types.encode(cloud), "sensor_msgs/msg/PointCloud2")
+    cloud = messages.point_cloud(Scan(ranges, spec), NOW_NS)
+    points = types.from_cdr(types.to_cdr(cloud), "sensor_msgs/msg/PointCloud2")
     xyz = points.data.view("<f4").reshape(3, 16, 3)
     assert np.isinf(xyz[1, 4]).all() and np.allclose(np.linalg.norm(xyz[0], axis=-1), 5.0)
     assert xyz[2, 8, 0] > 4.9 and xyz[2, 8, 2] > 0.8 and abs(xyz[2, 8, 1]) < 1e-6
@@ -186,13 +194,13 @@ def test_a_cloud_of_rings_has_the_points_of_the_scan() -> None:
 
 def test_a_goal_is_sent_when_it_changes() -> None:
     """A point is sent again after it has moved in odom, and an instruction when its text differs."""
-    sent, topic, _ = encode.new_goal(seen(), encode.SentGoal(), NOW_NS)
+    sent, topic, _ = messages.new_goal(seen(), messages.SentGoal(), NOW_NS)
     assert topic == "/goal_pose"
-    assert encode.new_goal(seen(goal=PointGoal(10.1, 2.0)), sent, NOW_NS)[1] == ""
-    assert encode.new_goal(seen(goal=PointGoal(12.0, 2.0)), sent, NOW_NS)[1] == "/goal_pose"
-    told, topic, message = encode.new_goal(seen(goal=Instruction("Go.")), sent, NOW_NS)
+    assert messages.new_goal(seen(goal=PointGoal(10.1, 2.0)), sent, NOW_NS)[1] == ""
+    assert messages.new_goal(seen(goal=PointGoal(12.0, 2.0)), sent, NOW_NS)[1] == "/goal_pose"
+    told, topic, message = messages.new_goal(seen(goal=Instruction("Go.")), sent, NOW_NS)
     assert (topic, message.data) == ("/cosim/instruction", "Go.")
-    assert encode.new_goal(seen(goal=Instruction("Go.")), told, NOW_NS)[1] == ""
+    assert messages.new_goal(seen(goal=Instruction("Go.")), told, NOW_NS)[1] == ""
 
 
 def twist(v_mps: float, w_radps: float, stamp_ns: int | None = None) -> Received:
@@ -203,9 +211,10 @@ def twist(v_mps: float, w_radps: float, stamp_ns: int | None = None) -> Received
     ]
     sent = types.message(TWIST, *vector)
     if stamp_ns is not None:
-        sent = types.message(TWIST_STAMPED, encode.header(stamp_ns, "base_link"), sent)
+        sent = types.message(TWIST_STAMPED, messages.header(stamp_ns, "base_link"), sent)
     name = sent.__msgtype__
-    return Received(types.encode(sent), name, types.HASHES[name], Attachment(1, 0, bytes(16)), "/a")
+    data = types.to_cdr(sent)
+    return Received(data, name, types.HASHES[name], bytes(16), "/a", len(data))
 
 
 def verdict(got: Received, wait: Ros2Wait = "next", distro: str = "jazzy") -> Any:
@@ -226,7 +235,7 @@ def test_a_command_is_taken_by_the_rule_of_its_stamp() -> None:
         assert verdict(twist(1.0, 0.5, stamp_ns)).command == Command(1.0, 0.5)
     assert verdict(twist(1.0, 0.5, NOW_NS), "stamped").command == Command(1.0, 0.5)
     early = verdict(twist(1.0, 0.5, NOW_NS - 1), "stamped")
-    assert early.command is None and early.early and not early.fault
+    assert early.command is None and early.fault is None
 
 
 def test_what_is_no_command_is_named_and_never_driven() -> None:
@@ -235,21 +244,20 @@ def test_what_is_no_command_is_named_and_never_driven() -> None:
     good = twist(1.0, 0.5)
     faults = {
         "both must be finite": verdict(twist(math.nan, 0.0)),
-        "at most 65536": verdict(good._replace(payload=bytes(LARGEST_B + 1))),
+        "at most 1048576": verdict(good._replace(payload=b"", size_b=LARGEST_B + 1)),
         "as std_msgs/msg/String": verdict(good._replace(type="std_msgs/msg/String")),
         "another definition": verdict(good._replace(hash="RIHS01_" + 64 * "0")),
         "--ros2-distro humble": verdict(good._replace(hash=types.NO_HASH)),
         "not of Humble": verdict(good, distro="humble"),
         "use_sim_time": verdict(twist(1.0, 0.0, 1_790_000_000 * 10**9)),
         "ahead of /clock": verdict(twist(1.0, 0.0, NOW_NS + 1)),
-        "without the attachment": verdict(good._replace(attachment=None)),
+        "without the attachment": verdict(good._replace(sender=b"")),
         "not a geometry_msgs/msg/Twist": verdict(good._replace(payload=good.payload[:20])),
         "has no stamp": verdict(good, "stamped"),
     }
     for words, found in faults.items():
-        assert found.command is None and words in found.fault and found.fault.startswith("/a "), (
-            found
-        )
+        assert found.command is None and words in found.fault.words, found
+        assert found.fault.topic == CMD_VEL and found.fault.words.startswith("/a ")
 
 
 def test_a_plan_is_turned_into_the_robots_frame() -> None:
@@ -258,7 +266,7 @@ def test_a_plan_is_turned_into_the_robots_frame() -> None:
     turn = types.message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
 
     def path(frame: str, points: list[tuple[float, float]]) -> bytes:
-        header = encode.header(NOW_NS, frame)
+        header = messages.header(NOW_NS, frame)
         poses = [
             types.message(
                 "geometry_msgs/msg/PoseStamped",
@@ -271,15 +279,50 @@ def test_a_plan_is_turned_into_the_robots_frame() -> None:
             )
             for xy in points
         ]
-        return types.encode(types.message("nav_msgs/msg/Path", header, poses))
+        return types.to_cdr(types.message("nav_msgs/msg/Path", header, poses))
 
-    pose = Odometry(1.0, 1.0, math.pi / 2)
-    found = plan_in_robot_frame(path("odom", [(1.0, 3.0), (0.0, 3.0)]), pose)
-    assert found is not None and np.allclose(found, [(2.0, 0.0), (2.0, 1.0)])
-    many = plan_in_robot_frame(path("map", [(float(i), 0.0) for i in range(400)]), pose)
-    assert many is not None and len(many) == 32
-    for payload in (path("camera", [(1.0, 1.0)]), path("odom", []), b"\0\1\0\0x"):
-        assert plan_in_robot_frame(payload, pose) is None
+    def points(payload: bytes, **more: Any) -> Any:
+        got = Received(payload, PATH, types.HASHES[PATH], bytes(16), "/a", len(payload))
+        pose = Odometry(1.0, 1.0, math.pi / 2)
+        return plan_points(got._replace(**more), pose, types.HASHES[PATH], attached=True)
+
+    good = path("odom", [(1.0, 3.0), (0.0, 3.0)])
+    assert np.allclose(points(good), [(2.0, 0.0), (2.0, 1.0)])
+    assert len(points(path("map", [(float(i), 0.0) for i in range(400)]))) == 32
+    faults = {
+        "in the frame 'camera'": points(path("camera", [(1.0, 1.0)])),
+        "without poses": points(path("odom", [])),
+        "not a nav_msgs/msg/Path": points(b"\0\1\0\0x"),
+        "not finite": points(path("odom", [(math.nan, 1.0)])),
+        "at most 1048576": points(b"", size_b=LARGEST_B + 1),
+        "as std_msgs/msg/String": points(good, type="std_msgs/msg/String"),
+    }
+    for words, fault in faults.items():
+        assert isinstance(fault, Fault) and fault.topic == PLAN and words in fault.words, fault
+
+
+def test_an_inbox_is_bounded_in_messages_and_bytes() -> None:
+    """A full inbox drops the newest message, or the oldest one for the rule `rate`."""
+    for newest, numbers in ((False, [0, 1, 2]), (True, [7, 8, 9])):
+        for inbox in (Inbox(newest=newest, most=3), Inbox(newest=newest, most_b=300)):
+            for number in range(10):
+                inbox.put(Received(bytes([number]) * 100))
+            assert len(inbox) == 3
+            first = inbox.take()
+            assert first is not None
+            taken = [first, *inbox.take_all()]
+            assert [got.payload[0] for got in taken] == numbers and inbox.take() is None
+
+
+def test_remarks_are_counted_by_topic_and_kind() -> None:
+    """A kind of fault is new once in an episode, whatever its words say; repeats are counted."""
+    remarks = Remarks()
+    first = [remarks.add(Fault(CMD_VEL, "number", f"linear.x {x}")) for x in range(3)]
+    assert first == [True, False, False]
+    assert remarks.add(Fault(PLAN, "number", "a plan"))
+    assert remarks.words == ["linear.x 0 (3 messages)", "a plan"]
+    assert remarks.ended() == ["3 messages in the episode: linear.x 0"]
+    assert remarks.words == [] and remarks.add(Fault(CMD_VEL, "number", "again"))
 
 
 def test_the_page_names_each_topic_and_its_type() -> None:

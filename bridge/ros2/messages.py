@@ -122,13 +122,6 @@ def _quaternion(axes: NDArray[np.float64]) -> Any:
     return message("geometry_msgs/msg/Quaternion", float(x), float(y), float(z), float(w))
 
 
-def heading_of(turn: Any) -> float:
-    """Return the heading of a quaternion in radians."""
-    return math.atan2(
-        2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2)
-    )
-
-
 def _transform(time_ns: int, frame: str, child: str, at: Any, turn: Any) -> Any:
     return message(
         "geometry_msgs/msg/TransformStamped",
@@ -376,7 +369,6 @@ class Topic(NamedTuple):
     """
 
     name: str
-    words: str
     message: Callable[[Observation, int], Any] | None = None
     qos: Qos = Qos()
     lazy: bool = False
@@ -426,27 +418,22 @@ INITIAL: Final = "/initialpose"
 GOAL: Final = "/goal_pose"
 INSTRUCTION: Final = "/cosim/instruction"
 _ROWS: Final = (
-    Topic(CLOCK, "simulated time, every 50 ms"),
-    Topic(EPISODE, "JSON at a start and at a reset", qos=_LATCHED),
-    Topic(STATIC, "map -> odom, base_link -> sensors", qos=_LATCHED),
-    Topic(INITIAL, "estimated pose after the robot was put elsewhere"),
-    Topic(GOAL, "point goal in `odom`, when it changes", qos=_LATCHED),
-    Topic(INSTRUCTION, "instruction, when it changes", qos=_LATCHED),
-    Topic("/cosim/goal", "point goal in `base_link`", relative_goal),
-    Topic("/tf", "odom -> base_link", tf),
-    Topic("/odom", "estimated pose, and speeds", odometry),
-    Topic("/imu", "angular speed and specific force (`--ros2-imu`)", _inertial),
-    Topic("/scan", "lidar of one ring (`--ros2-scan`)", _scan),
-    Topic("/points", "lidar of several rings (`--ros2-scan`)", _points),
-    Topic("/camera/camera_info", "K, D and P", _info),
-    Topic("/camera/depth", "32FC1 in metres (`--ros2-depth`)", _depth),
-    Topic(
-        "/camera/image_raw/compressed",
-        "JPEG, only for a subscriber",
-        _picture(compressed_image),
-        lazy=True,
-    ),
-    Topic("/camera/image_raw", "rgb8", _picture(image)),
+    Topic(CLOCK),
+    Topic(EPISODE, qos=_LATCHED),
+    Topic(STATIC, qos=_LATCHED),
+    Topic(INITIAL),
+    Topic(GOAL, qos=_LATCHED),
+    Topic(INSTRUCTION, qos=_LATCHED),
+    Topic("/cosim/goal", relative_goal),
+    Topic("/tf", tf),
+    Topic("/odom", odometry),
+    Topic("/imu", _inertial),
+    Topic("/scan", _scan),
+    Topic("/points", _points),
+    Topic("/camera/camera_info", _info),
+    Topic("/camera/depth", _depth),
+    Topic("/camera/image_raw/compressed", _picture(compressed_image), lazy=True),
+    Topic("/camera/image_raw", _picture(image)),
 )
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType({row.name: row for row in _ROWS})
 """Published topics by name, in the order in which those of a tick are sent."""
