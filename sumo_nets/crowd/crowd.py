@@ -54,7 +54,7 @@ from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.lights import Signals, SumoLights, WaitingSpots
 from sumo_nets.crowd.proxy import Proxy, Walks
 from sumo_nets.crowd.shown_people import PoseFilter, ShownPeople, positions_of, sorted_actors
-from sumo_nets.engine import NearPersons, NearVehicles, sumo, sumo_errors
+from sumo_nets.engine import NearPersons, NearReader, NearVehicles, sumo, sumo_errors
 
 _ROLL_TICKS = 10
 """Interval in ticks at which persons and vehicles enter and leave."""
@@ -213,6 +213,7 @@ class SumoCrowd(Crowd):
         self._together = GroupCohesion(sumo, self._map.strips, TICK_MS / 1000)
         self._gaps = FollowingGaps(sumo)
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
+        self._reader = NearReader(self._pedestrians.ages)
         self._braking = BrakingForRobot(sumo, self._half_m, self._drivers.size_m, TICK_MS / 1000)
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
@@ -262,10 +263,9 @@ class SumoCrowd(Crowd):
     def _read(
         self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None
     ) -> Street:
-        persons = engine.persons_near(
-            x_m, y_m, self._spec.radius_m + LEAVE_MARGIN_M, self._pedestrians.ages
-        )
-        self._found = persons, vehicles = persons, engine.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
+        persons = self._reader.persons_near(x_m, y_m, self._spec.radius_m + LEAVE_MARGIN_M)
+        vehicles = self._reader.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
+        self._found = persons, vehicles
         people = self._people(persons, cast, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
