@@ -71,14 +71,14 @@ class NearPairs:
         at = _points(xy)
         if len(at) != len(self._at) or np.abs(at - self._at).max(initial=0.0) > 0.49 * _MARGIN_M:
             self._search(at)
-        gap = at[self._one] - at[self._other]
-        far_m2 = gap.real * gap.real + gap.imag * gap.imag
-        close = far_m2 < SHOULDERS_M * SHOULDERS_M
-        if close.any():
+        gap = at.take(self._one) - at.take(self._other)
+        x_m, y_m = gap.real, gap.imag
+        far_m2 = x_m * x_m + y_m * y_m
+        if far_m2.min(initial=np.inf) < SHOULDERS_M * SHOULDERS_M:
             near = far_m2 <= _NEAR_M * _NEAR_M
             one, other = self._one[near], self._other[near]
             moves = ~(firm[one] & firm[other])
-            if (close[near] & moves).any():
+            if (moves & (far_m2[near] < SHOULDERS_M * SHOULDERS_M)).any():
                 return one[moves], other[moves]
         return self._one[:0], self._other[:0]
 

@@ -147,7 +147,7 @@ class PoseFilter:
         count = len(shown)
         firm = np.zeros(count + len(others), dtype=bool)
         firm[count:] = True
-        wanted = np.concatenate([shown, others])
+        wanted = np.concatenate([shown, others]) if len(others) else shown
         pairs = self._near.of(wanted, firm)
         if not len(pairs[0]):
             return shown
