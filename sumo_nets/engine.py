@@ -57,7 +57,6 @@ class _Persons(Protocol):
     getLanePosition: Callable[[str], float]
     getSpeed: Callable[[str], float]
     getAngle: Callable[[str], float]
-    getWaitingTime: Callable[[str], float]
 
     def add(self, name: str, edge: str, at_m: float, /, *, typeID: str = ...) -> None: ...
     def appendWalkingStage(
@@ -84,7 +83,6 @@ class _Persons(Protocol):
 class _Cars(Protocol):
     getIDList: Callable[[], Sequence[str]]
     getNextTLS: Callable[[str], Sequence[tuple[str, int, float, str]]]
-    getWaitingTime: Callable[[str], float]
     getLaneID: Callable[[str], str]
     getLanePosition: Callable[[str], float]
     getRoute: Callable[[str], Sequence[str]]
@@ -221,6 +219,16 @@ class NearVehicles(NamedTuple):
     xy: Floats
     mps: Floats
     angle_deg: Floats
+
+
+def persons_waiting_s(names: Sequence[str]) -> list[float]:
+    """Return for how long each of these persons has been standing, seconds."""
+    return [*map(_native.person_getWaitingTime, names)]
+
+
+def vehicles_waiting_s(names: Sequence[str]) -> list[float]:
+    """Return for how long each of these vehicles has been standing, seconds."""
+    return [*map(_native.vehicle_getWaitingTime, names)]
 
 
 class NearReader:

@@ -6,7 +6,7 @@ so the crowd evades them one tick late.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -170,10 +170,10 @@ class SumoCrowd(Crowd):
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
                 self._gaps.keep(persons)
-                self._pedestrians.roll(
-                    x_m, y_m, _seen(sumo.person.getWaitingTime, persons), self._waits_at_red
-                )
-                self._drivers.roll(x_m, y_m, _seen(sumo.vehicle.getWaitingTime, vehicles))
+                seen = _seen(persons, engine.persons_waiting_s(persons.names))
+                self._pedestrians.roll(x_m, y_m, seen, self._waits_at_red)
+                seen = _seen(vehicles, engine.vehicles_waiting_s(vehicles.names))
+                self._drivers.roll(x_m, y_m, seen)
             stands = outline_mps(robot.v_mps, robot.w_radps, self._half_m) < ROBOT_STANDS_MPS
             self._stood_ticks = self._stood_ticks + 1 if stands else 0
             if not absent:
@@ -299,9 +299,9 @@ class SumoCrowd(Crowd):
         return self._signals.is_red(sumo.person.getNextEdge(person))
 
 
-def _seen(waiting_s: Callable[[str], float], near: NearPersons | NearVehicles) -> dict[str, Seen]:
-    here = zip(near.names, near.xy.tolist(), strict=True)
-    return {name: Seen(x_m, y_m, waiting_s(name)) for name, (x_m, y_m) in here}
+def _seen(near: NearPersons | NearVehicles, waiting_s: list[float]) -> dict[str, Seen]:
+    x_m, y_m = near.xy.T.tolist()
+    return dict(zip(near.names, map(Seen, x_m, y_m, waiting_s), strict=True))
 
 
 def _facing(person: str) -> float:
