@@ -57,7 +57,6 @@ class _Persons(Protocol):
     getLanePosition: Callable[[str], float]
     getSpeed: Callable[[str], float]
     getAngle: Callable[[str], float]
-    getWaitingTime: Callable[[str], float]
 
     def add(self, name: str, edge: str, at_m: float, /, *, typeID: str = ...) -> None: ...
     def appendWalkingStage(
@@ -84,7 +83,6 @@ class _Persons(Protocol):
 class _Cars(Protocol):
     getIDList: Callable[[], Sequence[str]]
     getNextTLS: Callable[[str], Sequence[tuple[str, int, float, str]]]
-    getWaitingTime: Callable[[str], float]
     getLaneID: Callable[[str], str]
     getLanePosition: Callable[[str], float]
     getRoute: Callable[[str], Sequence[str]]
@@ -223,40 +221,83 @@ class NearVehicles(NamedTuple):
     angle_deg: Floats
 
 
-def persons_near(x_m: float, y_m: float, reach_m: float, crowd: Container[str]) -> NearPersons:
-    """Return the persons of a crowd within `reach_m` of a point."""
-    of_crowd = [name for name in sorted(libsumo.person.getIDList()) if name in crowd]
-    names, xy = _near(x_m, y_m, reach_m, of_crowd, _native.person_getPosition)
-    return NearPersons(
-        names,
-        xy,
-        _of_each(_native.person_getSpeed, names),
-        [*map(_native.person_getNextEdge, names)],
-    )
+def persons_waiting_s(names: Sequence[str]) -> list[float]:
+    """Return for how long each of these persons has been standing, seconds."""
+    return [*map(_native.person_getWaitingTime, names)]
 
 
-def vehicles_near(x_m: float, y_m: float, reach_m: float) -> NearVehicles:
-    """Return the vehicles within `reach_m` of a point."""
-    names, xy = _near(
-        x_m, y_m, reach_m, sorted(libsumo.vehicle.getIDList()), _native.vehicle_getPosition
-    )
-    speeds = _of_each(_native.vehicle_getSpeed, names)
-    return NearVehicles(names, xy, speeds, _of_each(_native.vehicle_getAngle, names))
+def vehicles_waiting_s(names: Sequence[str]) -> list[float]:
+    """Return for how long each of these vehicles has been standing, seconds."""
+    return [*map(_native.vehicle_getWaitingTime, names)]
 
 
-def _near(
-    x_m: float,
-    y_m: float,
-    reach_m: float,
-    names: Sequence[str],
-    position_of: Callable[[str], tuple[float, float]],
-) -> tuple[tuple[str, ...], Floats]:
-    """Return those of `names` within `reach_m` of a point, and their positions (N, 2), metres."""
-    xy = np.fromiter(chain.from_iterable(map(position_of, names)), dtype=float).reshape(-1, 2)
-    gap = xy - (x_m, y_m)
-    distance_m2 = gap[:, 0] * gap[:, 0] + gap[:, 1] * gap[:, 1]
-    near = np.sqrt(distance_m2) <= reach_m
-    return tuple(compress(names, near.tolist())), write_protect(xy[near])
+class NearReader:
+    """Reads persons and vehicles near a point.
+
+    Names are sorted and selected again only where SUMO's list of them has changed.
+
+    crowd: names of the persons to read; those of persons that are in SUMO already never change.
+    """
+
+    def __init__(self, crowd: Container[str]) -> None:
+        self._persons = _Selection(
+            _native.person_getIDList, _native.person_getPosition, crowd.__contains__
+        )
+        self._vehicles = _Selection(_native.vehicle_getIDList, _native.vehicle_getPosition)
+
+    def persons_near(self, x_m: float, y_m: float, reach_m: float) -> NearPersons:
+        """Return the persons of the crowd within `reach_m` of a point."""
+        names, xy = self._persons.near(x_m, y_m, reach_m)
+        return NearPersons(
+            names,
+            xy,
+            _of_each(_native.person_getSpeed, names),
+            [*map(_native.person_getNextEdge, names)],
+        )
+
+    def vehicles_near(self, x_m: float, y_m: float, reach_m: float) -> NearVehicles:
+        """Return the vehicles within `reach_m` of a point."""
+        names, xy = self._vehicles.near(x_m, y_m, reach_m)
+        speeds = _of_each(_native.vehicle_getSpeed, names)
+        return NearVehicles(names, xy, speeds, _of_each(_native.vehicle_getAngle, names))
+
+
+class _Selection:
+    """Selects persons or vehicles by their distance to a point.
+
+    listed: returns all names, in SUMO's order.
+    position_of: returns the position of one, metres.
+    chosen: returns whether a name is read.
+    """
+
+    def __init__(
+        self,
+        listed: Callable[[], Sequence[str]],
+        position_of: Callable[[str], tuple[float, float]],
+        chosen: Callable[[str], bool] | None = None,
+    ) -> None:
+        self._listed = listed
+        self._position_of = position_of
+        self._chosen = chosen
+        self._last: Sequence[str] = ()
+        self._names: tuple[str, ...] = ()
+
+    def near(self, x_m: float, y_m: float, reach_m: float) -> tuple[tuple[str, ...], Floats]:
+        """Return the sorted names within `reach_m` of a point, and their positions (N, 2), metres.
+
+        While they are the same, the names are the same tuple.
+        """
+        listed = self._listed()
+        if listed != self._last:
+            self._last = listed
+            self._names = tuple(filter(self._chosen, sorted(listed)))
+        places = chain.from_iterable(map(self._position_of, self._names))
+        xy = np.fromiter(places, dtype=float, count=2 * len(self._names)).reshape(-1, 2)
+        dx, dy = xy[:, 0] - x_m, xy[:, 1] - y_m
+        near = np.sqrt(dx * dx + dy * dy) <= reach_m
+        if near.all():
+            return self._names, write_protect(xy)
+        return tuple(compress(self._names, near.tolist())), write_protect(xy[near])
 
 
 def _of_each(getter: Callable[[str], float], names: Sequence[str]) -> Floats:

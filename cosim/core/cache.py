@@ -309,13 +309,22 @@ def _used_s(path: Path) -> float:
         return 0.0
 
 
-def _size_bytes(path: Path) -> int:
+def _size_bytes(path: str | Path) -> int:
     """Return the disk space of a file, or of all files in a folder."""
     try:
-        if not path.is_dir():
-            return path.stat().st_blocks * 512
-        return sum(_size_bytes(Path(one.path)) for one in os.scandir(path))
+        with os.scandir(path) as found:
+            entries = list(found)
+    except NotADirectoryError:
+        return _blocks_bytes(Path(path))
     except OSError:
+        return 0
+    return sum(_size_bytes(one.path) if one.is_dir() else _blocks_bytes(one) for one in entries)
+
+
+def _blocks_bytes(file: Path | os.DirEntry[str]) -> int:
+    try:
+        return file.stat().st_blocks * 512
+    except OSError:  # removed by another process
         return 0
 
 

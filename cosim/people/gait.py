@@ -66,15 +66,21 @@ def is_woman(name: str) -> bool:
 
 def relative_pace(pace_mps: ArrayLike, stature: ArrayLike) -> Floats:
     """Return the reference person's pace with an equal Froude number, (N,) m/s."""
-    return np.asarray(pace_mps, dtype=float) * np.sqrt(
-        REFERENCE_M / np.asarray(stature, dtype=float)
-    )
+    return np.asarray(pace_mps, dtype=float) * _pace_scale(stature)
 
 
 def stride_m(pace_mps: ArrayLike, stature: ArrayLike) -> Floats:
     """Return the stride of people of (N,) statures at (N,) paces, (N,) metres."""
-    scale = np.asarray(stature, dtype=float) / REFERENCE_M
-    return np.asarray(scale * np.interp(relative_pace(pace_mps, stature), _PACES_MPS, _STRIDES_M))
+    pace = relative_pace(pace_mps, stature)
+    return np.asarray(_length_scale(stature) * np.interp(pace, _PACES_MPS, _STRIDES_M))
+
+
+def _length_scale(stature: ArrayLike) -> Floats:
+    return np.asarray(stature, dtype=float) / REFERENCE_M
+
+
+def _pace_scale(stature: ArrayLike) -> Floats:
+    return np.asarray(np.sqrt(REFERENCE_M / np.asarray(stature, dtype=float)))
 
 
 @dataclass(slots=True)
@@ -89,7 +95,9 @@ class Strides:
     _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _strides: Floats = field(default_factory=lambda: np.zeros(1))
     _pace: Floats = field(default_factory=lambda: np.zeros(1))
-    _stature: Floats = field(default_factory=lambda: np.zeros(1))
+    _stature: Floats = field(default_factory=lambda: np.ones(1))
+    _length_scale: Floats = field(default_factory=lambda: np.ones(1))
+    _pace_scale: Floats = field(default_factory=lambda: np.ones(1))
 
     def update(
         self, ids: tuple[str, ...], xy: Floats, speed: Floats, age: Ages
@@ -107,19 +115,22 @@ class Strides:
         at = self._xy[row]
         strides = self._strides[row]
         pace = self._pace[row]
-        stature = self._stature[row]
-        for i in new:
-            at[i], strides[i], pace[i] = xy[i], first_stride(ids[i]), speed[i]
-            stature[i] = stature_m(ids[i], age[i])
+        if ids and not isinstance(row, slice):
+            self._stature = stature = self._stature[row]
+            for i in new:
+                at[i], strides[i], pace[i] = xy[i], first_stride(ids[i]), speed[i]
+                stature[i] = stature_m(ids[i], age[i])
+            self._length_scale, self._pace_scale = _length_scale(stature), _pace_scale(stature)
         pace = pace + (speed - pace) * min(self.period_s / PACE_TIME_CONSTANT_S, 1.0)
         step = xy - at
         moved = np.hypot(step[:, 0], step[:, 1])
         if ids:
-            strides = strides + np.where(moved < _JUMP_M, moved, 0.0) / stride_m(pace, stature)
+            relative = pace * self._pace_scale
+            stride = self._length_scale * np.interp(relative, _PACES_MPS, _STRIDES_M)
+            strides = strides + np.where(moved < _JUMP_M, moved, 0.0) / stride
             self._xy = xy
             self._strides = strides
             self._pace = pace
-            self._stature = stature
         return strides, pace
 
 

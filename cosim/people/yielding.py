@@ -88,19 +88,15 @@ def stepped_around(
     tangent, on the side on which the step passes the centre. The choice reinforces itself, so that
     people do not oscillate.
     """
+    if not _anyone_within_gap(wanted, body):
+        return wanted
     length, width = body.half_m
     ahead = ANTICIPATION_S * max(body.v_mps, 0.0)
     low = np.array([-length, -width])
     high = np.array([length, width])
     reach = np.array([ahead, 0.0])
-    offset = wanted - body.pose.xy
-    if (
-        np.hypot(offset[:, 0], offset[:, 1]).min(initial=np.inf)
-        > reaction_distance_m(body) + _ROUNDING_M
-    ):
-        return wanted
     turn = _axes(body)
-    targets = offset @ turn
+    targets = (wanted - body.pose.xy) @ turn
     rows = np.flatnonzero(_disk_gap(targets, low, high + reach) < STEP_ROUND_GAP_M)
     if not len(rows):
         return wanted
@@ -135,6 +131,27 @@ def stepped_around(
     return rounded
 
 
+def _anyone_within_gap(xy: Floats, body: RobotBody) -> bool:
+    """Return whether people may be within STEP_ROUND_GAP_M of the ground that a body covers or will
+    cover; only rounding makes it true for others."""
+    x_m, y_m, heading_rad = body.pose
+    near_m = reaction_distance_m(body) + _ROUNDING_M
+    dx, dy = xy[:, 0] - x_m, xy[:, 1] - y_m
+    near = dx * dx + dy * dy <= near_m * near_m
+    if not near.any():
+        return False
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    half_length, half_width = body.half_m
+    front = half_length + ANTICIPATION_S * max(body.v_mps, 0.0)
+    gap_m = PERSON_RADIUS_M + STEP_ROUND_GAP_M + _ROUNDING_M
+    for x, y in zip(dx[near].tolist(), dy[near].tolist(), strict=True):
+        ahead, left = cos * x + sin * y, cos * y - sin * x
+        beyond = max(ahead - front, -half_length - ahead, 0.0)
+        if math.hypot(beyond, max(abs(left) - half_width, 0.0)) < gap_m:
+            return True
+    return False
+
+
 def approaches_body(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
     """Return whether each step approaches the robot's outline below the gap, (N,) booleans."""
     turn = _axes(body)
@@ -166,6 +183,10 @@ def _disk_gap(points: Floats, low: Floats, high: Floats) -> Floats:
     return gap
 
 
+_SEARCH_M: Final = 1.0
+"""Movement of people after which distances to obstacles are computed again, metres."""
+
+
 class StandingObstacles:
     """Obstacles of a scenario as people avoid them.
 
@@ -177,6 +198,8 @@ class StandingObstacles:
         self._footprints = [obstacle_body(body) for body in self.bodies]
         self._xy = np.array([(body.x_m, body.y_m) for body in self.bodies]).reshape(-1, 2)
         self._reach_m = np.array([reaction_distance_m(body) for body in self._footprints])
+        self._searched = np.zeros((0, 2))
+        self._spare_m: list[float] = []
 
     def near(self, xy: Floats, margin_m: float = 0.0) -> tuple[StandingBody, ...]:
         """Return the obstacles near people at (N, 2) metres, within stepping distance plus a
@@ -188,7 +211,7 @@ class StandingObstacles:
     ) -> Floats:
         """Return new positions of people, as `stepped_around` does, for all near obstacles."""
         if len(self.bodies) and len(wanted):
-            for i in self._rows(wanted, 0.0):
+            for i in self._within_reach(wanted):
                 wanted = stepped_around(before, wanted, self._footprints[i], stand)
         return wanted
 
@@ -209,6 +232,24 @@ class StandingObstacles:
         to_side = self._xy[rows[nearest]] - at[0]
         side = (to_side / max(float(np.hypot(*to_side)), 1e-9)).tolist()
         return body._replace(closed=(side[0], side[1]))
+
+    def _within_reach(self, xy: Floats) -> list[int]:
+        """Return the rows of the obstacles within stepping distance of people; a single one may be
+        farther away.
+
+        Distances are computed only where people may have come near since the last search.
+        """
+        moved_m = math.inf
+        if len(xy) == len(self._searched):
+            moved_m = math.sqrt(2.0) * float(np.abs(xy - self._searched).max())
+        if moved_m > _SEARCH_M:
+            gap = xy[:, None] - self._xy[None]
+            nearest_m = np.sqrt((gap * gap).sum(axis=2).min(axis=0))
+            self._spare_m = (nearest_m - self._reach_m - _ROUNDING_M).tolist()
+            self._searched = xy
+            moved_m = 0.0
+        rows = [i for i, spare_m in enumerate(self._spare_m) if spare_m <= moved_m]
+        return rows if len(rows) < 2 else self._rows(xy, 0.0)
 
     def _rows(self, xy: Floats, margin_m: float) -> list[int]:
         gap = xy[:, None] - self._xy[None]

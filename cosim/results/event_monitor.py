@@ -107,6 +107,8 @@ class EventMonitor:
         before = step.robot.pose
         after = step.motion.robot.pose
         for i, (event, state) in enumerate(zip(self._events, self._states, strict=True)):
+            if state.triggered_tick is None and state.phase not in ("acting", "over"):
+                continue
             places = {k: shown[name] for k, name in enumerate(event.names) if name in shown}
             if state.triggered_tick is not None:
                 self._tracks += [(step.tick, i, person, *xy) for person, xy in places.items()]

@@ -51,7 +51,7 @@ def nearness(robot: RobotState, people: People, footprint_m: tuple[float, float]
     """Return the proximity of people to a robot of this length and width, metres."""
     if not len(people):
         return Nearness()
-    to = people.xy - robot.pose.xy
+    to = people.xy - robot.pose[:2]
     away_m = np.hypot(to[:, 0], to[:, 1])
     least_m = float(away_m.min())
     # A gap is at most the centre distance, and smaller by at most half the diagonal of the robot.
@@ -62,10 +62,9 @@ def nearness(robot: RobotState, people: People, footprint_m: tuple[float, float]
     )
     heading = robot.pose.heading_rad
     v_mps = robot.v_mps
-    going = people.speed[:, None] * np.column_stack(
-        [np.cos(people.heading), np.sin(people.heading)]
-    )
-    closing = going - v_mps * np.array([np.cos(heading), np.sin(heading)])
+    closing = np.empty_like(to)
+    closing[:, 0] = people.speed * np.cos(people.heading) - v_mps * np.cos(heading)
+    closing[:, 1] = people.speed * np.sin(people.heading) - v_mps * np.sin(heading)
     in_s = time_to_collision_s(to, closing, half_length_m + PERSON_RADIUS_M)
     return Nearness(least_m, max(gap_m - PERSON_RADIUS_M, 0.0), float(in_s.min()))
 
@@ -78,10 +77,12 @@ def time_to_collision_s(offset: Floats, velocity: Floats, radius_m: float) -> Fl
 
     A point already inside gets 0, a point that never comes inside inf.
     """
-    speed2 = (velocity**2).sum(axis=1)
-    along = (offset * velocity).sum(axis=1)
-    outside = (offset**2).sum(axis=1) - radius_m**2
-    root2 = along**2 - speed2 * outside
+    x_m, y_m = offset.T
+    vx_mps, vy_mps = velocity.T
+    speed2 = vx_mps * vx_mps + vy_mps * vy_mps
+    along = x_m * vx_mps + y_m * vy_mps
+    outside = x_m * x_m + y_m * y_m - radius_m**2
+    root2 = along * along - speed2 * outside
     meets = (along < -_SLOWEST_MPS) & (root2 >= 0.0)
     in_s = np.full(len(offset), np.inf)
     in_s[meets] = outside[meets] / (np.sqrt(root2[meets]) - along[meets])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Final
 
 import cv2
 import numpy as np
 
 from cosim.core.geometry import Floats
+from cosim.core.state import write_protect
 from physics.textures.noise import Field, Noise, smooth_step
 
 _SIZE: Final = 512
@@ -62,8 +64,10 @@ def clouded(
     return broken + (overcast - broken) * closed, seen
 
 
+@lru_cache(maxsize=1)
 def _layer(seed: int) -> Field:
-    """Return (S, S) noise with a uniform distribution in 0 to 1, so that a cover is a threshold."""
+    """Return (S, S) noise with a uniform distribution in 0 to 1, so that a cover is a threshold;
+    write-protected. Episodes in one place share it."""
     noise = Noise(_SIZE, (seed, 9001))
     field = noise.distort(
         np.asarray(noise.clouds(4) + 0.6 * noise.clouds(16) + 0.15 * noise.clouds(64), np.float32),
@@ -71,7 +75,7 @@ def _layer(seed: int) -> Field:
         8,
     )
     order = np.argsort(np.argsort(field, axis=None)).reshape(field.shape)
-    return np.asarray(order / order.size, dtype=np.float32)
+    return write_protect(np.asarray(order / order.size, dtype=np.float32))
 
 
 def _dense(layer: Field, ways: Floats, cover: float, moved: Floats) -> Field:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cosim.core.cache import mapped_arrays, sources_hash
 from cosim.core.geometry import Floats
+from cosim.core.state import write_protect
 from cosim.spec.scenario import Light
 from physics.cameras.clearsky import LUMINANCE, clear_sky
 from physics.cameras.clouds import clouded
@@ -112,12 +113,15 @@ def sky_of(light: Light, seed: int = 0, to_sun: tuple[float, float, float] | Non
     return Sky(**sky)
 
 
+@lru_cache(maxsize=2)
 def directions(rows: int) -> Floats:
-    """Return (rows, 2 rows, 3) unit vectors of an equirectangular picture's pixels."""
+    """Return (rows, 2 rows, 3) unit vectors of an equirectangular picture's pixels,
+    write-protected."""
     rise = (0.5 - (np.arange(rows) + 0.5) / rows)[:, None] * math.pi
     turn = (0.5 - (np.arange(2 * rows) + 0.5) / (2 * rows))[None, :] * 2.0 * math.pi
     flat = np.cos(rise)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), np.sin(rise) + 0.0 * turn], axis=-1)
+    ways = np.stack([flat * np.cos(turn), flat * np.sin(turn), np.sin(rise) + 0.0 * turn], axis=-1)
+    return write_protect(ways)
 
 
 def irradiance(radiance: NDArray[np.floating], towards: Floats) -> Floats:

@@ -6,6 +6,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.geometry import Pose
 from cosim.core.state import PERSON_RADIUS_M, People, Vehicles
@@ -55,12 +56,13 @@ def movers_near(
 
     Those missing from `before` are placed at their new pose at once.
     """
-    distance = np.hypot(after.xy[:, 0] - x_m, after.xy[:, 1] - y_m)
     same = before.ids == after.ids
+    search_m = reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)
+    near = _within(after, x_m, y_m, search_m)
     if same:
-        distance = np.minimum(distance, np.hypot(before.xy[:, 0] - x_m, before.xy[:, 1] - y_m))
+        near |= _within(before, x_m, y_m, search_m)
     found = []
-    for i in (distance <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).nonzero()[0].tolist():
+    for i in near.nonzero()[0].tolist():
         name = after.ids[i]
         start = None
         if same:
@@ -78,6 +80,14 @@ def movers_near(
         ):
             found.append(mover)
     return found
+
+
+def _within(things: People | Vehicles, x_m: float, y_m: float, reach_m: float) -> NDArray[np.bool_]:
+    """Return which people or vehicles are within `reach_m` of a point, (N,); rounding is not
+    exact."""
+    dx, dy = things.xy[:, 0] - x_m, things.xy[:, 1] - y_m
+    near: NDArray[np.bool_] = dx * dx + dy * dy <= reach_m * reach_m
+    return near
 
 
 def _mover(name: str, size_m: tuple[float, float], start: Pose | None, end: Pose) -> Mover:

@@ -6,7 +6,7 @@ so the crowd evades them one tick late.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -54,7 +54,7 @@ from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.lights import Signals, SumoLights, WaitingSpots
 from sumo_nets.crowd.proxy import Proxy, Walks
 from sumo_nets.crowd.shown_people import PoseFilter, ShownPeople, positions_of, sorted_actors
-from sumo_nets.engine import NearPersons, NearVehicles, sumo, sumo_errors
+from sumo_nets.engine import NearPersons, NearReader, NearVehicles, sumo, sumo_errors
 
 _ROLL_TICKS = 10
 """Interval in ticks at which persons and vehicles enter and leave."""
@@ -170,10 +170,10 @@ class SumoCrowd(Crowd):
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
                 self._gaps.keep(persons)
-                self._pedestrians.roll(
-                    x_m, y_m, _seen(sumo.person.getWaitingTime, persons), self._waits_at_red
-                )
-                self._drivers.roll(x_m, y_m, _seen(sumo.vehicle.getWaitingTime, vehicles))
+                seen = _seen(persons, engine.persons_waiting_s(persons.names))
+                self._pedestrians.roll(x_m, y_m, seen, self._waits_at_red)
+                seen = _seen(vehicles, engine.vehicles_waiting_s(vehicles.names))
+                self._drivers.roll(x_m, y_m, seen)
             stands = outline_mps(robot.v_mps, robot.w_radps, self._half_m) < ROBOT_STANDS_MPS
             self._stood_ticks = self._stood_ticks + 1 if stands else 0
             if not absent:
@@ -213,6 +213,7 @@ class SumoCrowd(Crowd):
         self._together = GroupCohesion(sumo, self._map.strips, TICK_MS / 1000)
         self._gaps = FollowingGaps(sumo)
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
+        self._reader = NearReader(self._pedestrians.ages)
         self._braking = BrakingForRobot(sumo, self._half_m, self._drivers.size_m, TICK_MS / 1000)
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
@@ -262,10 +263,9 @@ class SumoCrowd(Crowd):
     def _read(
         self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None
     ) -> Street:
-        persons = engine.persons_near(
-            x_m, y_m, self._spec.radius_m + LEAVE_MARGIN_M, self._pedestrians.ages
-        )
-        self._found = persons, vehicles = persons, engine.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
+        persons = self._reader.persons_near(x_m, y_m, self._spec.radius_m + LEAVE_MARGIN_M)
+        vehicles = self._reader.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
+        self._found = persons, vehicles
         people = self._people(persons, cast, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
@@ -299,9 +299,9 @@ class SumoCrowd(Crowd):
         return self._signals.is_red(sumo.person.getNextEdge(person))
 
 
-def _seen(waiting_s: Callable[[str], float], near: NearPersons | NearVehicles) -> dict[str, Seen]:
-    here = zip(near.names, near.xy.tolist(), strict=True)
-    return {name: Seen(x_m, y_m, waiting_s(name)) for name, (x_m, y_m) in here}
+def _seen(near: NearPersons | NearVehicles, waiting_s: list[float]) -> dict[str, Seen]:
+    x_m, y_m = near.xy.T.tolist()
+    return dict(zip(near.names, map(Seen, x_m, y_m, waiting_s), strict=True))
 
 
 def _facing(person: str) -> float:

@@ -89,6 +89,8 @@ class Signals:
 
     def red(self, crossings: Sequence[str]) -> list[int]:
         """Return the indices of those `crossings` with a signal that forbids walking."""
+        if self._signalised.isdisjoint(crossings):
+            return []
         now_s = self._lights.now_s()
         return [
             i

@@ -330,7 +330,8 @@ class Proxy:
         """Locate a position on the map; cached while the body is on the same walkable piece."""
         if self._inside.holds(x_m, y_m):
             return self._place
-        if self._piece is None or not shapely.contains_xy(self._piece, x_m, y_m):
+        inside = self._piece is not None and shapely.contains_xy(self._piece, x_m, y_m)
+        if not inside:
             street_map = self._walks.street_map
             self._place = place = street_map.locate(x_m, y_m)
             self._piece = None
@@ -339,8 +340,9 @@ class Proxy:
                 self._piece = piece.polygon
                 self._outline = shapely.boundary(piece.polygon)
                 shapely.prepare(self._piece)
+                inside = shapely.contains_xy(self._piece, x_m, y_m)
         room_m = 0.0
-        if self._piece is not None and shapely.contains_xy(self._piece, x_m, y_m):
+        if inside:
             room_m = max(
                 float(shapely.distance(self._outline, shapely.Point(x_m, y_m))) - _ROUNDING_M, 0.0
             )

@@ -62,22 +62,23 @@ class NearPairs:
     _one: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     _other: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
-    def of(self, at: Complex, firm: NDArray[np.bool_]) -> tuple[Rows, Rows]:
+    def of(self, xy: Floats, firm: NDArray[np.bool_]) -> tuple[Rows, Rows]:
         """Return the indices of near pairs, two arrays (P,) in order; empty if no pair is too near.
 
-        at: (N,) positions.
+        xy: (N, 2) positions, metres.
         firm: (N,) whether a person does not give way.
         """
+        at = _points(xy)
         if len(at) != len(self._at) or np.abs(at - self._at).max(initial=0.0) > 0.49 * _MARGIN_M:
             self._search(at)
-        gap = at[self._one] - at[self._other]
-        far_m2 = gap.real * gap.real + gap.imag * gap.imag
-        close = far_m2 < SHOULDERS_M * SHOULDERS_M
-        if close.any():
+        gap = at.take(self._one) - at.take(self._other)
+        x_m, y_m = gap.real, gap.imag
+        far_m2 = x_m * x_m + y_m * y_m
+        if far_m2.min(initial=np.inf) < SHOULDERS_M * SHOULDERS_M:
             near = far_m2 <= _NEAR_M * _NEAR_M
             one, other = self._one[near], self._other[near]
             moves = ~(firm[one] & firm[other])
-            if (close[near] & moves).any():
+            if (moves & (far_m2[near] < SHOULDERS_M * SHOULDERS_M)).any():
                 return one[moves], other[moves]
         return self._one[:0], self._other[:0]
 
@@ -93,7 +94,7 @@ def separated_positions(
     firm: NDArray[np.bool_],
     reach_m: float,
     stand: NDArray[np.bool_] | None = None,
-    near: NearPairs | None = None,
+    pairs: tuple[Rows, Rows] | None = None,
 ) -> Floats:
     """Return positions (N, 2) close to `wanted` at which people do not overlap, metres.
 
@@ -102,13 +103,12 @@ def separated_positions(
     reach_m: largest step, metres.
     stand: (N,) whether a person wants to stand; it does not move unless that brings it closer to
         its goal.
-    near: cache of near pairs between steps.
+    pairs: near pairs at `wanted`, if they are known already.
     """
-    goal = _points(wanted)
-    one, other = (near or NearPairs()).of(goal, firm)
+    one, other = NearPairs().of(wanted, firm) if pairs is None else pairs
     if not len(one):
         return wanted
-    start = _points(before)
+    goal, start = _points(wanted), _points(before)
     share_one = np.where(firm[one], 0.0, np.where(firm[other], 1.0, 0.5))
     shares = share_one, np.where(firm[other], 0.0, np.where(firm[one], 1.0, 0.5))
     apart = start[other] - start[one]

@@ -95,7 +95,6 @@ class PoseFilter:
             motion[new] = speed[new, None] * np.column_stack(
                 [np.cos(facing[new]), np.sin(facing[new])]
             )
-        simulated = motion[new]
 
         gap = xy - before
         distance = np.hypot(gap[:, 0], gap[:, 1])
@@ -105,7 +104,8 @@ class PoseFilter:
         shown = self._separated(before, shown, others, stand)
         shown = self._around_obstacles(before, shown, body, stand)
         velocity = (shown - before) / self.period_s
-        velocity[new] = simulated
+        if new:
+            velocity[new] = motion[new]
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
 
         moving = np.hypot(motion[:, 0], motion[:, 1]) > TURNING_SPEED_MPS
@@ -135,18 +135,26 @@ class PoseFilter:
             return stepped_around(before, past, self.standing.closing(body), stand)
         past = stepped_around(before, shown, body, stand)
         round_both = self.standing.stepped_around(before, past, stand)
+        if round_both is past:
+            return past
         stays = (round_both != past).any(axis=1) & approaches_body(before, round_both, body)
         return np.where(stays[:, None], before, round_both)
 
     def _separated(
         self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]
     ) -> Floats:
-        firm = np.arange(len(shown) + len(others)) >= len(shown)
+        """Keep people apart. others: (K, 2) positions of people who do not give way, metres."""
+        count = len(shown)
+        firm = np.zeros(count + len(others), dtype=bool)
+        firm[count:] = True
+        wanted = np.concatenate([shown, others]) if len(others) else shown
+        pairs = self._near.of(wanted, firm)
+        if not len(pairs[0]):
+            return shown
+        before = np.concatenate([before, others])
         stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
-        before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
-        return separated_positions(
-            before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand, self._near
-        )[: len(shown)]
+        reach_m = MAX_SPEED_MPS * self.period_s
+        return separated_positions(before, wanted, firm, reach_m, stand, pairs)[:count]
 
 
 _NO_VALUES: Final = np.zeros(0)
@@ -182,20 +190,22 @@ class ShownPeople:
             all_ages = [*(ages[name] for name in names), *(a.age for a in cast)]
             self._kind = write_protected_copy(kinds, np.int8)
             self._age = write_protected_copy(all_ages, np.int8)
-        doing: list[Doing] = [
-            "walk" if walks else "stand" for walks in (speed > PERSON_STANDS_MPS).tolist()
-        ]
-        places = np.concatenate([xy, positions_of(cast)])
-        paces = np.concatenate(
-            [speed, [a.speed_mps if a.pace_mps is None else a.pace_mps for a in cast]]
-        )
-        strides, paces = self._strides.update(self._names, places, paces, self._age)
+        doing = tuple(map(_DOING.__getitem__, (speed > PERSON_STANDS_MPS).tolist()))
+        paces = speed
+        if cast:
+            doing += tuple([a.doing for a in cast])
+            added = np.array([_columns(a) for a in cast])
+            xy = np.concatenate([xy, added[:, :2]])
+            heading = np.concatenate([heading, added[:, 2]])
+            paces = np.concatenate([speed, added[:, 4]])
+            speed = np.concatenate([speed, added[:, 3]])
+        strides, paces = self._strides.update(self._names, xy, paces, self._age)
         return People(
             self._names,
-            write_protect(places),
-            write_protect(np.concatenate([heading, [a.heading_rad for a in cast]])),
-            write_protect(np.concatenate([speed, [a.speed_mps for a in cast]])),
-            (*doing, *(a.doing for a in cast)),
+            write_protect(xy),
+            write_protect(heading),
+            write_protect(speed),
+            doing,
             write_protect(strides),
             write_protect(paces),
             self._kind,
@@ -203,10 +213,20 @@ class ShownPeople:
         )
 
 
+_DOING: Final[tuple[Doing, Doing]] = ("stand", "walk")
+"""Activity of a member of the crowd by whether it walks."""
+
+
+def _columns(one: Actor) -> tuple[float, float, float, float, float]:
+    """Return position, heading, speed and shown pace of an event pedestrian."""
+    pace_mps = one.speed_mps if one.pace_mps is None else one.pace_mps
+    return one.x_m, one.y_m, one.heading_rad, one.speed_mps, pace_mps
+
+
 def sorted_actors(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[Actor]:
     """Return actors sorted by id. Raises EngineError for duplicate ids, also with the crowd's."""
     ids = {actor.id for actor in actors}
-    if len(ids) != len(actors) or ids & crowd.keys():
+    if len(ids) != len(actors) or not crowd.keys().isdisjoint(ids):
         raise EngineError(
             f"actors need unique ids, and none of the crowd's: {[a.id for a in actors]}"
         )

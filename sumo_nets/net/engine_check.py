@@ -67,12 +67,13 @@ def reference_hashes() -> dict[str, str]:
             "--no-warnings",
         ]
         engine.start([*arguments, "--seed", "7", "--no-step-log"])
+        reader = engine.NearReader(_WALKERS)
         try:
             for _ in range(2 * _SECONDS):
                 sumo.simulationStep()
                 traffic = (
-                    engine.vehicles_near(0.0, 0.0, 1e3),
-                    engine.persons_near(0.0, 0.0, 1e3, _WALKERS),
+                    reader.vehicles_near(0.0, 0.0, 1e3),
+                    reader.persons_near(0.0, 0.0, 1e3),
                 )
                 for one in traffic:
                     seen.update(

@@ -55,6 +55,28 @@ def gap_m(track: Floats, *obstacles: Obstacle) -> float:
     return float(shapely.distance(shapely.points(track), ground).min()) - PERSON_RADIUS_M
 
 
+def test_distances_found_before_do_not_change_a_step() -> None:
+    """Obstacles that were compared with people before give the same bits as new ones, also where
+    the number of people changes."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-15.0, 15.0, (12, 2)).tolist()
+    ground = box(-40.0, -40.0, 40.0, 40.0)
+    obstacles = [thing("bin", x_m, y_m) for x_m, y_m in places]
+    used = standing(*obstacles, area=ground)
+    changed = 0
+    for count in (30, 45, 1, 45):
+        at = rng.uniform(-20.0, 20.0, (count, 2))
+        step = rng.normal(0.0, 0.06, (count, 2))
+        for _ in range(60):
+            step = np.where(rng.random((count, 1)) < 0.02, rng.normal(0.0, 0.06, step.shape), step)
+            stand = rng.random(count) < 0.1
+            new = StandingObstacles(used.bodies).stepped_around(at, at + step, stand)
+            at, before = used.stepped_around(at, at + step, stand), at
+            assert np.array_equal(at, new)
+            changed += not np.array_equal(at, before + step)
+    assert changed > 20
+
+
 @pytest.mark.parametrize("kind", sorted(OBSTACLE_SIZES_M))
 def test_the_crowd_steps_round_what_stands_in_its_way(kind: str) -> None:
     """From either side, wherever on it they are headed, people go round and come to where they

@@ -199,6 +199,16 @@ def test_statures_are_of_all_ages() -> None:
     assert min(grown) > 1.40 and max(grown) < 2.0 and 1.66 < float(np.mean(grown)) < 1.74
 
 
+def test_strides_of_people_who_come_back_begin_again() -> None:
+    """After a tick without people, the next ones are new."""
+    strides = Strides(0.05)
+    one = ("c1",), np.zeros((1, 2)), np.ones(1), [Age.ADULT]
+    first = strides.update(*one)
+    strides.update(*one)
+    strides.update((), np.zeros((0, 2)), np.zeros(0), [])
+    assert strides.update(*one) == first
+
+
 def test_strides_follow_the_way_walked() -> None:
     """Strides count the metres walked; standing and jumping count none."""
     strides = Strides(0.05)

@@ -18,7 +18,7 @@ from sumo_nets.city.store import city_net
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.lights import WaitingSpots
 from sumo_nets.crowd.proxy import KEEP_ROUTE, KEEP_ROUTE_ON_ROAD, LEAD_MIN_M, MATCH_M, Walks
-from sumo_nets.engine import persons_near, sumo, vehicles_near
+from sumo_nets.engine import NearReader, sumo
 from sumo_nets.net.snapshot import street_map_of
 
 CITY = City(seed=2, size_m=600.0)
@@ -48,8 +48,9 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
     """A query returns exactly the persons and vehicles within its radius."""
     x_m, y_m = crowd.street.people.xy.mean(axis=0).tolist()
     ours = set(sumo.person.getIDList()[::2])
+    reader = NearReader(ours)
     for reach_m in (60.0, 75.0, 500.0):
-        near = persons_near(x_m, y_m, reach_m, ours)
+        near = reader.persons_near(x_m, y_m, reach_m)
         away_m = {name: math.dist(sumo.person.getPosition(name), (x_m, y_m)) for name in ours}
         assert list(near.names) == sorted(
             name for name, far_m in away_m.items() if far_m <= reach_m
@@ -59,12 +60,12 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
                 k
             ] == sumo.person.getSpeed(name)
             assert near.ahead[k] == sumo.person.getNextEdge(name)
-    assert 0 < len(persons_near(x_m, y_m, 60.0, ours).names) < len(near.names) == len(ours)
-    cars = vehicles_near(x_m, y_m, 100.0)
+    assert 0 < len(reader.persons_near(x_m, y_m, 60.0).names) < len(near.names) == len(ours)
+    cars = reader.vehicles_near(x_m, y_m, 100.0)
     assert (
         0
         < len(cars.names)
-        <= len(vehicles_near(x_m, y_m, 1000.0).names)
+        <= len(reader.vehicles_near(x_m, y_m, 1000.0).names)
         == len(sumo.vehicle.getIDList())
     )
     assert np.hypot(*(cars.xy - (x_m, y_m)).T).max() <= 100.0
