@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from physics.ground.mesh import smooth_normals
-from physics.people.accessories import Carried, Hair, carried, hair, headgear
+from physics.people.accessories import Beside, Cap, Carried, Hair, carried, hair, headgear
+from physics.people.ambient import unshaded
 from physics.people.arms import arms
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton
@@ -29,23 +30,27 @@ from physics.people.head import about_head, neck_and_head
 from physics.people.lofted_mesh import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
 
-COATS: Final = ("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap")
+COATS: Final = (
+    *("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap"),
+    *("trim", "metal", "fur"),
+)
 """Surfaces of a body; a person has one colour for each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outfit:
-    """Components of a body: family, build, clothes, hair and carried objects."""
+    """Components of a body: family, build, clothes, hair, carried and pushed objects."""
 
     family: Family
     build: Build
     legs: Legs
     sleeve: Sleeve
     hair: Hair
-    cap: bool = False
+    cap: Cap = ""
     carried: Carried = ""
     bare: bool = False
     loose_m: float = 0.0
+    beside: Beside = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +63,7 @@ class SkinnedBody:
     weights: (V, 4) float32, descending, with sum 1
     coat: (V,) uint8 rows of COATS
     fat: (V,) float32, offset of a vertex on stouter people
+    unshaded: (V,) float32, share of ambient light that the body leaves, 0 to 1
     """
 
     vertices: NDArray[np.float32]
@@ -67,6 +73,7 @@ class SkinnedBody:
     weights: NDArray[np.float32]
     coat: NDArray[np.uint8]
     fat: NDArray[np.float32]
+    unshaded: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +99,7 @@ class FarBody:
     fat: NDArray[np.float32]
     still: NDArray[np.bool_]
     ribbon: NDArray[np.bool_]
+    unshaded: NDArray[np.float32]
 
 
 @lru_cache(maxsize=128)
@@ -109,6 +117,7 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
     )
     weights = np.concatenate([s.weights for _, s in surfaces])
     weights = _sided(vertices, weights)
+    light = unshaded(vertices, smooth_normals(vertices, triangles))
     vertices = _fitted(vertices, weights, skeleton(outfit.family))
     joints, few = strongest(weights)
     coat = np.repeat(
@@ -122,6 +131,7 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
         few,
         coat.astype(np.uint8),
         np.concatenate([s.fat for _, s in surfaces]).astype(np.float32),
+        light.astype(np.float32),
     )
 
 
@@ -158,6 +168,7 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
             np.repeat(kind, [len(t.middle) for _, t in tubes])
             for kind in zip(*((t.still, t.ribbon) for _, t in tubes), strict=True)
         ),
+        np.concatenate([unshaded(t.middle, 0.0 * t.middle) for _, t in tubes]).astype(np.float32),
     )
 
 
@@ -173,7 +184,7 @@ def pieces(outfit: Outfit) -> tuple[Piece, ...]:
     parts += arms(build, outfit.sleeve, outfit.loose_m)
     parts += [about_head(piece, build.head) for piece in hair(outfit.hair)]
     if outfit.cap:
-        parts += [about_head(piece, build.head) for piece in headgear()]
+        parts += [about_head(piece, build.head) for piece in headgear(outfit.cap)]
     return (*parts, *carried(outfit.carried, outfit.loose_m))
 
 

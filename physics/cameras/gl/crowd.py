@@ -25,19 +25,23 @@ from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.skins import mesh_skins, tube_skins
 from physics.cameras.view import PERSON_MARGIN_M
-from physics.people.appearance import ALL, look_of
+from physics.people.appearance import look_of
 from physics.people.body import COATS, body, far_body
 from physics.people.clips import own_clips
 from physics.people.figure import LEVELS, MESH_LEVELS
+from physics.people.families import skeleton
 from physics.people.poses import bodies_of, loops_of, poses_of
+from physics.people.wardrobe import ALL
 
 LEVEL_PX: Final = (170.0, 80.0, 44.0, 32.0)
 """Drawn heights of a body, in pixels, below which the next coarser level is used."""
 CAST_M: Final = 18.0
 """Maximum distance from the eye of people that cast shadows, metres."""
 
-_INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4")])
-"""person: row of the matrix texture; dress: row of the colour texture."""
+_INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4")])
+"""person: row of the matrix texture; dress: row of the colour texture; tall: of the modelled man
+relative to the family."""
+_TALL: Final = np.array([1.75 / skeleton(outfit.family).height_m for outfit in ALL])
 _ROW: Final = 3 * 24
 _CROWD_MIN: Final = 64
 _KEYS: Final = (LEVELS + 1) * len(ALL)
@@ -92,7 +96,7 @@ class _Worn(NamedTuple):
     """Appearance of N people.
 
     outfit, girth: (N,)
-    colours: (N, coats, 3)
+    colours: (N, coats, 4), with patterns
     bodies: (N, 4), as for poses
     """
 
@@ -234,6 +238,7 @@ class CrowdDrawing:
         self._split = form.searchsorted(ends).tolist()
         table = np.empty(len(people), dtype=_INSTANCE)
         table["person"], table["dress"], table["girth"] = people, dress[people], girth[people]
+        table["tall"] = _TALL[outfit[people]]
         self._instances.write(table)
         self._commands.write(commands)
 
@@ -259,7 +264,7 @@ class CrowdDrawing:
         self._release_room()
         self._room = room
         self._told = _texture(self._context, (4, room), 4, "f4")
-        self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
+        self._dyed = _texture(self._context, (len(COATS), room), 4, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
         self._posed = self._context.framebuffer([self._matrices])
         self._instances = self._context.buffer(reserve=2 * room * _INSTANCE.itemsize)
@@ -300,7 +305,9 @@ def _worn(ids: tuple[str, ...], ages: bytes, seed: int) -> _Worn:
     return _Worn(
         np.array([who.outfit for who in looks], dtype=np.intp),
         np.array([who.girth_m for who in looks], dtype=np.float32),
-        np.array([who.colours for who in looks], dtype=np.uint8).reshape(-1, len(COATS), 3),
+        np.array(
+            [np.column_stack([who.colours, who.patterns]) for who in looks], dtype=np.uint8
+        ).reshape(-1, len(COATS), 4),
         bodies_of(ids, ages),
     )
 
