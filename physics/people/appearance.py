@@ -14,13 +14,12 @@ from cosim.core.state import Age
 from cosim.people.gait import is_woman
 from physics.people.accessories import Beside
 from physics.people.body import COATS
+from physics.people.cloth_maps import BEARDS, layer
 from physics.people.families import Family
 from physics.people.wardrobe import (
     ALL,
     CLOTHES,
-    HANGS,
     PALETTES,
-    PATTERNS,
     Clothes,
     Season,
     with_object,
@@ -55,7 +54,7 @@ class Look:
 
     outfit: row of ALL
     colours: (coats, 3) uint8, in the order of COATS
-    patterns: (coats,) uint8, of the cloth of each surface: a row of PATTERNS, and HANGS
+    patterns: (coats,) uint8, rows of the map of each surface, from `cloth_maps`
     girth_m: offset of the surface by body fat, metres
     """
 
@@ -138,15 +137,17 @@ def _colours(name: str, seed: int, family: Family, clothes: Clothes) -> dict[str
 
 
 def _patterns(name: str, seed: int, clothes: Clothes) -> NDArray[np.uint8]:
-    """Return (coats,) codes: patterns of cloth, sneakers, and beards of some men."""
-    legs = clothes.outfit.legs
-    codes = np.zeros(len(COATS), dtype=np.uint8)
-    codes[COATS.index("top")] = PATTERNS.index(clothes.top) | (HANGS if legs == "coat" else 0)
-    codes[COATS.index("bottom")] = PATTERNS.index(clothes.bottom) | (HANGS if legs == "skirt" else 0)
-    codes[COATS.index("shoes")] = _draw(name, seed, "soles") // 5 % 2
-    if clothes.outfit.family == "man" or (clothes.outfit.family == "elder" and not is_woman(name)):
-        codes[COATS.index("skin")] = max(0, _draw(name, seed, "beard") // 5 % 6 - 2)
-    return codes
+    """Return (coats,) maps: cloths, and skin with the beards of some men."""
+    outfit = clothes.outfit
+    beard = 0
+    if outfit.build.woman < 0.5 and outfit.family in ("man", "elder"):
+        beard = max(0, _draw(name, seed, "beard") // 5 % (BEARDS + 2) - 2)
+    maps = {
+        "top": layer("top", clothes.top, outfit.legs == "coat"),
+        "bottom": layer("bottom", clothes.bottom, outfit.legs == "skirt"),
+        "skin": layer("skin", beard=beard),
+    }
+    return np.array([maps[c] if c in maps else layer(c) for c in COATS], dtype=np.uint8)
 
 
 def _hairs(skin: _Colour) -> tuple[str, ...]:

@@ -15,13 +15,12 @@ from physics.people.figure import Build
 Season = Literal["summer", "mild", "winter"]
 SEASONS: Final[tuple[Season, ...]] = ("summer", "mild", "winter")
 
-PATTERNS: Final = (
+TOP_PATTERNS: Final = (
     *("plain", "stripes", "bands", "check", "print", "open", "zip", "buttons", "knit"),
-    *("pinstripes", "denim", "side stripe", "crease", "dots"),
+    *("pinstripes", "dots"),
 )
-"""Patterns of cloth, drawn by shaders."""
-HANGS: Final = 64
-"""Bit of a pattern's code for skirts and the tails of coats, which fall in vertical folds."""
+BOTTOM_PATTERNS: Final = ("plain", "denim", "side stripe", "crease", "check", "dots")
+"""Patterns of cloth, drawn in `cloth_maps`."""
 
 _MAN: Final = Build()
 _STOUT: Final = Build(belly_m=0.045, limb=1.08)

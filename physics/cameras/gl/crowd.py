@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People
+from physics.cameras.gl.cloth import MAPS_UNIT, map_texture
 from physics.cameras.gl.instances import runs_of
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shots import Shots
@@ -116,6 +117,7 @@ class CrowdDrawing:
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
         self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
         self._everywhere = context.vertex_array(self._pose, [])
+        self._maps = map_texture(context)
         self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level))
         self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level))
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
@@ -198,6 +200,7 @@ class CrowdDrawing:
         if stage == "still" or near == end:
             return
         held = self._instances, self._commands
+        self._maps.use(MAPS_UNIT)
         if stage == "moving":
             self._far.draw(stage, shadows, *held, end - cast, cast)
         else:
@@ -208,7 +211,7 @@ class CrowdDrawing:
         self._near.release()
         self._far.release()
         self._release_room()
-        for thing in (self._baked, self._everywhere, self._pose):
+        for thing in (self._baked, self._maps, self._everywhere, self._pose):
             thing.release()
 
     def _set_draws(
