@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final, Literal
 
 from physics.people.arms import on_arm
+from physics.people.beside import bar
 from physics.people.figure import SMALL, upright_loft
 from physics.people.lofted_mesh import Joints, Piece, Ring, ball
 
 Hair = Literal["short", "crop", "curls", "bob", "long", "bun", "tail", "scarf"]
 Cap = Literal["", "cap", "beanie"]
 Carried = Literal["", "bag", "backpack", "phone"]
-Beside = Literal["", "dog", "pram", "bicycle", "wheelchair", "umbrella"]
-"""Object that a person leads, pushes, sits in or holds up."""
 
 _STYLES: Final[dict[Hair, tuple[float, float]]] = {
     "short": (1.585, 0.007),
@@ -26,6 +26,7 @@ _STYLES: Final[dict[Hair, tuple[float, float]]] = {
 }
 """Height of the lower end at the nape, and thickness, metres."""
 _HEAD: Final[Joints] = {"head": 1.0}
+_TRUNK: Final[Joints] = {"spine3": 0.65, "spine2": 0.35}
 _HAIR: Final = (18, 11, 6, 4)
 
 
@@ -164,31 +165,15 @@ def _bag() -> Piece:
 
 
 def _strap(loose: float) -> Piece:
-    """Return the strap of the shoulder bag as one thin ring.
-
-    It runs from the right shoulder over chest and back to the bag.
-    """
-    rings = []
-    for share in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
-        z = 0.95 + 0.53 * share
-        y = 0.195 - 0.285 * share
-        front = (0.115, 0.110, 0.114, 0.134, 0.101, 0.045)[round(5 * share)]
-        joints: Joints = (
-            {"pelvis": 1.0 - share, "spine3": share}
-            if 0.0 < share < 1.0
-            else ({"pelvis": 1.0} if share == 0.0 else {"spine3": 1.0})
-        )
-        rings.append(
-            Ring(
-                (-0.012, y, z),
-                (front + loose + 0.006, 0.0, 0.0),
-                (0.0, 0.016, 0.016),
-                joints,
-                0.78,
-                3.5,
-            )
-        )
-    return Piece("bag", tuple(rings), (16, 10, 0, 0), (10, 6, 0, 0))
+    """Return the strap of the shoulder bag, from the right shoulder over chest and back."""
+    ahead = 0.128 + loose
+    way = (
+        *((0.02, 0.20, 0.95), (ahead - 0.01, 0.10, 1.10), (ahead, 0.0, 1.26)),
+        *((ahead - 0.03, -0.07, 1.39), (-0.02, -0.105, 1.497 + 0.4 * loose)),
+        *((-0.118 - loose, -0.06, 1.39), (-0.128 - loose, 0.03, 1.22)),
+        *((-0.118 - loose, 0.13, 1.06), (-0.02, 0.20, 0.95)),
+    )
+    return replace(bar("bag", way, 0.013, _TRUNK), sides=(6, 4, 0, 0))
 
 
 def _backpack() -> Piece:
@@ -210,26 +195,13 @@ def _backpack() -> Piece:
 
 
 def _shoulder_strap(left: float, loose: float) -> Piece:
-    keys = (
-        (1.10, 0.10, 0.104),
-        (1.25, 0.085, 0.121),
-        (1.37, 0.085, 0.093),
-        (1.450, 0.085, 0.050),
-        (1.487, 0.085, 0.030),
-        (1.497, 0.085, 0.01),
+    ahead = 0.118 + loose
+    way = (
+        *((-0.12, 0.085, 1.42), (-0.03, 0.088, 1.490 + 0.4 * loose), (ahead - 0.045, 0.090, 1.42)),
+        *((ahead, 0.095, 1.28), (ahead - 0.03, 0.125, 1.14), (-0.09, 0.14, 1.06)),
     )
-    rings = [
-        Ring(
-            (-0.02, left * y, z),
-            (front + loose + 0.004, 0.0, 0.0),
-            (0.0, 0.021, 0.0),
-            {"spine3": 0.8, "spine2": 0.2},
-            0.9,
-            3.5,
-        )
-        for z, y, front in keys
-    ]
-    return Piece("bag", tuple(rings), (12, 8, 0, 0), (7, 5, 0, 0))
+    way = tuple((x, left * y, z) for x, y, z in way)
+    return replace(bar("bag", way, 0.017, _TRUNK), sides=(6, 4, 0, 0))
 
 
 def _phone() -> Piece:

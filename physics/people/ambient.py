@@ -61,9 +61,13 @@ def unshaded(vertices: Floats, normals: Floats) -> Floats:
     way = middles[None] - vertices[:, None]
     far = np.linalg.norm(way, axis=2)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    facing = np.einsum("vbi,vi->vb", way, normals / np.maximum(length, 1e-9)) / np.maximum(far, 1e-6)
+    facing = np.einsum("vbi,vi->vb", way, normals / np.maximum(length, 1e-9)) / np.maximum(
+        far, 1e-6
+    )
     facing = np.where(length > 1e-6, np.maximum(facing, 0.0), 0.35)
     own = far < radii[None] * 1.45
-    hidden = np.where(own, 0.0, facing * np.minimum((radii[None] / np.maximum(far, 1e-6)) ** 2, 1.0))
+    hidden = np.where(
+        own, 0.0, facing * np.minimum((radii[None] / np.maximum(far, 1e-6)) ** 2, 1.0)
+    )
     ground = 0.45 * np.clip(1.0 - vertices[:, 2] / _GROUND_M, 0.0, 1.0)
     return np.clip(np.prod(1.0 - 0.6 * hidden, axis=1) * (1.0 - ground), _LEAST, 1.0)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from cosim.core.state import Age
 from cosim.people.gait import is_woman
-from physics.people.accessories import Beside
 from physics.people.body import COATS
 from physics.people.cloth_maps import BEARDS, layer
 from physics.people.families import Family
+from physics.people.figure import Beside
 from physics.people.wardrobe import (
     ALL,
     CLOTHES,

@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from physics.ground.mesh import smooth_normals
-from physics.people.accessories import Beside, Cap, Carried, Hair, carried, hair, headgear
+from physics.people.accessories import Cap, Carried, Hair, carried, hair, headgear
 from physics.people.ambient import unshaded
 from physics.people.arms import arms
+from physics.people.beside import beside, reach
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton
 from physics.people.figure import (
     LEVELS,
     MESH_LEVELS,
     RIBBONS,
+    Beside,
     Build,
     Legs,
     Sleeve,
@@ -181,11 +183,12 @@ def pieces(outfit: Outfit) -> tuple[Piece, ...]:
         parts = parts[:1]
     parts += neck_and_head(build)
     parts += legs(build, outfit.legs, outfit.bare, outfit.loose_m)
-    parts += arms(build, outfit.sleeve, outfit.loose_m)
+    holds = {side: reach(outfit.beside, side) for side in ("left", "right")}
+    parts += arms(build, outfit.sleeve, outfit.loose_m, holds)
     parts += [about_head(piece, build.head) for piece in hair(outfit.hair)]
     if outfit.cap:
         parts += [about_head(piece, build.head) for piece in headgear(outfit.cap)]
-    return (*parts, *carried(outfit.carried, outfit.loose_m))
+    return (*parts, *carried(outfit.carried, outfit.loose_m), *beside(outfit.beside))
 
 
 def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -218,4 +221,4 @@ def _fitted(vertices: Floats, weights: Floats, family: Skeleton) -> Floats:
     scale = family.height_m / man.height_m
     _, ours = bind_of(Skeleton(family.rest_m / scale, man.height_m), model_pose())
     _, his = bind_of(man, model_pose())
-    return (vertices + weights @ (ours - his)) * scale
+    return (vertices + weights[:, : len(ours)] @ (ours - his)) * scale

@@ -201,13 +201,15 @@ _PATTERNS: Final[dict[str, Callable[[_Cloth], None]]] = {
 def _fold(cloth: _Cloth, coat: str, pattern: str, hangs: bool) -> None:
     """Add folds where cloth bends, seams at the waist and mottling."""
     y, z = cloth.y, cloth.z
-    x = np.where(cloth.front, 1.0, -1.0) * np.sqrt(np.maximum(0.015 - 0.3 * y * y, 0.0))
+    x = np.sqrt(np.maximum(0.015 - 0.3 * y * y, 0.0))  # both halves meet at the sides
     if coat == "bottom":
         phase = 74.0 * z + 2.4 * np.sin(25.0 * x + 16.0 * y) + 1.3 * np.sin(17.0 * z + 33.0 * y)
         soft = 0.12 + 0.42 * _bump(z, 0.49, 0.09) + 0.30 * _bump(z, 0.85, 0.06)
         soft += 0.55 * np.clip((0.30 - z) / 0.2, 0.0, 1.0)
     else:
-        phase = 58.0 * z + 3.0 * np.sin(15.0 * y + 12.0 * x + 4.0 * z) + 1.5 * np.sin(15 * z - 27 * y)
+        phase = (
+            58.0 * z + 3.0 * np.sin(15.0 * y + 12.0 * x + 4.0 * z) + 1.5 * np.sin(15 * z - 27 * y)
+        )
         soft = np.where(
             cloth.arm,
             0.16 + 0.42 * _bump(z, 1.17, 0.10) + 0.25 * _bump(z, 0.93, 0.05),
@@ -216,7 +218,7 @@ def _fold(cloth: _Cloth, coat: str, pattern: str, hangs: bool) -> None:
     soft = soft * (0.65 if pattern in ("crease", "zip") else 1.0)
     along, around = soft * np.cos(phase), 0.5 * soft * np.cos(0.6 * phase + 20.0 * y)
     if hangs:
-        turn = np.arcsin(np.clip(y / 0.24, -1.0, 1.0)) + np.where(cloth.front, 0.0, 2.0)
+        turn = np.arcsin(np.clip(y / 0.24, -1.0, 1.0))
         falls = np.clip((0.98 - z) / 0.3, 0.0, 1.0) * ~cloth.arm
         phase = np.where(falls > 0.0, 9.0 * turn + 2.0 * np.sin(2.0 * turn + 5.0 * z), phase)
         along, soft = along * (1.0 - falls), np.where(falls > 0.0, 0.5 * falls, soft)
@@ -251,9 +253,10 @@ def _noise(cloth: _Cloth, size_m: float) -> Floats:
     import cv2
 
     rng = np.random.default_rng(round(size_m * 1e4))
-    shape = max(2, round(TALL_M / size_m)), max(2, round(4.0 * SIDE_M / size_m))
+    shape = max(2, round(TALL_M / size_m)), max(2, round(2.0 * SIDE_M / size_m))
     coarse = rng.uniform(-1.0, 1.0, shape).astype(np.float32)
-    return np.asarray(cv2.resize(coarse, (COLUMNS, ROWS), interpolation=cv2.INTER_LINEAR), float)
+    fine = cv2.resize(coarse, (COLUMNS // 2, ROWS), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(np.tile(fine, (1, 2)), dtype=float)
 
 
 def _numbered() -> dict[tuple[str, str, bool], int]:

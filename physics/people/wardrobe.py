@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from physics.people.accessories import Beside
 from physics.people.body import Outfit
-from physics.people.figure import Build
+from physics.people.figure import Beside, Build
 
 Season = Literal["summer", "mild", "winter"]
 SEASONS: Final[tuple[Season, ...]] = ("summer", "mild", "winter")

@@ -202,10 +202,11 @@ class BatchDrawing:
         self._bind(i, picture)
         gl.depth_func = "<"
         self._draw_pass(i, stage, "colour")
-        # Paint changes colours only; labels and depth stay those of the ground.
+        # Paint and the shade at feet change colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
         target.use_colours()
         stage.scene.draw_paint()
+        self._crowd.draw_contact(i)
         target.use()
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="

@@ -1,7 +1,7 @@
 """People of the gl camera: skinned bodies of all pictures of a batch, posed on the graphics card.
 
 Each batch uploads a few numbers per person: four baked frames with weights, place, heading, size.
-A first small pass blends the frames into 24 joint matrices per person, stored in a texture.
+A first small pass blends the frames into 25 joint matrices per person, stored in a texture.
 They are in metres from the picture's anchor; the vertex shaders of all passes skin with them.
 Bodies of all outfits and levels are in one buffer.
 A pass of a picture is one indirect draw for near people (four joints per vertex) and one for far
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.core.state import People
 from physics.cameras.gl.cloth import MAPS_UNIT, map_texture
+from physics.cameras.gl.contact import ContactShadows
 from physics.cameras.gl.instances import runs_of
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shots import Shots
@@ -29,8 +30,10 @@ from physics.cameras.view import PERSON_MARGIN_M
 from physics.people.appearance import look_of
 from physics.people.body import COATS, body, far_body
 from physics.people.clips import own_clips
-from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.families import skeleton
+from physics.people.figure import LEVELS, MESH_LEVELS
+from physics.people.gestures import GESTURES, SEATED_BACK_M
+from physics.people.lofted_mesh import ROWS
 from physics.people.poses import bodies_of, loops_of, poses_of
 from physics.people.wardrobe import ALL
 
@@ -38,12 +41,17 @@ LEVEL_PX: Final = (170.0, 80.0, 44.0, 32.0)
 """Drawn heights of a body, in pixels, below which the next coarser level is used."""
 CAST_M: Final = 18.0
 """Maximum distance from the eye of people that cast shadows, metres."""
+_CONTACT_M: Final = 25.0
+"""Maximum distance from the eye of people whose feet darken the ground, metres."""
 
 _INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4")])
 """person: row of the matrix texture; dress: row of the colour texture; tall: of the modelled man
 relative to the family."""
+_SIT: Final = list(GESTURES).index("sit")
+_SEAT_AHEAD_M: Final = SEATED_BACK_M - 0.1
+"""Shift of people in wheelchairs, so that their hips are nearly at their place, metres."""
 _TALL: Final = np.array([1.75 / skeleton(outfit.family).height_m for outfit in ALL])
-_ROW: Final = 3 * 24
+_ROW: Final = 3 * len(ROWS)
 _CROWD_MIN: Final = 64
 _KEYS: Final = (LEVELS + 1) * len(ALL)
 """Number of forms of a picture: outfits by level, plus one level for shadows."""
@@ -99,12 +107,14 @@ class _Worn(NamedTuple):
     outfit, girth: (N,)
     colours: (N, coats, 4), with patterns
     bodies: (N, 4), as for poses
+    sits: (N,) in a wheelchair, also while moving
     """
 
     outfit: NDArray[np.intp]
     girth: NDArray[np.float32]
     colours: NDArray[np.uint8]
     bodies: Floats
+    sits: NDArray[np.bool_]
 
 
 class CrowdDrawing:
@@ -113,11 +123,15 @@ class CrowdDrawing:
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self._clips = own_clips()
-        matrices = self._clips.matrices
+        still = np.broadcast_to(
+            np.eye(3, 4, dtype=np.float32), (len(self._clips.matrices), 1, 3, 4)
+        )
+        matrices = np.concatenate([self._clips.matrices, still], axis=1)
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
         self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
         self._everywhere = context.vertex_array(self._pose, [])
         self._maps = map_texture(context)
+        self._contact = ContactShadows(context)
         self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level))
         self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level))
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
@@ -159,6 +173,12 @@ class CrowdDrawing:
             for name in ("heading", "strides", "pace")
         )
         loops = np.concatenate([loops_of(one.people.doing) for one in watched])[rows]
+        sits = worn.sits[rows]
+        if sits.any():
+            loops = np.where(sits, _SIT, loops)
+            pace = np.where(sits, 0.0, pace)
+            ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+            xy = xy + (sits * _SEAT_AHEAD_M)[:, None] * ahead
         time_s = np.array([one.time_s for one in watched])[whose]
         posed = poses_of(bodies, pace, strides, loops, time_s, self._clips)
         told = np.zeros((len(rows), 4, 4), dtype=np.float32)
@@ -167,6 +187,9 @@ class CrowdDrawing:
         told[:, 3, 0], told[:, 3, 1] = np.cos(heading), np.sin(heading)
         self._told.write(told, viewport=(0, 0, 4, len(rows)))
         self._set_draws(whose, outfit, levels(shots, whose, xy, z_m), seen, casts, girth, rows)
+        near = (seen & (shots.far_m(whose, xy) < _CONTACT_M)).nonzero()[0]
+        on_picture = np.bincount(whose[near], minlength=len(watched))
+        self._contact.set(on_picture, near, _TALL[outfit[near]])
         self._posed.use()
         self._posed.viewport = (0, 0, _ROW, len(rows))
         self._context.enable_only(moderngl.NOTHING)
@@ -207,7 +230,13 @@ class CrowdDrawing:
             self._near.draw(stage, shadows, *held, far - near, near)
             self._far.draw(stage, shadows, *held, cast - far, far)
 
+    def draw_contact(self, picture: int = 0) -> None:
+        """Darken the ground under the feet of the people of a picture, without labels."""
+        if self._split[picture][3]:
+            self._contact.draw(picture)
+
     def release(self) -> None:
+        self._contact.release()
         self._near.release()
         self._far.release()
         self._release_room()
@@ -312,6 +341,7 @@ def _worn(ids: tuple[str, ...], ages: bytes, seed: int) -> _Worn:
             [np.column_stack([who.colours, who.patterns]) for who in looks], dtype=np.uint8
         ).reshape(-1, len(COATS), 4),
         bodies_of(ids, ages),
+        np.array([ALL[who.outfit].beside == "wheelchair" for who in looks], dtype=bool),
     )
 
 

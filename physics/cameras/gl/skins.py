@@ -61,7 +61,9 @@ _TUBE_LAYOUT: Final = (
     "3f4 3f4 3f4 4f4 4u1 4f1 4u1",
     *("in_middle", "in_ahead", "in_side", "in_ring", "in_joints", "in_weights", "in_coat"),
 )
-_SKIN: Final = f"const int TRIM = {COATS.index('trim')};\n" + """
+_SKIN: Final = (
+    f"const int TRIM = {COATS.index('trim')};\n"
+    + """
 layout(binding = 0) uniform sampler2D posed;
 layout(binding = 1) uniform sampler2D dyed;
 in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
@@ -84,6 +86,7 @@ void pose(int bones) {
 vec3 moved(vec3 v) { return vec3(dot(x.xyz, v), dot(y.xyz, v), dot(z.xyz, v)); }
 vec3 placed(vec3 v) { return vec3(x.w, y.w, z.w) + moved(v); }
 """
+)
 
 _MESH: Final = """
 in vec3 in_at; in vec4 in_normal;
@@ -132,6 +135,7 @@ void main() {
     gl_Position = project(at);
 }
 """
+
 
 class Skins:
     """Bodies in one vertex and one index buffer.
