@@ -200,8 +200,8 @@ def _shoulder_strap(left: float, loose: float) -> Piece:
         *((-0.12, 0.085, 1.42), (-0.03, 0.088, 1.490 + 0.4 * loose), (ahead - 0.045, 0.090, 1.42)),
         *((ahead, 0.095, 1.28), (ahead - 0.03, 0.125, 1.14), (-0.09, 0.14, 1.06)),
     )
-    way = tuple((x, left * y, z) for x, y, z in way)
-    return replace(bar("bag", way, 0.017, _TRUNK), sides=(6, 4, 0, 0))
+    points = [(x, left * y, z) for x, y, z in way]
+    return replace(bar("bag", points, 0.017, _TRUNK), sides=(6, 4, 0, 0))
 
 
 def _phone() -> Piece:

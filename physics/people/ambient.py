@@ -70,4 +70,5 @@ def unshaded(vertices: Floats, normals: Floats) -> Floats:
         own, 0.0, facing * np.minimum((radii[None] / np.maximum(far, 1e-6)) ** 2, 1.0)
     )
     ground = 0.45 * np.clip(1.0 - vertices[:, 2] / _GROUND_M, 0.0, 1.0)
-    return np.clip(np.prod(1.0 - 0.6 * hidden, axis=1) * (1.0 - ground), _LEAST, 1.0)
+    light = np.prod(1.0 - 0.6 * hidden, axis=1) * (1.0 - ground)
+    return np.asarray(np.clip(light, _LEAST, 1.0))

@@ -31,8 +31,8 @@ _GREYS: Final = ("8f8f8f", "b8b6b2", "d8d6d2", "6e6d6c")
 _CAPS: Final = ("2c3f66", "b3403a", "3a3d44", "d8d2c4", "4f6b4a", "7a5a86")
 _METALS: Final = ("9a9da3", "33363c", "b0413a", "2f5f8f", "3f7d5a")
 _FURS: Final = ("c9a26b", "5a4030", "2b2724", "d8d0c4", "8a6a48")
-_SHOES: Final = ("2a2725", "5b4030", "e6e4df", "43464c", "8a6b4a", "a33a33", "d9d5cc")
-_BAGS: Final = ("3a2a1f", "1f2226", "8c3b2e", "2f5d62", "b08d57", "51437a", "d0b49a", "3d5a36")
+_SHOES: Final = ("2a2725", "5b4030", "e6e4df", "43464c", "8a6b4a", "8c4a44", "d9d5cc")
+_BAGS: Final = ("4a3a2f", "3a3d42", "84483e", "3f5f63", "a88f66", "5a5074", "c8b49f", "4a5a45")
 
 _Colour = tuple[int, int, int]
 

@@ -1,4 +1,4 @@
-"""Lofts of what people push, lead, sit in or hold up: wheelchairs, prams, dogs, bicycles, umbrellas.
+"""Lofts of wheelchairs, prams, dogs on leads, pushed bicycles and umbrellas.
 
 They are modelled beside the man of 1.75 m. All but umbrellas follow the joint `GROUND`, which moves
 with the person's place and heading alone.
@@ -210,16 +210,10 @@ def _dog() -> list[Piece]:
             )
         )
     pieces.append(bar("fur", ((x - 0.33, y, z + 0.04), (x - 0.44, y, z + 0.16)), 0.022))
-    for side in (0.045, -0.045):
-        pieces.append(
-            ball(
-                "fur",
-                (x + 0.37, y + side, z + 0.27),
-                (0.02, 0.018, 0.045),
-                _ON_GROUND,
-                (8, 6, 4, 0),
-            )
-        )
+    pieces += [
+        ball("fur", (x + 0.37, y + side, z + 0.27), (0.02, 0.018, 0.045), _ON_GROUND, (8, 6, 4, 0))
+        for side in (0.045, -0.045)
+    ]
     hand = HANDLES["dog"][1]
     pieces.append(
         bar(

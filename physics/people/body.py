@@ -150,12 +150,13 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
         [_sided(t.corners, t.weights) if t.still else t.weights for _, t in tubes]
     )
     even = np.concatenate([t.weights for _, t in tubes])
+    middle = np.concatenate([t.middle for _, t in tubes])
     family = skeleton(outfit.family)
     scale = family.height_m / 1.75
     joints, few = strongest(weights)
     coat = np.repeat([COATS.index(coat) for coat, _ in tubes], [len(t.middle) for _, t in tubes])
     return FarBody(
-        _fitted(np.concatenate([t.middle for _, t in tubes]), even, family).astype(np.float32),
+        _fitted(middle, even, family).astype(np.float32),
         (scale * np.concatenate([t.ahead for _, t in tubes])).astype(np.float32),
         (scale * np.concatenate([t.side for _, t in tubes])).astype(np.float32),
         np.concatenate([t.ring for _, t in tubes]).astype(np.float32),
@@ -170,7 +171,9 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
             np.repeat(kind, [len(t.middle) for _, t in tubes])
             for kind in zip(*((t.still, t.ribbon) for _, t in tubes), strict=True)
         ),
-        np.concatenate([unshaded(t.middle, 0.0 * t.middle) for _, t in tubes]).astype(np.float32),
+        unshaded=np.concatenate([unshaded(t.middle, 0.0 * t.middle) for _, t in tubes]).astype(
+            np.float32
+        ),
     )
 
 

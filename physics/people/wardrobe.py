@@ -205,14 +205,14 @@ ALL: Final[tuple[Outfit, ...]] = (
 """All bodies; renderers number them by their row."""
 
 PALETTES: Final[dict[str, tuple[str, ...]]] = {
-    "shirts": ("b3403a", "2f5f9e", "3b8a5e", "5a4780", "3a3d44", "8aa0b4", "a3653c", "6f8a5a"),
-    "light": ("eceae4", "dfe7ee", "f0e2d0", "d5dfcf", "e9d3d3", "c9d6e6", "f4f1e6", "d9cfbf"),
-    "bright": ("d23b32", "2c6fc0", "f0b93a", "2f9a68", "e0708f", "eb7d3c", "3ba3b5", "f2efe8"),
-    "muted": ("8b8f96", "7c6a5a", "6f7d6c", "8a5a58", "59677c", "b0a48e", "4a4f5c", "9a8fa0"),
-    "coats": ("3a3f4a", "7c664f", "9a9080", "31486a", "6e3d38", "4f5d4a", "c3a985", "5a5b60"),
-    "suits": ("3c4250", "4a4a4e", "5c5548", "34425c", "6c6f78"),
-    "jeans": ("3f5b82", "5a7aa3", "2f4261", "7f9abb", "4a4f58"),
-    "dark": ("2f323a", "3a3630", "3d4658", "45403c", "51545a"),
-    "chinos": ("a8967a", "8a7f6a", "c2b59a", "6c6f60", "75604c", "9a9c9e"),
+    "shirts": ("964844", "3d5d88", "4e8466", "574a70", "3b3d42", "909fad", "92684c", "758766"),
+    "light": ("ebeae6", "e1e7eb", "ece3d6", "d7ded3", "e3d4d4", "cdd5e0", "f3f1e9", "d6cfc4"),
+    "bright": ("ac453f", "3f6ca3", "dfba63", "499270", "c4788d", "ce8357", "569ca9", "f1efea"),
+    "muted": ("8c8f94", "776b60", "727c70", "7e5d5c", "5d6775", "aca495", "4c4f58", "98909c"),
+    "coats": ("3c3f46", "766757", "979085", "38475e", "62403d", "525c4f", "bcaa91", "5a5b5e"),
+    "suits": ("3e424b", "4a4a4d", "5a554c", "384253", "6d6f75"),
+    "jeans": ("475a75", "637995", "354157", "8799af", "4b4f55"),
+    "dark": ("303237", "393632", "404652", "44403e", "525458"),
+    "chinos": ("a39784", "877f71", "beb5a3", "6c6e64", "6f6153", "9b9c9d"),
 }
 """Colours of cloth as sRGB, by the name that `Clothes` use."""

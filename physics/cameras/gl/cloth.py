@@ -38,7 +38,9 @@ void main() {{
     float column = clamp(own.y * {0.25 / SIDE_M} + 0.25, 0.004, 0.496) + (own.x < -0.012 ? 0.5 : 0.0);
     vec4 map = textureLod(maps, vec3(column, own.z * {1.0 / TALL_M}, float(worn.y)),
         log2(max(max(wide.x, wide.y) * {ROWS / TALL_M}, 1.0)));
-    vec3 colour = decoded(mix(albedo, trim, map.x)) * (map.y * {255.0 / 128.0});
+    float bright = map.y * {255.0 / 128.0};
+    // what dark cloth reflects at its folds is not of its colour
+    vec3 colour = max(decoded(mix(albedo, trim, map.x)) * bright + 0.05 * (bright - 0.85), 0.006);
     vec2 lean = map.zw * {255.0 / 127.0} - {128.0 / 127.0};
     n = normalize(n + vec3(n.y * lean.y, -n.x * lean.y, lean.x));
     // light from the ground nearby; light that enters skin leaves it nearby, mostly red
