@@ -5,6 +5,7 @@ An `Outfit` is a body, which renderers load once. `Clothes` dress it in cloths a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -13,6 +14,19 @@ from physics.people.figure import Beside, Build
 
 Season = Literal["summer", "mild", "winter"]
 SEASONS: Final[tuple[Season, ...]] = ("summer", "mild", "winter")
+
+_HOTTEST: Final = 200
+"""Hottest day of the year in the north."""
+
+
+def season_of(day_of_year: int, latitude_deg: float) -> Season:
+    """Return the season of the clothes that people wear on a day at a latitude."""
+    if abs(latitude_deg) < 20.0:
+        return "summer"
+    warm = math.cos(2.0 * math.pi * (day_of_year - _HOTTEST) / 365.25)
+    warm = math.copysign(warm, warm * latitude_deg)
+    return "summer" if warm > 0.6 else "winter" if warm < -0.5 else "mild"
+
 
 TOP_PATTERNS: Final = (
     *("plain", "stripes", "bands", "check", "print", "open", "zip", "buttons", "knit"),

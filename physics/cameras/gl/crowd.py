@@ -35,7 +35,7 @@ from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.gestures import GESTURES, SEATED_BACK_M
 from physics.people.lofted_mesh import ROWS
 from physics.people.poses import bodies_of, loops_of, poses_of
-from physics.people.wardrobe import ALL
+from physics.people.wardrobe import ALL, Season
 
 LEVEL_PX: Final = (170.0, 80.0, 44.0, 32.0)
 """Drawn heights of a body, in pixels, below which the next coarser level is used."""
@@ -51,6 +51,7 @@ _SIT: Final = list(GESTURES).index("sit")
 _SEAT_AHEAD_M: Final = SEATED_BACK_M - 0.1
 """Shift of people in wheelchairs, so that their hips are nearly at their place, metres."""
 _TALL: Final = np.array([1.75 / skeleton(outfit.family).height_m for outfit in ALL])
+_Dress = tuple[tuple[str, ...], bytes, int, Season, bool]
 _ROW: Final = 3 * len(ROWS)
 _CROWD_MIN: Final = 64
 _KEYS: Final = (LEVELS + 1) * len(ALL)
@@ -92,6 +93,8 @@ class PeopleSeen(NamedTuple):
     heights: function of (N, 2) points that returns the ground height
     shadows: people cast shadows
     seed: of their clothes and colours
+    season: of their clothes
+    rain: most people hold umbrellas
     """
 
     people: People
@@ -99,6 +102,14 @@ class PeopleSeen(NamedTuple):
     heights: Callable[[Floats], Floats]
     shadows: bool
     seed: int = 0
+    season: Season = "mild"
+    rain: bool = False
+
+    @property
+    def dressed(self) -> _Dress:
+        """Return all that their appearance depends on."""
+        people = self.people
+        return people.ids, people.age.tobytes(), self.seed, self.season, self.rain
 
 
 class _Worn(NamedTuple):
@@ -139,7 +150,7 @@ class CrowdDrawing:
         self._known = np.zeros(len(self._starts), dtype=bool)
         self._split: list[list[int]] = []
         self._room = 0
-        self._dressed: list[tuple[tuple[str, ...], bytes, int]] = []
+        self._dressed: list[_Dress] = []
         self._grow(_CROWD_MIN)
 
     def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
@@ -164,9 +175,7 @@ class CrowdDrawing:
         seen = seen[rows]
         casts = casts[rows]
         z_m = _heights(watched, whose, xy)
-        worn = self._dress(
-            [(one.people.ids, one.people.age.tobytes(), one.seed) for one in watched]
-        )
+        worn = self._dress([one.dressed for one in watched])
         outfit, girth, bodies = worn.outfit[rows], worn.girth[rows], worn.bodies[rows]
         heading, strides, pace = (
             np.concatenate([getattr(one.people, name) for one in watched])[rows]
@@ -199,10 +208,10 @@ class CrowdDrawing:
         self._matrices.use(0)
         self._dyed.use(1)
 
-    def _dress(self, who: list[tuple[tuple[str, ...], bytes, int]]) -> _Worn:
+    def _dress(self, who: list[_Dress]) -> _Worn:
         """Return the appearance of all people, and upload their colours if they changed.
 
-        who: names, ages and seeds
+        who: as `PeopleSeen.dressed`
         """
         if who != self._dressed:
             each = [_worn(*one) for one in who]
@@ -332,8 +341,8 @@ def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats)
 
 
 @lru_cache(maxsize=256)
-def _worn(ids: tuple[str, ...], ages: bytes, seed: int) -> _Worn:
-    looks = [look_of(name, age, seed) for name, age in zip(ids, ages, strict=True)]
+def _worn(ids: tuple[str, ...], ages: bytes, seed: int, season: Season, rain: bool) -> _Worn:
+    looks = [look_of(name, age, seed, season, rain) for name, age in zip(ids, ages, strict=True)]
     return _Worn(
         np.array([who.outfit for who in looks], dtype=np.intp),
         np.array([who.girth_m for who in looks], dtype=np.float32),
