@@ -31,8 +31,8 @@ TALL_M: Final = 1.92
 COLUMNS: Final = 2 * 96
 ROWS: Final = 224
 BEARDS: Final = 4
-_CRUMPLE_M: Final = 0.045
-_CRUMPLED: Final = 0.36
+_CRUMPLE_M: Final = 0.035
+_CRUMPLED: Final = 0.28
 """Size (standard deviation of Gaussian blobs, metres) and strength of light and shade on cloth.
 
 Without such folds, networks of real streets mistake people for walls (`cosim bench realism`).

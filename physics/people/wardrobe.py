@@ -69,6 +69,7 @@ BODIES: Final[dict[str, Outfit]] = {
     "c skirt": Outfit("child", _CHILD, "skirt", "short", "tail", bare=True),
     "c shorts": Outfit("child", _CHILD, "shorts", "short", "short", cap="cap", bare=True),
     "c jacket": Outfit("child", _CHILD, "trousers", "long", "curls", loose_m=0.014),
+    "c padded": Outfit("child", _CHILD, "trousers", "long", "short", cap="beanie", loose_m=0.022),
     "e jacket": Outfit("elder", _OLD, "trousers", "long", "crop", cap="cap", loose_m=0.012),
     "e coat": Outfit("elder", _OLD, "coat", "long", "crop", loose_m=0.012),
     "e shirt": Outfit("elder", _OLD, "trousers", "short", "short"),
@@ -154,6 +155,7 @@ c tee           stripes    plain       bright  chinos   summer mild
 c skirt         dots       plain       bright  bright   summer mild
 c shorts        print      plain       bright  chinos   summer
 c jacket        zip        denim       bright  jeans    mild winter
+c padded        bands      plain       bright  dark     winter
 c jacket        bands      side stripe bright  dark     mild winter
 e jacket        zip        plain       muted   chinos   mild winter
 e jacket        check      crease      muted   dark     summer mild
