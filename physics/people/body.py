@@ -154,7 +154,8 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
     family = skeleton(outfit.family)
     scale = family.height_m / 1.75
     joints, few = strongest(weights)
-    coat = np.repeat([COATS.index(coat) for coat, _ in tubes], [len(t.middle) for _, t in tubes])
+    counts = [len(t.middle) for _, t in tubes]
+    coat = np.repeat([COATS.index(coat) for coat, _ in tubes], counts)
     return FarBody(
         _fitted(middle, even, family).astype(np.float32),
         (scale * np.concatenate([t.ahead for _, t in tubes])).astype(np.float32),
@@ -167,13 +168,9 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
         few,
         coat.astype(np.uint8),
         np.concatenate([t.fat for _, t in tubes]).astype(np.float32),
-        *(
-            np.repeat(kind, [len(t.middle) for _, t in tubes])
-            for kind in zip(*((t.still, t.ribbon) for _, t in tubes), strict=True)
-        ),
-        unshaded=np.concatenate([unshaded(t.middle, 0.0 * t.middle) for _, t in tubes]).astype(
-            np.float32
-        ),
+        np.repeat([t.still for _, t in tubes], counts),
+        np.repeat([t.ribbon for _, t in tubes], counts),
+        unshaded(middle, np.zeros_like(middle)).astype(np.float32),
     )
 
 
