@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final, Literal
 
 from physics.people.arms import on_arm
+from physics.people.beside import bar
 from physics.people.figure import SMALL, upright_loft
 from physics.people.lofted_mesh import Joints, Piece, Ring, ball
 
-Hair = Literal["short", "crop", "bob", "long", "bun", "tail"]
+Hair = Literal["short", "crop", "curls", "bob", "long", "bun", "tail", "scarf"]
+Cap = Literal["", "cap", "beanie"]
 Carried = Literal["", "bag", "backpack", "phone"]
 
+_STYLES: Final[dict[Hair, tuple[float, float]]] = {
+    "short": (1.585, 0.007),
+    "crop": (1.600, 0.002),
+    "curls": (1.570, 0.020),
+    "bob": (1.515, 0.014),
+    "long": (1.40, 0.013),
+    "bun": (1.585, 0.004),
+    "tail": (1.585, 0.004),
+    "scarf": (1.44, 0.016),
+}
+"""Height of the lower end at the nape, and thickness, metres."""
 _HEAD: Final[Joints] = {"head": 1.0}
+_TRUNK: Final[Joints] = {"spine3": 0.65, "spine2": 0.35}
 _HAIR: Final = (18, 11, 6, 4)
 
 
 def hair(style: Hair) -> list[Piece]:
     """Return the hair of a style, down to the hairline at the front."""
-    nape = {"short": 1.585, "crop": 1.600, "bob": 1.515, "long": 1.40, "bun": 1.585, "tail": 1.585}[
-        style
-    ]
-    full = {
-        "short": 0.006,
-        "crop": 0.001,
-        "bob": 0.014,
-        "long": 0.012,
-        "bun": 0.003,
-        "tail": 0.003,
-    }[style]
+    nape, full = _STYLES[style]
+    coat = "trim" if style == "scarf" else "hair"
     low = (
         # z, x, half depth ahead, behind, half width
         (nape, -0.066, 0.012, 0.030, 0.050),
@@ -55,13 +61,13 @@ def hair(style: Hair) -> list[Piece]:
                 if z > 1.46
                 else {"head": 0.2, "neck": 0.3, "spine3": 0.5}
             )
-        if style in ("bob", "long") and z < 1.6:
+        if style in ("bob", "long", "scarf") and z < 1.6:
             front, wide = front + 0.030, wide + 0.016
-        if style == "long" and z < 1.5:
+        if style in ("long", "scarf") and z < 1.5:
             x = x - 0.022
             wide = wide + 0.022
         rings.append(upright_loft((x, 0.0, top), front, behind / front, wide, joints, 2.1))
-    pieces = [Piece("hair", tuple(rings), _HAIR, (15, 9, 7, 5))]
+    pieces = [Piece(coat, tuple(rings), _HAIR, (15, 9, 7, 5))]
     if style == "bun":
         pieces.append(
             ball("hair", (-0.125, 0.0, 1.700), (0.034, 0.038, 0.036), _HEAD, (10, 7, 6, 4))
@@ -82,8 +88,10 @@ def hair(style: Hair) -> list[Piece]:
     return pieces
 
 
-def headgear() -> list[Piece]:
-    """Return a cap with a visor."""
+def headgear(kind: Cap) -> list[Piece]:
+    """Return a cap with a visor, or a knitted hat."""
+    if kind == "beanie":
+        return [_beanie()]
     dome = (
         (1.676, -0.006, 0.096, 0.110, 0.083),
         (1.690, -0.006, 0.101, 0.114, 0.0865),
@@ -109,6 +117,22 @@ def headgear() -> list[Piece]:
         Piece("cap", tuple(rings), _HAIR, (9, 6, 5, 4)),
         Piece("cap", tuple(visor), (10, 8, 6, 4), (5, 4, 3, 3)),
     ]
+
+
+def _beanie() -> Piece:
+    keys = (
+        (1.668, -0.010, 0.094, 0.112, 0.086),
+        (1.672, -0.010, 0.100, 0.118, 0.091),
+        (1.705, -0.010, 0.100, 0.118, 0.090),
+        (1.740, -0.014, 0.086, 0.104, 0.080),
+        (1.775, -0.022, 0.060, 0.074, 0.058),
+        (1.792, -0.026, 0.022, 0.028, 0.022),
+    )
+    rings = [
+        upright_loft((x, 0.0, z), front, behind / front, wide, _HEAD, 2.1)
+        for z, x, front, behind, wide in keys
+    ]
+    return Piece("cap", tuple(rings), _HAIR, (9, 6, 5, 4))
 
 
 def carried(what: Carried, loose: float = 0.0) -> list[Piece]:
@@ -141,31 +165,15 @@ def _bag() -> Piece:
 
 
 def _strap(loose: float) -> Piece:
-    """Return the strap of the shoulder bag as one thin ring.
-
-    It runs from the right shoulder over chest and back to the bag.
-    """
-    rings = []
-    for share in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
-        z = 0.95 + 0.53 * share
-        y = 0.195 - 0.285 * share
-        front = (0.115, 0.110, 0.114, 0.134, 0.101, 0.045)[round(5 * share)]
-        joints: Joints = (
-            {"pelvis": 1.0 - share, "spine3": share}
-            if 0.0 < share < 1.0
-            else ({"pelvis": 1.0} if share == 0.0 else {"spine3": 1.0})
-        )
-        rings.append(
-            Ring(
-                (-0.012, y, z),
-                (front + loose + 0.006, 0.0, 0.0),
-                (0.0, 0.016, 0.016),
-                joints,
-                0.78,
-                3.5,
-            )
-        )
-    return Piece("bag", tuple(rings), (16, 10, 0, 0), (10, 6, 0, 0))
+    """Return the strap of the shoulder bag, from the right shoulder over chest and back."""
+    ahead = 0.128 + loose
+    way = (
+        *((0.02, 0.20, 0.95), (ahead - 0.01, 0.10, 1.10), (ahead, 0.0, 1.26)),
+        *((ahead - 0.03, -0.07, 1.39), (-0.02, -0.105, 1.497 + 0.4 * loose)),
+        *((-0.118 - loose, -0.06, 1.39), (-0.128 - loose, 0.03, 1.22)),
+        *((-0.118 - loose, 0.13, 1.06), (-0.02, 0.20, 0.95)),
+    )
+    return replace(bar("bag", way, 0.013, _TRUNK), sides=(6, 4, 0, 0))
 
 
 def _backpack() -> Piece:
@@ -187,26 +195,13 @@ def _backpack() -> Piece:
 
 
 def _shoulder_strap(left: float, loose: float) -> Piece:
-    keys = (
-        (1.10, 0.10, 0.104),
-        (1.25, 0.085, 0.121),
-        (1.37, 0.085, 0.093),
-        (1.450, 0.085, 0.050),
-        (1.487, 0.085, 0.030),
-        (1.497, 0.085, 0.01),
+    ahead = 0.118 + loose
+    way = (
+        *((-0.12, 0.085, 1.42), (-0.03, 0.088, 1.490 + 0.4 * loose), (ahead - 0.045, 0.090, 1.42)),
+        *((ahead, 0.095, 1.28), (ahead - 0.03, 0.125, 1.14), (-0.09, 0.14, 1.06)),
     )
-    rings = [
-        Ring(
-            (-0.02, left * y, z),
-            (front + loose + 0.004, 0.0, 0.0),
-            (0.0, 0.021, 0.0),
-            {"spine3": 0.8, "spine2": 0.2},
-            0.9,
-            3.5,
-        )
-        for z, y, front in keys
-    ]
-    return Piece("bag", tuple(rings), (12, 8, 0, 0), (7, 5, 0, 0))
+    points = [(x, left * y, z) for x, y, z in way]
+    return replace(bar("bag", points, 0.017, _TRUNK), sides=(6, 4, 0, 0))
 
 
 def _phone() -> Piece:

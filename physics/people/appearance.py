@@ -12,90 +12,40 @@ from numpy.typing import NDArray
 
 from cosim.core.state import Age
 from cosim.people.gait import is_woman
-from physics.people.body import COATS, Outfit
+from physics.people.body import COATS
+from physics.people.cloth_maps import BEARDS, layer
 from physics.people.families import Family
-from physics.people.figure import Build
+from physics.people.figure import Beside
+from physics.people.wardrobe import (
+    ALL,
+    CLOTHES,
+    PALETTES,
+    Clothes,
+    Season,
+    with_object,
+)
 
-_MAN: Final = Build()
-_STOUT: Final = Build(belly_m=0.045, limb=1.08)
-_WOMAN: Final = Build(woman=1.0, limb=0.92)
-_ROUND: Final = Build(woman=1.0, belly_m=0.025, limb=1.03)
-_CHILD: Final = Build(woman=0.3, limb=0.92, head=1.25)
-_OLD: Final = Build(woman=0.3, belly_m=0.03, limb=0.96)
-_OLD_WOMAN: Final = Build(woman=0.9, belly_m=0.03, limb=0.96)
-
-OUTFITS: Final[dict[str, tuple[Outfit, ...]]] = {
-    "man": (
-        Outfit("man", _MAN, "trousers", "short", "short"),
-        Outfit("man", _MAN, "trousers", "long", "crop", loose_m=0.012, carried="backpack"),
-        Outfit("man", _MAN, "coat", "long", "short", loose_m=0.014),
-        Outfit("man", _STOUT, "trousers", "long", "short", loose_m=0.008, carried="phone"),
-        Outfit("man", _MAN, "shorts", "short", "short", cap=True, bare=True),
-        Outfit("man", _STOUT, "trousers", "short", "crop", carried="bag"),
-    ),
-    "woman": (
-        Outfit("woman", _WOMAN, "trousers", "long", "long", carried="bag"),
-        Outfit("woman", _WOMAN, "skirt", "short", "bob", bare=True),
-        Outfit("woman", _WOMAN, "coat", "long", "long", loose_m=0.010),
-        Outfit("woman", _WOMAN, "trousers", "short", "tail", carried="backpack"),
-        Outfit("woman", _ROUND, "skirt", "long", "bun", bare=True),
-        Outfit("woman", _ROUND, "trousers", "long", "bob", loose_m=0.006, carried="phone"),
-    ),
-    "child": (
-        Outfit("child", _CHILD, "trousers", "short", "short", carried="backpack"),
-        Outfit("child", _CHILD, "skirt", "short", "tail", bare=True),
-        Outfit("child", _CHILD, "shorts", "short", "short", cap=True, bare=True),
-    ),
-    "elder": (
-        Outfit("elder", _OLD, "trousers", "long", "crop", cap=True, loose_m=0.012),
-        Outfit(
-            "elder", _OLD_WOMAN, "skirt", "long", "bun", bare=True, loose_m=0.008, carried="bag"
-        ),
-        Outfit("elder", _OLD, "coat", "long", "crop", loose_m=0.012),
-    ),
-}
-"""Available outfits by family."""
-
-ALL: Final = tuple(outfit for family in OUTFITS.values() for outfit in family)
-
-_SKINS: Final = ("f1cfb8", "e6b898", "d9a37e", "c68c66", "a9714d", "8a573a", "6b4029", "4f2e20")
-_HAIRS: Final = ("1a1512", "2c1f18", "4a3122", "6d4a2f", "9a7446", "c7a468", "7b3b22", "3a3a3c")
+_SKINS: Final = ("f0cdb6", "e6b898", "d9a582", "c99270", "b07c5a", "96674a", "7c5340", "64432f")
+_HAIRS: Final = ("221c19", "33261f", "4e3626", "6d4c33", "96744c", "c3a26c", "7b4028", "403f41")
 _GREYS: Final = ("8f8f8f", "b8b6b2", "d8d6d2", "6e6d6c")
-_TOPS: Final = (
-    "b3312c",
-    "24508f",
-    "d9b341",
-    "2f7d51",
-    "e4e2dc",
-    "4a356b",
-    "26282c",
-    "c8708c",
-    "7ea7c9",
-    "8c9a5b",
-    "d77a3c",
-    "5a6470",
-    "a3b8a0",
-    "7a2f3b",
-    "efd9c0",
-    "3b7f86",
-)
-_COATS: Final = ("2b2e36", "6b5845", "8a8172", "1f3247", "5c2f2c", "3d4a3a", "b59a77", "47484c")
-_BOTTOMS: Final = (
-    "26303f",
-    "3f5878",
-    "40392f",
-    "1b1c1e",
-    "6d6353",
-    "8e8878",
-    "54585c",
-    "2e3a2f",
-    "a79d88",
-    "6a3d3a",
-)
-_SHOES: Final = ("1c1a19", "4b3324", "e6e4df", "35383d", "7a5b3d", "9c2f2a")
-_BAGS: Final = ("3a2a1f", "1f2226", "8c3b2e", "2f5d62", "b08d57", "51437a", "d0b49a", "3d5a36")
+_CAPS: Final = ("2c3f66", "b3403a", "3a3d44", "d8d2c4", "4f6b4a", "7a5a86")
+_METALS: Final = ("9a9da3", "33363c", "b0413a", "2f5f8f", "3f7d5a")
+_FURS: Final = ("c9a26b", "5a4030", "2b2724", "d8d0c4", "8a6a48")
+_SHOES: Final = ("2a2725", "5b4030", "e6e4df", "43464c", "8a6b4a", "8c4a44", "d9d5cc")
+_BAGS: Final = ("4a3a2f", "3a3d42", "84483e", "3f5f63", "a88f66", "5a5074", "c8b49f", "4a5a45")
 
 _Colour = tuple[int, int, int]
+
+
+_BESIDE: Final[tuple[tuple[Beside, int], ...]] = (
+    ("dog", 15),
+    ("pram", 10),
+    ("bicycle", 10),
+    ("wheelchair", 6),
+)
+"""Objects that people push or lead, and how many of 1000 people do."""
+_UMBRELLAS: Final = 700
+"""How many of 1000 people hold an umbrella in rain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +53,14 @@ class Look:
     """Appearance of a person.
 
     outfit: row of ALL
-    colours: (10, 3) uint8, in the order of COATS
+    colours: (coats, 3) uint8, in the order of COATS
+    patterns: (coats,) uint8, rows of the map of each surface, from `cloth_maps`
     girth_m: offset of the surface by body fat, metres
     """
 
     outfit: int
     colours: NDArray[np.uint8]
+    patterns: NDArray[np.uint8]
     girth_m: float
 
 
@@ -122,33 +74,80 @@ def family_of(name: str, age: int) -> Family:
 
 
 @lru_cache(maxsize=65536)
-def look_of(name: str, age: int, seed: int = 0) -> Look:
+def look_of(
+    name: str, age: int, seed: int = 0, season: Season = "mild", rain: bool = False
+) -> Look:
     """Return the look of the person of this `Age` called `name`.
 
     seed: changes clothes and colours, but not stature
+    season: of the clothes
+    rain: most people hold an umbrella
     """
     family = family_of(name, age)
-    choices = [outfit for outfit in OUTFITS[family] if _fits(outfit, name)]
-    outfit = choices[_draw(name, seed, "outfit") % len(choices)]
+    beside = object_of(name, seed, rain)
+    choices = [one for one in CLOTHES if season in one.seasons and _fits(one, family, name)]
+    choices = [one for one in choices if with_object(one.body, beside)] or choices
+    clothes = choices[_draw(name, seed, "outfit") % len(choices)]
+    outfit = with_object(clothes.body, beside) or clothes.outfit
+    colours = _colours(name, seed, family, clothes)
+    table = np.array([colours[coat] for coat in COATS], dtype=np.uint8)
+    patterns = _patterns(name, seed, clothes)
+    for array in (table, patterns):
+        array.flags.writeable = False
+    girth_m = 0.022 * (_draw(name, seed, "girth") % 1001 / 1000.0) - 0.006
+    return Look(ALL.index(outfit), table, patterns, girth_m)
+
+
+def object_of(name: str, seed: int = 0, rain: bool = False) -> Beside:
+    """Return the object that a person pushes, leads or holds, or "" for none.
+
+    rain: most of those with free hands hold an umbrella
+    """
+    draw = _draw(name, seed, "beside") // 7 % 1000
+    for beside, share in _BESIDE:
+        if draw < share:
+            return beside
+        draw -= share
+    if rain and _draw(name, seed, "umbrella") // 7 % 1000 < _UMBRELLAS:
+        return "umbrella"
+    return ""
+
+
+def _colours(name: str, seed: int, family: Family, clothes: Clothes) -> dict[str, _Colour]:
+    """Return the colour of each surface."""
     skin = _pick(_SKINS, name, seed, "skin")
-    colours = {
+    red, green, blue = skin
+    suit = clothes.tops == clothes.bottoms == "suits"
+    inner = "light" if clothes.top in ("open", "buttons", "zip") else "bright"
+    return {
         "skin": skin,
+        "lips": (int(red * 0.86), int(green * 0.62), int(blue * 0.62)),
         "hair": _pick(_GREYS if family == "elder" else _hairs(skin), name, seed, "hair"),
         "white": (206, 200, 194),
         "dark": (34, 28, 26),
-        "top": _pick(_COATS if outfit.legs == "coat" else _TOPS, name, seed, "top"),
-        "bottom": _pick(_BOTTOMS, name, seed, "bottom"),
+        "top": _pick(PALETTES[clothes.tops], name, seed, "top"),
+        "bottom": _pick(PALETTES[clothes.bottoms], name, seed, "top" if suit else "bottom"),
         "shoes": _pick(_SHOES, name, seed, "shoes"),
         "bag": _pick(_BAGS, name, seed, "bag"),
-        "cap": _pick(_TOPS, name, seed, "cap"),
+        "cap": _pick(_CAPS, name, seed, "cap"),
+        "trim": _pick(PALETTES[inner], name, seed, "trim"),
+        "metal": _pick(_METALS, name, seed, "metal"),
+        "fur": _pick(_FURS, name, seed, "fur"),
     }
-    red, green, blue = colours["skin"]
-    colours["lips"] = (int(red * 0.86), int(green * 0.62), int(blue * 0.62))
-    table = np.array([colours[coat] for coat in COATS], dtype=np.uint8)
-    table.flags.writeable = False
-    return Look(
-        ALL.index(outfit), table, 0.022 * (_draw(name, seed, "girth") % 1001 / 1000.0) - 0.006
-    )
+
+
+def _patterns(name: str, seed: int, clothes: Clothes) -> NDArray[np.uint8]:
+    """Return (coats,) maps: cloths, and skin with the beards of some men."""
+    outfit = clothes.outfit
+    beard = 0
+    if outfit.build.woman < 0.5 and outfit.family in ("man", "elder"):
+        beard = max(0, _draw(name, seed, "beard") // 5 % (BEARDS + 2) - 2)
+    maps = {
+        "top": layer("top", clothes.top, outfit.legs == "coat"),
+        "bottom": layer("bottom", clothes.bottom, outfit.legs == "skirt"),
+        "skin": layer("skin", beard=beard),
+    }
+    return np.array([maps[c] if c in maps else layer(c) for c in COATS], dtype=np.uint8)
 
 
 def _hairs(skin: _Colour) -> tuple[str, ...]:
@@ -156,9 +155,12 @@ def _hairs(skin: _Colour) -> tuple[str, ...]:
     return _HAIRS if skin[0] > 0xB0 else _HAIRS[:3]
 
 
-def _fits(outfit: Outfit, name: str) -> bool:
-    """Return whether an outfit suits the person. Old men and women share a family, not clothes."""
-    return outfit.family != "elder" or (outfit.legs == "skirt") == is_woman(name)
+def _fits(clothes: Clothes, family: Family, name: str) -> bool:
+    """Return whether clothes suit the person. Old men and women share a family, not clothes."""
+    outfit = clothes.outfit
+    if outfit.family != family:
+        return False
+    return family != "elder" or (outfit.build.woman > 0.5) == is_woman(name)
 
 
 def _pick(palette: tuple[str, ...], name: str, seed: int, what: str) -> _Colour:

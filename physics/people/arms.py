@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+from physics.people.beside import bar, elbow_of
 from physics.people.families import man_rest_m
 from physics.people.figure import LIMB, SMALL, Build, Sleeve
-from physics.people.lofted_mesh import Joints, Piece, Ring
+from physics.people.lofted_mesh import Joints, Piece, Ring, ball
 from physics.people.skeleton import INDEX, REACH_RAD
 
+Holds = Mapping[str, tuple[float, float, float] | None]
+"""Place of the wrist, by side, of arms that hold an object in place of swinging."""
 
-def arms(build: Build, sleeve: Sleeve, loose: float = 0.0) -> list[Piece]:
+
+def arms(
+    build: Build, sleeve: Sleeve, loose: float = 0.0, holds: Holds | None = None
+) -> list[Piece]:
     """Return both arms in sleeves, and the hands."""
     pieces: list[Piece] = []
     for side, left in (("left", 1.0), ("right", -1.0)):
+        wrist_m = None if holds is None else holds[side]
+        if wrist_m is not None:
+            pieces += _holding(build, sleeve, loose, left, wrist_m)
+            continue
         collar, shoulder, elbow, wrist = (
             f"{side}_{part}" for part in ("collar", "shoulder", "elbow", "wrist")
         )
         keys = (
             # distance along the arm from the shoulder, half depth, half width across, weights
             (-0.020, 0.020, 0.014, {"spine3": 0.1, collar: 0.5, shoulder: 0.4}),
-            (-0.008, 0.040, 0.030, {collar: 0.5, shoulder: 0.5}),
-            (0.014, 0.053, 0.043, {collar: 0.35, shoulder: 0.65}),
-            (0.050, 0.057, 0.051, {collar: 0.1, shoulder: 0.9}),
+            (-0.008, 0.037, 0.027, {collar: 0.5, shoulder: 0.5}),
+            (0.014, 0.050, 0.039, {collar: 0.35, shoulder: 0.65}),
+            (0.050, 0.054, 0.048, {collar: 0.1, shoulder: 0.9}),
             (0.110, 0.052, 0.050, {shoulder: 1.0}),
             (0.190, 0.045, 0.045, {shoulder: 1.0}),
             (0.245, 0.041, 0.041, {shoulder: 0.78, elbow: 0.22}),
@@ -63,6 +74,44 @@ def _arm(
         for t, a, s, joints in keys
     ]
     return Piece(coat, tuple(rings), sides, kept)
+
+
+def _holding(
+    build: Build, sleeve: Sleeve, loose: float, left: float, wrist_m: tuple[float, float, float]
+) -> list[Piece]:
+    """Return an arm bent towards an object; it moves with the chest."""
+    chest = {"spine3": 1.0}
+    x, y, z = man_rest_m()[INDEX["left_shoulder"]].tolist()
+    shoulder = (x, left * (y + 0.012), z - 0.012)
+    elbow = elbow_of(shoulder, wrist_m, 0.28, 0.255)
+    f, more = build.limb, 0.005 + 0.7 * loose
+    mid = [0.5 * (a + b) for a, b in zip(shoulder, elbow, strict=True)]
+    low = [0.4 * a + 0.6 * b for a, b in zip(elbow, wrist_m, strict=True)]
+    keys = [
+        (shoulder, 0.050),
+        (tuple(mid), 0.047),
+        (elbow, 0.041),
+        (tuple(low), 0.036),
+        (wrist_m, 0.026),
+    ]
+    skin = bar("skin", [at for at, _ in keys], 0.030 * f, chest)
+    bent = bar("top", [at for at, _ in keys], 1.0, chest)
+    rings = tuple(
+        replace(ring, ahead=_times(ring.ahead, r * f + more), side=_times(ring.side, r * f + more))
+        for ring, (_, r) in zip(bent.rings, keys, strict=True)
+    )
+    shown = rings if sleeve == "long" else rings[:2]
+    pieces = [
+        Piece("top", shown, LIMB, (9, 6, 4, 3) if sleeve == "long" else (5, 3, 2, 2)),
+        ball("skin", wrist_m, (0.045, 0.036, 0.040), chest, (10, 8, 6, 4)),
+    ]
+    if sleeve == "short":
+        pieces.append(replace(skin, sides=LIMB, rings_kept=(8, 5, 4, 3)))
+    return pieces
+
+
+def _times(vector: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+    return vector[0] * factor, vector[1] * factor, vector[2] * factor
 
 
 def _hand(side: str, left: float) -> list[Piece]:

@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from physics.ground.mesh import smooth_normals
-from physics.people.accessories import Carried, Hair, carried, hair, headgear
+from physics.people.accessories import Cap, Carried, Hair, carried, hair, headgear
+from physics.people.ambient import unshaded
 from physics.people.arms import arms
+from physics.people.beside import beside, reach
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton
 from physics.people.figure import (
     LEVELS,
     MESH_LEVELS,
     RIBBONS,
+    Beside,
     Build,
     Legs,
     Sleeve,
@@ -29,23 +32,27 @@ from physics.people.head import about_head, neck_and_head
 from physics.people.lofted_mesh import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
 
-COATS: Final = ("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap")
+COATS: Final = (
+    *("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap"),
+    *("trim", "metal", "fur"),
+)
 """Surfaces of a body; a person has one colour for each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outfit:
-    """Components of a body: family, build, clothes, hair and carried objects."""
+    """Components of a body: family, build, clothes, hair, carried and pushed objects."""
 
     family: Family
     build: Build
     legs: Legs
     sleeve: Sleeve
     hair: Hair
-    cap: bool = False
+    cap: Cap = ""
     carried: Carried = ""
     bare: bool = False
     loose_m: float = 0.0
+    beside: Beside = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,7 @@ class SkinnedBody:
     weights: (V, 4) float32, descending, with sum 1
     coat: (V,) uint8 rows of COATS
     fat: (V,) float32, offset of a vertex on stouter people
+    unshaded: (V,) float32, share of ambient light that the body leaves, 0 to 1
     """
 
     vertices: NDArray[np.float32]
@@ -67,6 +75,7 @@ class SkinnedBody:
     weights: NDArray[np.float32]
     coat: NDArray[np.uint8]
     fat: NDArray[np.float32]
+    unshaded: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +101,7 @@ class FarBody:
     fat: NDArray[np.float32]
     still: NDArray[np.bool_]
     ribbon: NDArray[np.bool_]
+    unshaded: NDArray[np.float32]
 
 
 @lru_cache(maxsize=128)
@@ -109,6 +119,7 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
     )
     weights = np.concatenate([s.weights for _, s in surfaces])
     weights = _sided(vertices, weights)
+    light = unshaded(vertices, smooth_normals(vertices, triangles))
     vertices = _fitted(vertices, weights, skeleton(outfit.family))
     joints, few = strongest(weights)
     coat = np.repeat(
@@ -122,6 +133,7 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
         few,
         coat.astype(np.uint8),
         np.concatenate([s.fat for _, s in surfaces]).astype(np.float32),
+        light.astype(np.float32),
     )
 
 
@@ -138,12 +150,14 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
         [_sided(t.corners, t.weights) if t.still else t.weights for _, t in tubes]
     )
     even = np.concatenate([t.weights for _, t in tubes])
+    middle = np.concatenate([t.middle for _, t in tubes])
     family = skeleton(outfit.family)
     scale = family.height_m / 1.75
     joints, few = strongest(weights)
-    coat = np.repeat([COATS.index(coat) for coat, _ in tubes], [len(t.middle) for _, t in tubes])
+    counts = [len(t.middle) for _, t in tubes]
+    coat = np.repeat([COATS.index(coat) for coat, _ in tubes], counts)
     return FarBody(
-        _fitted(np.concatenate([t.middle for _, t in tubes]), even, family).astype(np.float32),
+        _fitted(middle, even, family).astype(np.float32),
         (scale * np.concatenate([t.ahead for _, t in tubes])).astype(np.float32),
         (scale * np.concatenate([t.side for _, t in tubes])).astype(np.float32),
         np.concatenate([t.ring for _, t in tubes]).astype(np.float32),
@@ -154,10 +168,9 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
         few,
         coat.astype(np.uint8),
         np.concatenate([t.fat for _, t in tubes]).astype(np.float32),
-        *(
-            np.repeat(kind, [len(t.middle) for _, t in tubes])
-            for kind in zip(*((t.still, t.ribbon) for _, t in tubes), strict=True)
-        ),
+        np.repeat([t.still for _, t in tubes], counts),
+        np.repeat([t.ribbon for _, t in tubes], counts),
+        unshaded(middle, np.zeros_like(middle)).astype(np.float32),
     )
 
 
@@ -170,11 +183,12 @@ def pieces(outfit: Outfit) -> tuple[Piece, ...]:
         parts = parts[:1]
     parts += neck_and_head(build)
     parts += legs(build, outfit.legs, outfit.bare, outfit.loose_m)
-    parts += arms(build, outfit.sleeve, outfit.loose_m)
+    holds = {side: reach(outfit.beside, side) for side in ("left", "right")}
+    parts += arms(build, outfit.sleeve, outfit.loose_m, holds)
     parts += [about_head(piece, build.head) for piece in hair(outfit.hair)]
     if outfit.cap:
-        parts += [about_head(piece, build.head) for piece in headgear()]
-    return (*parts, *carried(outfit.carried, outfit.loose_m))
+        parts += [about_head(piece, build.head) for piece in headgear(outfit.cap)]
+    return (*parts, *carried(outfit.carried, outfit.loose_m), *beside(outfit.beside))
 
 
 def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -207,4 +221,4 @@ def _fitted(vertices: Floats, weights: Floats, family: Skeleton) -> Floats:
     scale = family.height_m / man.height_m
     _, ours = bind_of(Skeleton(family.rest_m / scale, man.height_m), model_pose())
     _, his = bind_of(man, model_pose())
-    return (vertices + weights @ (ours - his)) * scale
+    return (vertices + weights[:, : len(ours)] @ (ours - his)) * scale

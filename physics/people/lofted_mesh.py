@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,10 @@ from physics.people.skeleton import INDEX
 
 Joints = Mapping[str, float]
 """Weights of joints, by name; they sum to 1."""
+GROUND: Final = "ground"
+"""Joint after those of the skeleton, which moves with the place and heading of the body alone."""
+ROWS: Final[Mapping[str, int]] = MappingProxyType({**INDEX, GROUND: len(INDEX)})
+"""Row of each joint of a loft."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +69,7 @@ class LoftedPiece:
 
     vertices: (V, 3), metres
     triangles: (T, 3), front counter-clockwise
-    weights: (V, 24)
+    weights: (V, 25), in the order of ROWS
     fat: (V,)
     """
 
@@ -89,7 +94,7 @@ def lofted(piece: Piece, level: int) -> LoftedPiece:
     if _volume(vertices, triangles) < 0.0:
         triangles = triangles[:, ::-1].copy()
     own = np.concatenate([np.repeat(table[:, 12:], sides, axis=0), table[[0, -1], 12:]])
-    return LoftedPiece(vertices, triangles, _shares(own), own[:, 24])
+    return LoftedPiece(vertices, triangles, _shares(own), own[:, _JOINTS])
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +107,7 @@ class Tube:
     middle, ahead, side: (V, 3) of the corner's ring
     ring: (V, 4) back, square, cosine and sine of the angle from the outline to the corner
     triangles: (T, 3)
-    weights: (V, 24)
+    weights: (V, 25), in the order of ROWS
     fat: (V,)
     still: corners are not turned, run all around, and have angles from `ahead`
     ribbon: only the outline is drawn
@@ -168,7 +173,7 @@ def tube(piece: Piece, level: int, ribbon: bool = False) -> Tube:
         ring,
         triangles,
         _shares(rows[:, 12:]),
-        rows[:, 36],
+        rows[:, 12 + _JOINTS],
         spreads,
         ribbon,
     )
@@ -201,7 +206,7 @@ def _sheet(rings: int, sides: int, open_: bool = False, capped: bool = True) -> 
 
 
 def _shares(rows: Floats) -> Floats:
-    weights = np.maximum(rows[:, :24], 0.0)
+    weights = np.maximum(rows[:, :_JOINTS], 0.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
@@ -223,18 +228,19 @@ def ball(
     )
 
 
-_WIDTH: Final = 12 + 24 + 1
+_JOINTS: Final = len(ROWS)
+_WIDTH: Final = 12 + _JOINTS + 1
 _ROUND: Final = 2.0 * np.pi * np.arange(64) / 64
 
 
 def _table(rings: Sequence[Ring]) -> Floats:
-    """Return the rings as (K, 37): middle, ahead, side, back, square, spare, 24 weights, fat."""
+    """Return the rings as (K, 38): middle, ahead, side, back, square, spare, 25 weights, fat."""
     table = np.zeros((len(rings), _WIDTH))
     for row, ring in zip(table, rings, strict=True):
         row[:9] = (*ring.at, *ring.ahead, *ring.side)
-        row[9], row[10], row[36] = ring.back, ring.square, ring.fat
+        row[9], row[10], row[12 + _JOINTS] = ring.back, ring.square, ring.fat
         for name, weight in ring.joints.items():
-            row[12 + INDEX[name]] = weight
+            row[12 + ROWS[name]] = weight
     return table
 
 

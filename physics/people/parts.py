@@ -11,12 +11,13 @@ import numpy as np
 from cosim.core.geometry import Floats
 from cosim.core.state import People
 from physics.ground.mesh import Mesh, box, frustum, join
-from physics.people.appearance import ALL, family_of, look_of
+from physics.people.appearance import family_of, look_of
 from physics.people.body import COATS
 from physics.people.clips import bind_of, own_clips
 from physics.people.families import Family, skeleton
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, model_pose
+from physics.people.wardrobe import ALL
 from physics.textures.layers import Colour
 
 RIGID_PARTS: Final = (

@@ -3,8 +3,10 @@ joints."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -23,6 +25,8 @@ from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, shot
+from physics.people.appearance import Look
+from physics.people.wardrobe import ALL
 
 pytestmark = [pytest.mark.engine, pytest.mark.skipif(not available(), reason="no OpenGL here")]
 
@@ -77,6 +81,15 @@ def mask(crowd: CrowdDrawing, people: People, taken: Shot) -> NDArray[np.bool_]:
         return np.asarray(labels == LABELS["person"])
 
 
+def near_people(doing: str = "walk") -> People:
+    """Twelve people in two rows, 5 and 8 m away."""
+    names = tuple(sorted(f"c{i}" for i in range(12)))
+    rows = np.arange(12)
+    xy = np.column_stack([5.0 + 3.0 * (rows % 2), 0.75 * (rows - 5.5)])
+    pace = np.full(12, 1.3 if doing == "walk" else 0.0)
+    return People.of(names, xy, 0.7 * rows, pace, (doing,) * 12, 0.13 * rows)
+
+
 @pytest.fixture
 def crowd() -> Iterator[CrowdDrawing]:
     with context() as gl:
@@ -101,3 +114,43 @@ def test_levels_of_detail_keep_the_silhouettes(
     total = sum(int(b.sum()) for b in full)
     print(f"{100 * changed / total:.2f} % of {total} silhouette pixels changed")
     assert changed < 0.03 * total
+
+
+def test_people_are_neither_black_nor_flat(crowd: CrowdDrawing) -> None:
+    """At noon people reflect 0.12 to 0.6 of white on average, and their pixels vary as those of
+    cloth in light and shade."""
+    taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
+    with drawing(crowd, near_people(), taken) as (rgb, labels):
+        light = rgb[labels == LABELS["person"]] @ (0.2126, 0.7152, 0.0722) / 255.0
+    print(f"luminance {light.mean():.3f} +- {light.std():.3f} of {len(light)} pixels")
+    assert 0.12 < light.mean() < 0.6 and light.std() > 0.08
+
+
+@pytest.mark.parametrize(
+    ("what", "higher"), [("umbrella", 1.06), ("wheelchair", 0.5), ("pram", 0.9), ("dog", 0.9)]
+)
+def test_objects_are_drawn_and_labelled(
+    crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, what: str, higher: float
+) -> None:
+    """What people push, lead or hold has their label; umbrellas rise over heads, and people in
+    wheelchairs sit while they move."""
+    taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
+    plain = mask(crowd, near_people(), taken)
+    crowds._worn.cache_clear()
+    look = crowds.look_of
+    variants = {o.family: k for k, o in enumerate(ALL) if o.beside == what}
+
+    def with_object(name: str, age: int, *more: Any) -> Look:
+        own = look(name, age, *more)
+        return dataclasses.replace(own, outfit=variants[ALL[own.outfit].family])
+
+    monkeypatch.setattr(crowds, "look_of", with_object)
+    other = CrowdDrawing(context())
+    shown = mask(other, near_people(), taken)
+    other.release()
+    crowds._worn.cache_clear()
+    changed = shown ^ plain
+    assert changed.sum() > 0.03 * plain.sum()
+    rows = [np.flatnonzero(one.any(axis=1)) for one in (plain, shown)]
+    tall = [288 // 2 - int(row.min()) for row in rows]
+    assert tall[1] > higher * tall[0] if what != "wheelchair" else tall[1] < 0.85 * tall[0]

@@ -13,16 +13,18 @@ from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, Age, People
 from cosim.people.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
-from physics.people.appearance import ALL, family_of, look_of
+from physics.people.appearance import family_of, look_of, object_of
 from physics.people.body import COATS, SkinnedBody, body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
+from physics.people.cloth_maps import cloth_maps
 from physics.people.families import FAMILIES, skeleton
 from physics.people.figure import MESH_LEVELS
 from physics.people.gaits import CYCLE_FRAMES
 from physics.people.gestures import SEAT_M, SEATED_BACK_M
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, forward, rodrigues
+from physics.people.wardrobe import ALL, CLOTHES, SEASONS, season_of
 from tests.support.blend import skinned
 
 ROOT = Path(__file__).parents[2]
@@ -178,11 +180,54 @@ def test_looks_hang_on_name_and_age_alone() -> None:
     assert said.stdout.splitlines() == [
         f"{look_of(*n).outfit} {look_of(*n).colours.tolist()}" for n in names
     ]
-    assert len({look_of(*n).outfit for n in names}) > 12
+    assert len({look_of(*n).outfit for n in names}) > 16
     assert len({look_of(*n).colours.tobytes() for n in names}) == 60
     assert (
         sum(look_of(*n, 7).colours.tobytes() != look_of(*n).colours.tobytes() for n in names) == 60
     )
+
+
+def test_sixty_outfits_follow_the_season() -> None:
+    """There are at least 60 different outfits. In every season each family and sex wears several of
+    its own, and no other."""
+    assert len({(one.body, one.top, one.bottom, one.tops) for one in CLOTHES}) == len(CLOTHES) >= 60
+    names = [f"c{i}" for i in range(400)]
+    for season in SEASONS:
+        allowed = {one.outfit for one in CLOTHES if season in one.seasons}
+        for age in (Age.ADULT, Age.CHILD, Age.ELDERLY):
+            worn = {ALL[look_of(name, age, 0, season).outfit] for name in names}
+            plain = {outfit for outfit in worn if not outfit.beside}
+            assert plain <= allowed and len(plain) >= (8 if age == Age.ADULT else 2)
+    coats = [
+        sum(o.legs == "coat" for o in map(ALL.__getitem__, rows))
+        for rows in (
+            [look_of(name, Age.ADULT, 0, season).outfit for name in names]
+            for season in ("summer", "winter")
+        )
+    ]
+    assert coats[0] < 0.15 * len(names) < coats[1]
+    assert [season_of(day, 48.0) for day in (15, 105, 172)] == ["winter", "mild", "summer"]
+    assert season_of(15, -35.0) == "summer"
+
+
+def test_rain_opens_umbrellas() -> None:
+    """In rain most people hold an umbrella, without rain none; the others keep what they push."""
+    names = [f"c{i}" for i in range(2000)]
+    dry, wet = ([object_of(name, 3, rain) for name in names] for rain in (False, True))
+    assert "umbrella" not in dry and 0.5 < wet.count("umbrella") / len(names) < 0.8
+    assert {"dog", "pram", "bicycle", "wheelchair"} < set(dry)
+    assert all(b in (a, "umbrella") and (b == a or not a) for a, b in zip(dry, wet, strict=True))
+
+
+def test_cloth_shows_folds_at_a_distance() -> None:
+    """Averaged over 4 cm, a pixel of a person 10 m away, the brightness of all tops still varies."""
+    maps = cloth_maps()
+    rows = sorted({int(look_of(f"c{i}", 0).patterns[COATS.index("top")]) for i in range(200)})
+    assert len(rows) > 6
+    for row in rows:
+        chest = maps[row, 110:168, 20:76, 1].astype(float)[:55, :55].reshape(11, 5, 11, 5)
+        means = chest.mean(axis=(1, 3))
+        assert means.std() > 0.08 * means.mean()
 
 
 def test_statures_are_of_all_ages() -> None:

@@ -30,6 +30,7 @@ from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.targets import Target
 from physics.cameras.gl.traffic import Driven, TrafficDrawing
 from physics.cameras.view import Shot
+from physics.people.wardrobe import Season
 from physics.street.surface import Surface
 
 _CLOCK: Final = Clock()
@@ -41,6 +42,8 @@ class Stage(NamedTuple):
     """Resources of a camera: street scene, optional shadow maps, backdrop, light.
 
     cloud: splats of the place, None without
+    season: of people's clothes
+    rain: most people hold umbrellas
     """
 
     surface: Surface
@@ -50,6 +53,8 @@ class Stage(NamedTuple):
     backdrop: Backdrop
     light: Lighting
     cloud: SplatCloud | None = None
+    season: Season = "mild"
+    rain: bool = False
 
 
 class PictureOrder(NamedTuple):
@@ -115,6 +120,8 @@ class BatchDrawing:
                     surface.heights,
                     shadows,
                     surface.seed,
+                    stage.season,
+                    stage.rain,
                 )
             )
             driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
@@ -202,10 +209,11 @@ class BatchDrawing:
         self._bind(i, picture)
         gl.depth_func = "<"
         self._draw_pass(i, stage, "colour")
-        # Paint changes colours only; labels and depth stay those of the ground.
+        # Paint and the shade at feet change colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
         target.use_colours()
         stage.scene.draw_paint()
+        self._crowd.draw_contact(i)
         target.use()
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="

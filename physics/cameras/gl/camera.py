@@ -28,6 +28,7 @@ from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, View
 from physics.dynamics.world import BulletWorld
+from physics.people.wardrobe import season_of
 
 NOON: Final = Light()
 _TARGETS_MAX: Final = 4
@@ -53,6 +54,7 @@ class GlCamera(WorldCamera):
         seed = world.surface.seed
         self._sky = sky_of(light, seed) if scan is None else scan_sky(light, scan.facts, seed)
         self._light = lighting_of(self._sky, haze=self._splats is None)
+        self._season = season_of(light.day_of_year, light.latitude_deg)
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
@@ -66,7 +68,9 @@ class GlCamera(WorldCamera):
                 shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
                 cloud = None if splats is None else splat_pictures(gl).cloud(splats)
                 sky = Backdrop(gl, self._sky)
-                self._stage = Stage(world.surface, world.robot, scene, shadows, sky, light, cloud)
+                self._stage = Stage(
+                    *(world.surface, world.robot, scene, shadows, sky, light, cloud, self._season)
+                )
             self._context = gl
         return self
 

@@ -1,7 +1,7 @@
 """People of the gl camera: skinned bodies of all pictures of a batch, posed on the graphics card.
 
 Each batch uploads a few numbers per person: four baked frames with weights, place, heading, size.
-A first small pass blends the frames into 24 joint matrices per person, stored in a texture.
+A first small pass blends the frames into 25 joint matrices per person, stored in a texture.
 They are in metres from the picture's anchor; the vertex shaders of all passes skin with them.
 Bodies of all outfits and levels are in one buffer.
 A pass of a picture is one indirect draw for near people (four joints per vertex) and one for far
@@ -20,25 +20,39 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People
+from physics.cameras.gl.cloth import MAPS_UNIT, map_texture
+from physics.cameras.gl.contact import ContactShadows
 from physics.cameras.gl.instances import runs_of
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.skins import mesh_skins, tube_skins
 from physics.cameras.view import PERSON_MARGIN_M
-from physics.people.appearance import ALL, look_of
+from physics.people.appearance import look_of
 from physics.people.body import COATS, body, far_body
 from physics.people.clips import own_clips
+from physics.people.families import skeleton
 from physics.people.figure import LEVELS, MESH_LEVELS
+from physics.people.gestures import GESTURES, SEATED_BACK_M
+from physics.people.lofted_mesh import ROWS
 from physics.people.poses import bodies_of, loops_of, poses_of
+from physics.people.wardrobe import ALL, Season
 
 LEVEL_PX: Final = (170.0, 80.0, 44.0, 32.0)
 """Drawn heights of a body, in pixels, below which the next coarser level is used."""
 CAST_M: Final = 18.0
 """Maximum distance from the eye of people that cast shadows, metres."""
+_CONTACT_M: Final = 25.0
+"""Maximum distance from the eye of people whose feet darken the ground, metres."""
 
-_INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4")])
-"""person: row of the matrix texture; dress: row of the colour texture."""
-_ROW: Final = 3 * 24
+_INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4")])
+"""person: row of the matrix texture; dress: row of the colour texture; tall: of the modelled man
+relative to the family."""
+_SIT: Final = list(GESTURES).index("sit")
+_SEAT_AHEAD_M: Final = SEATED_BACK_M - 0.1
+"""Shift of people in wheelchairs, so that their hips are nearly at their place, metres."""
+_TALL: Final = np.array([1.75 / skeleton(outfit.family).height_m for outfit in ALL])
+_Dress = tuple[tuple[str, ...], bytes, int, Season, bool]
+_ROW: Final = 3 * len(ROWS)
 _CROWD_MIN: Final = 64
 _KEYS: Final = (LEVELS + 1) * len(ALL)
 """Number of forms of a picture: outfits by level, plus one level for shadows."""
@@ -79,6 +93,8 @@ class PeopleSeen(NamedTuple):
     heights: function of (N, 2) points that returns the ground height
     shadows: people cast shadows
     seed: of their clothes and colours
+    season: of their clothes
+    rain: most people hold umbrellas
     """
 
     people: People
@@ -86,20 +102,30 @@ class PeopleSeen(NamedTuple):
     heights: Callable[[Floats], Floats]
     shadows: bool
     seed: int = 0
+    season: Season = "mild"
+    rain: bool = False
+
+    @property
+    def dressed(self) -> _Dress:
+        """Return all that their appearance depends on."""
+        people = self.people
+        return people.ids, people.age.tobytes(), self.seed, self.season, self.rain
 
 
 class _Worn(NamedTuple):
     """Appearance of N people.
 
     outfit, girth: (N,)
-    colours: (N, coats, 3)
+    colours: (N, coats, 4), with patterns
     bodies: (N, 4), as for poses
+    sits: (N,) in a wheelchair, also while moving
     """
 
     outfit: NDArray[np.intp]
     girth: NDArray[np.float32]
     colours: NDArray[np.uint8]
     bodies: Floats
+    sits: NDArray[np.bool_]
 
 
 class CrowdDrawing:
@@ -108,10 +134,15 @@ class CrowdDrawing:
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self._clips = own_clips()
-        matrices = self._clips.matrices
+        still = np.broadcast_to(
+            np.eye(3, 4, dtype=np.float32), (len(self._clips.matrices), 1, 3, 4)
+        )
+        matrices = np.concatenate([self._clips.matrices, still], axis=1)
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
         self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
         self._everywhere = context.vertex_array(self._pose, [])
+        self._maps = map_texture(context)
+        self._contact = ContactShadows(context)
         self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level))
         self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level))
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
@@ -119,7 +150,7 @@ class CrowdDrawing:
         self._known = np.zeros(len(self._starts), dtype=bool)
         self._split: list[list[int]] = []
         self._room = 0
-        self._dressed: list[tuple[tuple[str, ...], bytes, int]] = []
+        self._dressed: list[_Dress] = []
         self._grow(_CROWD_MIN)
 
     def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
@@ -144,15 +175,19 @@ class CrowdDrawing:
         seen = seen[rows]
         casts = casts[rows]
         z_m = _heights(watched, whose, xy)
-        worn = self._dress(
-            [(one.people.ids, one.people.age.tobytes(), one.seed) for one in watched]
-        )
+        worn = self._dress([one.dressed for one in watched])
         outfit, girth, bodies = worn.outfit[rows], worn.girth[rows], worn.bodies[rows]
         heading, strides, pace = (
             np.concatenate([getattr(one.people, name) for one in watched])[rows]
             for name in ("heading", "strides", "pace")
         )
         loops = np.concatenate([loops_of(one.people.doing) for one in watched])[rows]
+        sits = worn.sits[rows]
+        if sits.any():
+            loops = np.where(sits, _SIT, loops)
+            pace = np.where(sits, 0.0, pace)
+            ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+            xy = xy + (sits * _SEAT_AHEAD_M)[:, None] * ahead
         time_s = np.array([one.time_s for one in watched])[whose]
         posed = poses_of(bodies, pace, strides, loops, time_s, self._clips)
         told = np.zeros((len(rows), 4, 4), dtype=np.float32)
@@ -161,6 +196,9 @@ class CrowdDrawing:
         told[:, 3, 0], told[:, 3, 1] = np.cos(heading), np.sin(heading)
         self._told.write(told, viewport=(0, 0, 4, len(rows)))
         self._set_draws(whose, outfit, levels(shots, whose, xy, z_m), seen, casts, girth, rows)
+        near = (seen & (shots.far_m(whose, xy) < _CONTACT_M)).nonzero()[0]
+        on_picture = np.bincount(whose[near], minlength=len(watched))
+        self._contact.set(on_picture, near, _TALL[outfit[near]])
         self._posed.use()
         self._posed.viewport = (0, 0, _ROW, len(rows))
         self._context.enable_only(moderngl.NOTHING)
@@ -170,10 +208,10 @@ class CrowdDrawing:
         self._matrices.use(0)
         self._dyed.use(1)
 
-    def _dress(self, who: list[tuple[tuple[str, ...], bytes, int]]) -> _Worn:
+    def _dress(self, who: list[_Dress]) -> _Worn:
         """Return the appearance of all people, and upload their colours if they changed.
 
-        who: names, ages and seeds
+        who: as `PeopleSeen.dressed`
         """
         if who != self._dressed:
             each = [_worn(*one) for one in who]
@@ -194,17 +232,24 @@ class CrowdDrawing:
         if stage == "still" or near == end:
             return
         held = self._instances, self._commands
+        self._maps.use(MAPS_UNIT)
         if stage == "moving":
             self._far.draw(stage, shadows, *held, end - cast, cast)
         else:
             self._near.draw(stage, shadows, *held, far - near, near)
             self._far.draw(stage, shadows, *held, cast - far, far)
 
+    def draw_contact(self, picture: int = 0) -> None:
+        """Darken the ground under the feet of the people of a picture, without labels."""
+        if self._split[picture][3]:
+            self._contact.draw(picture)
+
     def release(self) -> None:
+        self._contact.release()
         self._near.release()
         self._far.release()
         self._release_room()
-        for thing in (self._baked, self._everywhere, self._pose):
+        for thing in (self._baked, self._maps, self._everywhere, self._pose):
             thing.release()
 
     def _set_draws(
@@ -234,6 +279,7 @@ class CrowdDrawing:
         self._split = form.searchsorted(ends).tolist()
         table = np.empty(len(people), dtype=_INSTANCE)
         table["person"], table["dress"], table["girth"] = people, dress[people], girth[people]
+        table["tall"] = _TALL[outfit[people]]
         self._instances.write(table)
         self._commands.write(commands)
 
@@ -259,7 +305,7 @@ class CrowdDrawing:
         self._release_room()
         self._room = room
         self._told = _texture(self._context, (4, room), 4, "f4")
-        self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
+        self._dyed = _texture(self._context, (len(COATS), room), 4, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
         self._posed = self._context.framebuffer([self._matrices])
         self._instances = self._context.buffer(reserve=2 * room * _INSTANCE.itemsize)
@@ -295,13 +341,16 @@ def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats)
 
 
 @lru_cache(maxsize=256)
-def _worn(ids: tuple[str, ...], ages: bytes, seed: int) -> _Worn:
-    looks = [look_of(name, age, seed) for name, age in zip(ids, ages, strict=True)]
+def _worn(ids: tuple[str, ...], ages: bytes, seed: int, season: Season, rain: bool) -> _Worn:
+    looks = [look_of(name, age, seed, season, rain) for name, age in zip(ids, ages, strict=True)]
     return _Worn(
         np.array([who.outfit for who in looks], dtype=np.intp),
         np.array([who.girth_m for who in looks], dtype=np.float32),
-        np.array([who.colours for who in looks], dtype=np.uint8).reshape(-1, len(COATS), 3),
+        np.array(
+            [np.column_stack([who.colours, who.patterns]) for who in looks], dtype=np.uint8
+        ).reshape(-1, len(COATS), 4),
         bodies_of(ids, ages),
+        np.array([ALL[who.outfit].beside == "wheelchair" for who in looks], dtype=bool),
     )
 
 

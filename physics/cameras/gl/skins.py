@@ -15,9 +15,9 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.state import LABELS
+from physics.cameras.gl.cloth import FRAGMENT
 from physics.cameras.gl.shading import Pass, Programs, programs
-from physics.people.body import FarBody, SkinnedBody
+from physics.people.body import COATS, FarBody, SkinnedBody
 
 _CORNER: Final = np.dtype(
     [
@@ -28,7 +28,10 @@ _CORNER: Final = np.dtype(
         ("coat", "u1", 4),
     ]
 )
-"""normal: as in corners._CORNER, fourth: offset by fat; weights: of 255; coat: row of COATS."""
+"""normal: as in corners._CORNER, fourth: offset by fat; weights: of 255.
+
+coat: row of COATS, unshaded light of 255
+"""
 
 FAR_CORNER: Final = np.dtype(
     [
@@ -43,7 +46,7 @@ FAR_CORNER: Final = np.dtype(
 )
 """Corner of a tube.
 
-coat: row of COATS, offset by fat, flag for a fixed ring, flag for a ribbon
+coat: row of COATS, offset by fat, 1 for a fixed ring plus 2 for a ribbon, unshaded light of 255
 """
 
 _MESH_LAYOUT: Final = (
@@ -58,12 +61,15 @@ _TUBE_LAYOUT: Final = (
     "3f4 3f4 3f4 4f4 4u1 4f1 4u1",
     *("in_middle", "in_ahead", "in_side", "in_ring", "in_joints", "in_weights", "in_coat"),
 )
-_SKIN: Final = """
+_SKIN: Final = (
+    f"const int TRIM = {COATS.index('trim')};\n"
+    + """
 layout(binding = 0) uniform sampler2D posed;
 layout(binding = 1) uniform sampler2D dyed;
 in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
-in int person; in int dress; in float girth;
-out vec3 at; out vec3 normal; flat out vec3 albedo;
+in int person; in int dress; in float girth; in float tall;
+out vec3 at; out vec3 normal; out vec3 own; out float unshaded;
+flat out vec3 albedo; flat out vec3 trim; flat out ivec2 worn;
 vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
 void pose(int bones) {
     for (int k = 0; k < bones; k++) {
@@ -72,11 +78,15 @@ void pose(int bones) {
         y += in_weights[k] * texelFetch(posed, ivec2(column + 1, person), 0);
         z += in_weights[k] * texelFetch(posed, ivec2(column + 2, person), 0);
     }
-    albedo = texelFetch(dyed, ivec2(int(in_coat.x), dress), 0).rgb;
+    vec4 dye = texelFetch(dyed, ivec2(int(in_coat.x), dress), 0);
+    albedo = dye.rgb;
+    trim = texelFetch(dyed, ivec2(TRIM, dress), 0).rgb;
+    worn = ivec2(int(in_coat.x), int(dye.a * 255.0 + 0.5));
 }
 vec3 moved(vec3 v) { return vec3(dot(x.xyz, v), dot(y.xyz, v), dot(z.xyz, v)); }
 vec3 placed(vec3 v) { return vec3(x.w, y.w, z.w) + moved(v); }
 """
+)
 
 _MESH: Final = """
 in vec3 in_at; in vec4 in_normal;
@@ -85,6 +95,8 @@ void main() {
     vec3 outward = in_normal.xyz * (255.0 / 127.0) - 1.0;
     at = placed(in_at + outward * (in_normal.w * girth));
     normal = moved(outward);
+    own = in_at * tall;
+    unshaded = float(in_coat.y) / 255.0;
     gl_Position = project(at);
 }
 """
@@ -92,7 +104,7 @@ void main() {
 _TUBE: Final = """
 in vec3 in_middle; in vec3 in_ahead; in vec3 in_side; in vec4 in_ring;
 void main() {
-    bool still = in_coat.z > 0u;
+    bool still = (in_coat.z & 1u) > 0u;
     pose(still ? 4 : 2);
     float share = still ? 1.0 : 1.0 / (in_weights.x + in_weights.y);
     x *= share; y *= share; z *= share;
@@ -106,7 +118,7 @@ void main() {
     vec2 before = vec2(-across.y, across.x);
     vec2 way = in_ring.z * across + in_ring.w * before;
     if (still) way = in_ring.zw;
-    float ribbon = still ? 0.0 : float(in_coat.w);
+    float ribbon = still ? 0.0 : float(in_coat.z >> 1);
     float thick = length(vec2(before.x < 0.0 ? half_.x * in_ring.x : half_.x, half_.y) * before);
     if (way.x < 0.0) half_.x *= in_ring.x;
     // the corner is where the outline of a superellipse has the normal `way`
@@ -116,22 +128,19 @@ void main() {
     // a ribbon lies where the tube is nearest, and is shaded as if it were round
     corner += before * (thick * ribbon * RAISED);
     way = normalize(way + ribbon * before);
+    own = (in_middle + in_ahead * (corner.x / length(in_ahead)) + in_side * (corner.y / length(in_side))) * tall;
+    unshaded = float(in_coat.w) / 255.0;
     at = middle + ahead_ * corner.x + side * corner.y;
     normal = ahead_ * way.x + side * way.y;
     gl_Position = project(at);
 }
 """
 
-_FRAGMENT: Final = f"""
-in vec3 at; in vec3 normal; flat in vec3 albedo;
-void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
-"""
-
 
 class Skins:
     """Bodies in one vertex and one index buffer.
 
-    instances: rows of person, dress and girth
+    instances: rows of person, dress, girth and tall
     drawn: the programs, with and without shadow maps
     """
 
@@ -193,7 +202,7 @@ class Skins:
         corner, index = self._buffers
         content = [
             (corner, *self._layout),
-            (instances, "1i4 1i4 1f4/i", "person", "dress", "girth"),
+            (instances, "1i4 1i4 1f4 1f4/i", "person", "dress", "girth", "tall"),
         ]
         colour, shadow = (
             self._context.vertex_array(program, content, index, skip_errors=True)
@@ -206,7 +215,7 @@ def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody
     """Create skins of meshes with four joints per corner."""
 
     def drawn(shadows: bool) -> Programs:
-        return programs(context, _SKIN + _MESH, _FRAGMENT, shadows)
+        return programs(context, _SKIN + _MESH, FRAGMENT, shadows)
 
     return Skins(context, made, lru_cache(drawn), _MESH_LAYOUT)
 
@@ -219,7 +228,7 @@ def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -
             programs(
                 context,
                 f"#define TOWARDS ({ray})\n#define RAISED {raised}\n" + _SKIN + _TUBE,
-                _FRAGMENT,
+                FRAGMENT,
                 shadows,
             )
             for ray, raised in (("middle - eye.xyz", 1.0), ("sun.xyz", 0.0))
@@ -236,6 +245,7 @@ def _corners(made: SkinnedBody) -> NDArray[np.void]:
     rows["normal"][:, :3] = np.rint(127.0 * made.normals) + 127.0
     rows["normal"][:, 3] = np.rint(255.0 * made.fat)
     rows["joints"], rows["coat"][:, 0] = made.joints, made.coat
+    rows["coat"][:, 1] = np.rint(255.0 * made.unshaded)
     rows["weights"] = _bytes(made.weights)
     return rows
 
@@ -251,7 +261,8 @@ def far_corners(made: FarBody) -> NDArray[np.void]:
     )
     rows["joints"], rows["weights"] = made.joints, _bytes(made.weights)
     rows["coat"][:, 0], rows["coat"][:, 1] = made.coat, np.rint(255.0 * made.fat)
-    rows["coat"][:, 2], rows["coat"][:, 3] = made.still, made.ribbon
+    rows["coat"][:, 2] = made.still + 2 * made.ribbon
+    rows["coat"][:, 3] = np.rint(255.0 * made.unshaded)
     return rows
 
 

@@ -1,0 +1,91 @@
+"""Contact shadows of people: soft dark spots where feet are near the ground."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from physics.cameras.gl.shading import programs
+from physics.people.skeleton import INDEX
+
+_SPOT: Final = np.dtype([("person", "i4"), ("tall", "f4")])
+_VERTEX: Final = f"""
+layout(binding = 0) uniform sampler2D posed;
+in int person; in float tall;
+out vec2 off; out float dark;
+vec3 sole(int joint, float y) {{
+    vec4 rest = vec4(vec3(0.03, y, 0.0) / tall, 1.0);
+    return vec3(dot(texelFetch(posed, ivec2(3 * joint, person), 0), rest),
+        dot(texelFetch(posed, ivec2(3 * joint + 1, person), 0), rest),
+        dot(texelFetch(posed, ivec2(3 * joint + 2, person), 0), rest));
+}}
+void main() {{
+    vec3 left = sole({INDEX["left_ankle"]}, 0.094), right = sole({INDEX["right_ankle"]}, -0.094);
+    vec3 foot = gl_VertexID < 6 ? left : right;
+    int corner = gl_VertexID % 6;
+    off = vec2(corner == 1 || corner == 2 || corner == 4 ? 1.0 : -1.0, corner > 1 && corner != 3 ? 1.0 : -1.0);
+    float ground = min(left.z, right.z);
+    dark = 0.62 * clamp(1.0 - (foot.z - ground) / 0.14, 0.0, 1.0);
+    gl_Position = project(vec3(foot.xy + 0.24 * off, ground + 0.012));
+}}
+"""
+_FRAGMENT: Final = """
+in vec2 off; in float dark;
+void main() {
+    float inside = max(1.0 - dot(off, off), 0.0);
+    pixel = vec4(0.0, 0.0, 0.0, dark * inside * inside * (1.0 - fogged()));
+}
+"""
+
+
+class ContactShadows:
+    """Spots under the feet of the people of a batch, from the matrices in texture unit 0."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._counts = np.zeros(0, dtype=np.intp)
+        self._room = 0
+        self._held: list[moderngl.Buffer | moderngl.VertexArray] = []
+
+    def set(
+        self, counts: NDArray[np.intp], person: NDArray[np.intp], tall: NDArray[np.floating]
+    ) -> None:
+        """Upload spots, by picture.
+
+        counts: (pictures,) people with spots
+        person: (N,) rows of the matrix texture
+        tall: (N,) size of the modelled man relative to their family
+        """
+        self._counts = counts
+        table = np.empty(len(person), dtype=_SPOT)
+        table["person"], table["tall"] = person, tall
+        commands = np.zeros((len(counts), 5), dtype=np.uint32)
+        commands[:, 0], commands[:, 1], commands[:, 3] = 12, counts, np.cumsum(counts) - counts
+        if max(table.nbytes, commands.nbytes) > self._room or not self._held:
+            self._grow(max(2 * table.nbytes, 2 * commands.nbytes, 1024))
+        self._spots.write(table)
+        self._commands.write(commands)
+
+    def draw(self, picture: int) -> None:
+        """Darken the ground of a picture. Labels and depth must be masked."""
+        if picture < len(self._counts) and self._counts[picture]:
+            self._context.enable(moderngl.BLEND)
+            self._array.render_indirect(self._commands, moderngl.TRIANGLES, 1, picture)
+            self._context.disable(moderngl.BLEND)
+
+    def release(self) -> None:
+        for thing in self._held:
+            thing.release()
+        self._held = []
+
+    def _grow(self, room: int) -> None:
+        self.release()
+        self._room = room
+        self._spots, self._commands = (self._context.buffer(reserve=room) for _ in range(2))
+        drawn = programs(self._context, _VERTEX, _FRAGMENT, False).colour
+        content = [(self._spots, "1i4 1f4/i", "person", "tall")]
+        self._array = self._context.vertex_array(drawn, content)
+        self._held = [self._array, self._spots, self._commands]
