@@ -15,8 +15,9 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from physics.ground.mesh import Part, box, disc, frustum, join
-from physics.street.tree_shapes import SPECIES, crown, tree_trunk
+from physics.street.tree_shapes import SPECIES, crown, crown_core, crown_twigs, tree_trunk
 from physics.street.vehicles import vehicle_parts
+from physics.textures.walls import PANE as GLASS
 
 Size = tuple[float, float, float]
 """Length along the street, depth across it, and height, in metres."""
@@ -30,6 +31,7 @@ LIGHT: Final = (0.93, 0.92, 0.85)
 BANDS: Final = (0.90, 0.88, 0.84)
 WHITE: Final = (0.92, 0.92, 0.90)
 _DARK: Final = (0.10, 0.10, 0.11)
+_DISTANCES: Final[tuple[Literal["near", "far"], ...]] = ("near", "far")
 PANE: Final = (0.66, 0.76, 0.80)
 
 
@@ -165,9 +167,20 @@ def park_bench(size: Size) -> tuple[Part, ...]:
 def tree(size: Size, look: int) -> tuple[Part, ...]:
     """Return a tree; `look` selects the species."""
     species = SPECIES[look % len(SPECIES)]
-    leaves = crown(species, size[2])
+    whole = crown(species, size[2])
+    core = crown_core(whole)
     stem = tree_trunk(species, size[2], 0.5 * size[0])
-    return Part(stem, BARK, "bark"), Part(leaves.mesh, None, species.cover, leaves.shade)
+    parts = [
+        Part(stem, BARK, "bark"),
+        Part(whole.mesh, None, species.cover, whole.shade, detail="plain"),
+    ]
+    for distance in _DISTANCES:
+        twigs = crown_twigs(whole, distance)
+        parts.append(Part(core.mesh, None, species.cover, core.shade, detail=distance))
+        parts.append(
+            Part(twigs.mesh, None, species.leaves, twigs.shade, detail=distance, spots=twigs.spots)
+        )
+    return tuple(parts)
 
 
 def planter(size: Size) -> tuple[Part, ...]:
@@ -246,7 +259,7 @@ def shelter(size: Size) -> tuple[Part, ...]:
         )
         for s in (-1, 1)
     ]
-    return Part(join([roof, seat]), None), Part(join(panes), PANE)
+    return Part(join([roof, seat]), None), Part(join(panes), PANE, GLASS)
 
 
 def boxes(size: Size) -> tuple[Part, ...]:

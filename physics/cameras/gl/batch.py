@@ -90,9 +90,10 @@ class BatchDrawing:
         """
         first = 0
         for few in _batches(pictures):
-            self._cast(few, self._arrange(few))
-            self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+            shots = self._arrange(few)
             self._surfaces.bind()
+            self._cast(few, shots)
+            self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self._context.front_face = "cw"  # draw upside down, to read the top row first
             for start, some in self._together(few, target.size):
                 for i in self._draw_some(start, some, target):
@@ -210,6 +211,14 @@ class BatchDrawing:
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
         stage.backdrop.draw()
+        # Glass shows what is behind it; its labels and depth are its own.
+        gl.enable(moderngl.BLEND)
+        target.use_colours()
+        stage.scene.draw_panes(labels=False)
+        gl.disable(moderngl.BLEND)
+        target.use_labels()
+        stage.scene.draw_panes(labels=True)
+        target.use()
 
     def _draw_layers(self, i: int, picture: PictureOrder, layers: Layers) -> None:
         """Draw objects before the sky, and the scan's mesh apart."""

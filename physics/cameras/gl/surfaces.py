@@ -23,7 +23,7 @@ from physics.textures.layers import Layers, join_layers
 from physics.textures.walls import prop_layers, wall_layers
 
 SIZE_PX: Final = 256
-LAYERS_MAX: Final = 72
+LAYERS_MAX: Final = 96
 
 LOOKED_UP: Final = f"""
 layout(binding = {SURFACES_UNIT}) uniform sampler2DArray surfaces;

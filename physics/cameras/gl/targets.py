@@ -36,11 +36,12 @@ class Target:
         self.size = size
         self._colour = context.texture(size, 4)
         self._depth = context.depth_renderbuffer(size)
-        self.frame, self._painted = (
-            context.framebuffer([self._colour], self._depth) for _ in range(2)
+        self.frame, self._painted, self._labelled = (
+            context.framebuffer([self._colour], self._depth) for _ in range(3)
         )
         self._painted.color_mask = (True, True, True, False)
         self._painted.depth_mask = False
+        self._labelled.color_mask = (False, False, False, True)
         on_card = is_card(context) if parts_on_card is None else parts_on_card
         self._parting = _Parting(context, size) if on_card else None
 
@@ -56,6 +57,10 @@ class Target:
     def use_colours(self) -> None:
         """Make it the target of later draws without changing labels and depth."""
         self._painted.use()
+
+    def use_labels(self) -> None:
+        """Make it the target of later draws without changing colours."""
+        self._labelled.use()
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Read colours (H, W, 3) and labels (H, W), the top row first."""
@@ -96,7 +101,7 @@ class Target:
         ).astype(np.float32)
 
     def release(self) -> None:
-        for thing in (self.frame, self._painted, self._colour, self._depth, self._parting):
+        for thing in (self.frame, self._painted, self._labelled, self._colour, self._depth, self._parting):
             if thing is not None:
                 thing.release()
 
