@@ -29,7 +29,7 @@ _SHARPNESS: Final = 16.0
 
 _CORE: Final = 0.66
 """Size of the core behind the twigs, as a fraction of the crown."""
-_TWIGS: Final[Mapping[Literal["near", "far"], tuple[int, float]]] = {"near": (150, 0.46), "far": (56, 0.66)}
+_TWIGS: Final[Mapping[Literal["near", "far"], tuple[int, float]]] = {"near": (110, 0.50), "far": (40, 0.72)}
 """Number of twigs of a crown, and their size as a fraction of the crown's radius."""
 _TWIG_PICTURES: Final = 2
 """Pictures of twigs along each side of a layer of leaves."""

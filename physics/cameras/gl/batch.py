@@ -206,7 +206,9 @@ class BatchDrawing:
         # Paint changes colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
         target.use_colours()
+        gl.enable(moderngl.BLEND)
         stage.scene.draw_paint()
+        gl.disable(moderngl.BLEND)
         target.use()
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="

@@ -80,7 +80,7 @@ void main() {{
     if (cover >= 0.0) {{
         vec3 s = abs(side);
         vec2 where = s.z > max(s.x, s.y) ? spot.xy : s.x > s.y ? spot.yz : spot.xz;
-        vec4 seen = texture(surfaces, vec3(where, cover), -0.75);
+        vec4 seen = texture(surfaces, vec3(where, cover));
         colour *= decoded(seen.rgb);
     }} else if (shines < -0.5) {{
         own = vec3({_LAMPLIGHT}) * side_light.w;

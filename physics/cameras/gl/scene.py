@@ -30,7 +30,13 @@ from physics.cameras.gl.scans import scan_layer, scan_rows, scan_shaders
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import STEP_M
 from physics.cameras.gl.surfaces import TileRows, surfaces
-from physics.cameras.gl.tiles import ground_layer, ground_rows, tile_shaders
+from physics.cameras.gl.tiles import (
+    ground_layer,
+    ground_rows,
+    paint_rows,
+    paint_shaders,
+    tile_shaders,
+)
 from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.dynamics.world import BulletWorld
@@ -115,7 +121,9 @@ class GlScene:
         ground = tile_shaders(context, self._surfaces, light.shadows)
         walls = wall_shaders(context, self._surfaces, light.shadows, light.lamps > 0.0)
         self._ground = ground_layer(context, ground)
-        self._paint = ground_layer(context, ground)
+        self._paint = ground_layer(
+            context, paint_shaders(context, self._surfaces, light.shadows)
+        )
         self._walls = wall_layer(context, walls)
         self._scan = scan_layer(
             context, scan_shaders(context, self._surfaces, light.shadows and not splats, splats)
@@ -316,7 +324,7 @@ class GlScene:
         layers = {
             "scan": scan_rows(scanned, middle),
             "ground": ground_rows(self._surfaces, ground, middle),
-            "paint": ground_rows(self._surfaces, finish.painted, middle),
+            "paint": paint_rows(self._surfaces, finish.painted, finish.decals, middle),
             "walls": wall_rows(self._surfaces, chunk.buildings, finish.styles, middle),
         }
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from typing import Final
 
 import moderngl
+import numpy as np
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
 from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
+from physics.street.decals import Decals
 from physics.street.surface import Patch
 
 _TINTED: Final = 128
@@ -36,16 +38,48 @@ void main() {
 _FRAGMENT: Final = """
 in vec3 at; in vec3 normal; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
 void main() {
-    vec4 seen = texture(surfaces, vec3(spot, layer_label.x), -1.0);
+    vec4 seen = texture(surfaces, vec3(spot, layer_label.x), -0.7);
     vec3 albedo = decoded(seen.rgb) * mix(vec3(1.0), tint, seen.a);
     show_linear(albedo, vec3(0.0), normal, at, layer_label.y);
 }
 """
 
 
+_PAINT_VERTEX: Final = """
+in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
+in vec2 middle; in vec2 middle_in_world;
+out vec3 at; out vec3 normal; out vec2 spot; flat out vec2 layer_opacity;
+void main() {
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    bool decal = in_colour.a == 0.0;
+    at = in_at + vec3(middle, 0.0);
+    normal = unpacked(in_normal);
+    float side = layers[layer].w;
+    spot = decal ? in_colour.rg : fract(middle_in_world / side) + in_at.xy / side;
+    layer_opacity = vec2(layer, decal ? in_colour.b : -1.0);
+    gl_Position = project(at);
+}
+"""
+
+_PAINT_FRAGMENT: Final = """
+in vec3 at; in vec3 normal; in vec2 spot; flat in vec2 layer_opacity;
+void main() {
+    vec4 seen = texture(surfaces, vec3(spot, layer_opacity.x), -0.7);
+    show_linear(decoded(seen.rgb), vec3(0.0), normal, at, 0.0);
+    pixel.a = layer_opacity.y < 0.0 ? 1.0 : seen.a * layer_opacity.y;
+}
+"""
+"""Shader of markings and decals, which are blended by alpha and have no labels."""
+
+
 def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
     """Create the program of the ground of all tiles."""
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
+
+
+def paint_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
+    """Create the program of the markings and decals of all tiles."""
+    return SurfaceShaders(context, surfaces, _PAINT_VERTEX, _PAINT_FRAGMENT, shadows)
 
 
 def ground_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
@@ -60,5 +94,26 @@ def ground_rows(surfaces: Surfaces, patches: Sequence[Patch], middle: Floats) ->
         here = patch.mesh.moved((*-middle, 0.0))
         rows = corners(here, patch.colour, LABELS[patch.label] + (_TINTED if patch.tinted else 0))
         rows["normal"][:, 3] = surfaces.surfaces.index(patch.layer)
+        parts.append((here, rows))
+    return joined_corners(parts) if parts else None
+
+
+def paint_rows(
+    surfaces: Surfaces, patches: Sequence[Patch], decals: Sequence[Decals], middle: Floats
+) -> TileRows | None:
+    """Return markings and decals of one tile, drawn in their order.
+
+    middle: (2,) of the tile, world metres
+    """
+    parts = []
+    for patch in patches:
+        here = patch.mesh.moved((*-middle, 0.0))
+        rows = corners(here, patch.colour, LABELS[patch.label])
+        rows["normal"][:, 3] = surfaces.surfaces.index(patch.layer)
+        parts.append((here, rows))
+    for decal in decals:
+        here = decal.mesh.moved((*-middle, 0.0))
+        rows = corners(here, np.column_stack([decal.spots, decal.opacity]), 0)
+        rows["normal"][:, 3] = surfaces.surfaces.index(decal.layer)
         parts.append((here, rows))
     return joined_corners(parts) if parts else None
