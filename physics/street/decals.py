@@ -56,10 +56,10 @@ _ON_ROADS: Final = (
     _Sort("decal-cover", 26.0, (0.95, 1.05)),
 )
 _ON_SIDEWALKS: Final = (
-    _Sort("decal-dust", 6.0, (0.4, 0.9), (0.3, 0.9)),
+    _Sort("decal-dust", 9.0, (0.4, 0.7), (0.3, 0.9)),
     _Sort("decal-stain", 6.0, (0.3, 0.9), (0.25, 0.7)),
     _Sort("decal-crack", 16.0, (0.3, 0.6), (0.5, 0.9)),
-    _Sort("decal-gum", 4.0, (0.7, 1.2), (0.5, 1.0)),
+    _Sort("decal-gum", 6.0, (0.5, 0.8), (0.5, 1.0)),
     _Sort("decal-leaves", 8.0, (0.6, 1.1)),
     _Sort("decal-litter", 21.0, (0.6, 1.0)),
     _Sort("decal-lid", 30.0, (0.7, 1.1)),

@@ -206,8 +206,11 @@ class BatchDrawing:
         # Paint changes colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
         target.use_colours()
-        gl.enable(moderngl.BLEND)
         stage.scene.draw_paint()
+        gl.enable(moderngl.BLEND)
+        gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
+        stage.scene.draw_decals()
+        gl.blend_func = moderngl.DEFAULT_BLENDING
         gl.disable(moderngl.BLEND)
         target.use()
         gl.polygon_offset = 0.0, 0.0

@@ -31,10 +31,10 @@ from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import STEP_M
 from physics.cameras.gl.surfaces import TileRows, surfaces
 from physics.cameras.gl.tiles import (
+    decal_rows,
+    decal_shaders,
     ground_layer,
     ground_rows,
-    paint_rows,
-    paint_shaders,
     tile_shaders,
 )
 from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
@@ -82,6 +82,7 @@ class _Tile:
     middle: Floats
     ground: TileRows | None
     paint: TileRows | None
+    decals: TileRows | None
     walls: TileRows | None
     scan: TileRows | None
     things: _Placed
@@ -121,9 +122,8 @@ class GlScene:
         ground = tile_shaders(context, self._surfaces, light.shadows)
         walls = wall_shaders(context, self._surfaces, light.shadows, light.lamps > 0.0)
         self._ground = ground_layer(context, ground)
-        self._paint = ground_layer(
-            context, paint_shaders(context, self._surfaces, light.shadows)
-        )
+        self._paint = ground_layer(context, ground)
+        self._decals = ground_layer(context, decal_shaders(context, self._surfaces))
         self._walls = wall_layer(context, walls)
         self._scan = scan_layer(
             context, scan_shaders(context, self._surfaces, light.shadows and not splats, splats)
@@ -184,6 +184,10 @@ class GlScene:
         """Draw road paint after the ground, without labels and depth."""
         self._paint.draw("colour")
 
+    def draw_decals(self) -> None:
+        """Draw pictures on the ground; the blending multiplies colours."""
+        self._decals.draw("colour")
+
     def draw_panes(self, labels: bool) -> None:
         """Draw clear glass over the finished picture: its colours, or its labels and depth."""
         self._seen.draw_panes(labels)
@@ -192,6 +196,7 @@ class GlScene:
         for held in (
             self._ground,
             self._paint,
+            self._decals,
             self._walls,
             self._scan,
             self._seen,
@@ -219,6 +224,7 @@ class GlScene:
         for layer, rows in (
             (self._ground, [tile.ground for tile in tiles]),
             (self._paint, [tile.paint for tile in tiles]),
+            (self._decals, [tile.decals for tile in tiles]),
             (self._walls, [tile.walls for tile in tiles]),
             (self._scan, [tile.scan for tile in tiles]),
         ):
@@ -240,7 +246,7 @@ class GlScene:
         self._seen_for = None
         self._still_for = None
         self._lit_for = []
-        for layer in (self._ground, self._paint, self._walls, self._scan):
+        for layer in (self._ground, self._paint, self._decals, self._walls, self._scan):
             layer.place(anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
         self._stands = _joined([*placed, _at(self._obstacles, self._obstacle_xy, anchor)])
@@ -262,7 +268,7 @@ class GlScene:
         form, things = self._stands
         form = np.where(away > _NEAR_M, self._far, form)
         self._seen.set(*_joined([(form[rows], things[rows]), self._lit]))
-        for layer in (self._ground, self._paint, self._walls, self._scan):
+        for layer in (self._ground, self._paint, self._decals, self._walls, self._scan):
             layer.show("colour", tiles.nonzero()[0])
 
     def _stand(self, middle: Floats, anchor: Floats) -> None:
@@ -285,14 +291,15 @@ class GlScene:
         pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
         forms = [self._form(*form) for form in words.forms] + [(pole, pole)] * len(words.posts)
         near, far = np.array(forms, dtype=np.intp).reshape(-1, 2).T
-        ground, paint, walls, scan = (
+        ground, paint, decals, walls, scan = (
             (held[name], held[f"{name}_triangles"]) if name in held else None
-            for name in ("ground", "paint", "walls", "scan")
+            for name in ("ground", "paint", "decals", "walls", "scan")
         )
         return _Tile(
             _middle(key),
             ground,
             paint,
+            decals,
             walls,
             scan,
             (near, held["things"]),
@@ -324,7 +331,8 @@ class GlScene:
         layers = {
             "scan": scan_rows(scanned, middle),
             "ground": ground_rows(self._surfaces, ground, middle),
-            "paint": paint_rows(self._surfaces, finish.painted, finish.decals, middle),
+            "paint": ground_rows(self._surfaces, finish.painted, middle),
+            "decals": decal_rows(self._surfaces, finish.decals, middle),
             "walls": wall_rows(self._surfaces, chunk.buildings, finish.styles, middle),
         }
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)

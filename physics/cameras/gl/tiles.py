@@ -45,31 +45,26 @@ void main() {
 """
 
 
-_PAINT_VERTEX: Final = """
+_DECAL_VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
-in vec2 middle; in vec2 middle_in_world;
-out vec3 at; out vec3 normal; out vec2 spot; flat out vec2 layer_opacity;
+in vec2 middle;
+out vec3 spot; flat out float opacity;
 void main() {
-    int layer = int(in_normal.w * 255.0 + 0.5);
-    bool decal = in_colour.a == 0.0;
-    at = in_at + vec3(middle, 0.0);
-    normal = unpacked(in_normal);
-    float side = layers[layer].w;
-    spot = decal ? in_colour.rg : fract(middle_in_world / side) + in_at.xy / side;
-    layer_opacity = vec2(layer, decal ? in_colour.b : -1.0);
-    gl_Position = project(at);
+    spot = vec3(in_colour.rg, int(in_normal.w * 255.0 + 0.5));
+    opacity = in_colour.b;
+    gl_Position = project(in_at + vec3(middle, 0.0));
 }
 """
 
-_PAINT_FRAGMENT: Final = """
-in vec3 at; in vec3 normal; in vec2 spot; flat in vec2 layer_opacity;
+_DECAL_FRAGMENT: Final = """
+in vec3 spot; flat in float opacity;
 void main() {
-    vec4 seen = texture(surfaces, vec3(spot, layer_opacity.x), -0.7);
-    show_linear(decoded(seen.rgb), vec3(0.0), normal, at, 0.0);
-    pixel.a = layer_opacity.y < 0.0 ? 1.0 : seen.a * layer_opacity.y;
+    vec4 seen = texture(surfaces, spot, -0.7);
+    float far = 1.0 / gl_FragCoord.w;
+    pixel = vec4(mix(vec3(0.5), seen.rgb, seen.a * opacity * clamp(1.3 - 0.03 * far, 0.0, 1.0)), 0.0);
 }
 """
-"""Shader of markings and decals, which are blended by alpha and have no labels."""
+"""Shader of decals, which multiply the colours of the lit ground by twice their own."""
 
 
 def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
@@ -77,9 +72,9 @@ def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 
 
-def paint_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
-    """Create the program of the markings and decals of all tiles."""
-    return SurfaceShaders(context, surfaces, _PAINT_VERTEX, _PAINT_FRAGMENT, shadows)
+def decal_shaders(context: moderngl.Context, surfaces: Surfaces) -> SurfaceShaders:
+    """Create the program of the decals of all tiles."""
+    return SurfaceShaders(context, surfaces, _DECAL_VERTEX, _DECAL_FRAGMENT, shadows=False)
 
 
 def ground_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
@@ -98,19 +93,9 @@ def ground_rows(surfaces: Surfaces, patches: Sequence[Patch], middle: Floats) ->
     return joined_corners(parts) if parts else None
 
 
-def paint_rows(
-    surfaces: Surfaces, patches: Sequence[Patch], decals: Sequence[Decals], middle: Floats
-) -> TileRows | None:
-    """Return markings and decals of one tile, drawn in their order.
-
-    middle: (2,) of the tile, world metres
-    """
+def decal_rows(surfaces: Surfaces, decals: Sequence[Decals], middle: Floats) -> TileRows | None:
+    """Return decals of one tile, drawn in their order. middle: (2,) of the tile, world metres."""
     parts = []
-    for patch in patches:
-        here = patch.mesh.moved((*-middle, 0.0))
-        rows = corners(here, patch.colour, LABELS[patch.label])
-        rows["normal"][:, 3] = surfaces.surfaces.index(patch.layer)
-        parts.append((here, rows))
     for decal in decals:
         here = decal.mesh.moved((*-middle, 0.0))
         rows = corners(here, np.column_stack([decal.spots, decal.opacity]), 0)
