@@ -27,10 +27,14 @@ _SHARPNESS: Final = 16.0
 """Exponent of the power mean that joins the clumps; larger values give deeper creases."""
 
 
-_CORE: Final = 0.66
+_CORE: Final = 0.70
 """Size of the core behind the twigs, as a fraction of the crown."""
-_TWIGS: Final[Mapping[Literal["near", "far"], tuple[int, float]]] = {"near": (110, 0.50), "far": (40, 0.72)}
+Distance = Literal["near", "far"]
+"""Distance at which a crown is drawn with its own number of twigs."""
+TREE_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (88, 0.50), "far": (32, 0.72)}
 """Number of twigs of a crown, and their size as a fraction of the crown's radius."""
+SHRUB_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (60, 0.42), "far": (16, 0.8)}
+"""The same of a shrub."""
 _TWIG_PICTURES: Final = 2
 """Pictures of twigs along each side of a layer of leaves."""
 
@@ -132,9 +136,11 @@ def crown_core(whole: Crown) -> Crown:
     return Crown(mesh, 0.42 * whole.shade)
 
 
-def crown_twigs(whole: Crown, distance: Literal["near", "far"]) -> Twigs:
-    """Return the twigs of a crown for a distance; their number and size depend on it."""
-    count, share = _TWIGS[distance]
+def crown_twigs(whole: Crown, count: int, share: float) -> Twigs:
+    """Return the twigs of a crown.
+
+    share: size of a twig as a fraction of the crown's radius
+    """
     at = whole.mesh.vertices
     low, high = at.min(axis=0), at.max(axis=0)
     middle = 0.5 * (low + high)

@@ -205,25 +205,23 @@ class BatchDrawing:
         self._draw_pass(i, stage, "colour")
         # Paint changes colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
-        target.use_colours()
-        stage.scene.draw_paint()
-        gl.enable(moderngl.BLEND)
-        gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
-        stage.scene.draw_decals()
-        gl.blend_func = moderngl.DEFAULT_BLENDING
-        gl.disable(moderngl.BLEND)
-        target.use()
+        with target.only("colours"):
+            stage.scene.draw_paint()
+            gl.enable(moderngl.BLEND)
+            gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
+            stage.scene.draw_decals()
+            gl.blend_func = moderngl.DEFAULT_BLENDING
+            gl.disable(moderngl.BLEND)
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
         stage.backdrop.draw()
         # Glass shows what is behind it; its labels and depth are its own.
         gl.enable(moderngl.BLEND)
-        target.use_colours()
-        stage.scene.draw_panes(labels=False)
+        with target.only("colours"):
+            stage.scene.draw_panes(labels=False)
         gl.disable(moderngl.BLEND)
-        target.use_labels()
-        stage.scene.draw_panes(labels=True)
-        target.use()
+        with target.only("labels"):
+            stage.scene.draw_panes(labels=True)
 
     def _draw_layers(self, i: int, picture: PictureOrder, layers: Layers) -> None:
         """Draw objects before the sky, and the scan's mesh apart."""

@@ -100,7 +100,9 @@ void main() {
     int layer = int(in_normal.w * 255.0 + 0.5);
     shade = in_colour.r;
     spot = vec3(in_colour.gb, layer);
-    albedo_label = vec4(tint_of(thing_paint.rgb, layer), thing_paint.a * 255.0);
+    vec3 tint = tint_of(thing_paint.rgb, layer);
+    tint = mix(vec3(dot(tint, vec3(0.35, 0.55, 0.10))), tint, 0.72);
+    albedo_label = vec4(tint, thing_paint.a * 255.0);
     gl_Position = project(at);
 }
 """

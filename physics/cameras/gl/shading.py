@@ -136,11 +136,10 @@ float sunlit(vec3 at, vec3 normal) {
 }
 
 vec3 on_screen(vec3 light) {
-    // Narkowicz's fit of the ACES curve, then sRGB to a level or two.
-    vec3 x = light * sun_light.w;
-    x = min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0);
-    vec3 s = sqrt(x);
-    return s * (1.1366 - 0.1366 * s);
+    // The ACES curve (Narkowicz's fit) in sRGB, which reaches white at 1.96, as a polynomial of
+    // the root of light: to two levels below 0.8, without a division.
+    vec3 s = min(sqrt(light * sun_light.w), 1.4);
+    return s * (0.1725 + s * (6.1673 + s * (-11.3129 + s * (7.7517 - s * 1.8716))));
 }
 
 float fogged() {
