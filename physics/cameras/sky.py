@@ -196,7 +196,9 @@ def _assembled(
     # Metered light: by day on the ground of a street, at night also on the sky over it.
     bright = float((up + direct + 0.5 * horizon) @ LUMINANCE)
     below = float((over + _IN_SUN * direct) @ LUMINANCE)
-    metered = [key * max(one, 1e-5) ** -_ADAPTED for key, one in ((_GROUND_KEY, below), (_KEY, bright))]
+    metered = [
+        key * max(one, 1e-5) ** -_ADAPTED for key, one in ((_GROUND_KEY, below), (_KEY, bright))
+    ]
     exposure = 2.0**light.exposure_ev * (metered[0] + lamps * (metered[1] - metered[0]))
     whole += np.where(above, glare, 0.0).astype(np.float32)
     for array in (sun, beam, ambient, whole, horizon):

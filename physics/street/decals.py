@@ -50,17 +50,17 @@ class _Sort(NamedTuple):
 
 _ON_ROADS: Final = (
     _Sort("decal-repair", 19.0, (0.5, 1.15), (0.7, 1.0)),
-    _Sort("decal-dust", 9.0, (0.7, 1.2), (0.3, 0.8)),
+    _Sort("decal-dust", 20.0, (0.5, 0.9), (0.3, 0.8)),
     _Sort("decal-crack", 10.0, (0.5, 0.95), (0.6, 1.0)),
-    _Sort("decal-stain", 7.0, (0.5, 1.5), (0.4, 0.9)),
+    _Sort("decal-stain", 12.0, (0.5, 1.2), (0.4, 0.9)),
     _Sort("decal-cover", 26.0, (0.95, 1.05)),
 )
 _ON_SIDEWALKS: Final = (
-    _Sort("decal-dust", 9.0, (0.4, 0.7), (0.3, 0.9)),
-    _Sort("decal-stain", 6.0, (0.3, 0.9), (0.25, 0.7)),
+    _Sort("decal-dust", 20.0, (0.3, 0.5), (0.3, 0.9)),
+    _Sort("decal-stain", 11.0, (0.3, 0.7), (0.25, 0.7)),
     _Sort("decal-crack", 16.0, (0.3, 0.6), (0.5, 0.9)),
-    _Sort("decal-gum", 6.0, (0.5, 0.8), (0.5, 1.0)),
-    _Sort("decal-leaves", 8.0, (0.6, 1.1)),
+    _Sort("decal-gum", 9.0, (0.45, 0.7), (0.5, 1.0)),
+    _Sort("decal-leaves", 11.0, (0.5, 0.9)),
     _Sort("decal-litter", 21.0, (0.6, 1.0)),
     _Sort("decal-lid", 30.0, (0.7, 1.1)),
 )
@@ -129,7 +129,9 @@ def _laid(layer: str, quads: Sequence[_Quad], tile: Tile) -> Decals:
     """Return quads at the height of the ground."""
     xy = np.concatenate([quad.corners for quad in quads])
     first = 4 * np.arange(len(quads))[:, None]
-    triangles = np.concatenate([first + (0, 1, 2), first + (0, 2, 3)]).astype(np.int32)
+    triangles = np.concatenate([first + np.array((0, 1, 2)), first + np.array((0, 2, 3))]).astype(
+        np.int32
+    )
     up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
     mesh = Mesh(np.column_stack([xy, tile.height(xy) + _LIFT_M]), up, triangles)
     corner = np.array([(0.0, 1.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.0)])
@@ -207,4 +209,3 @@ def _grass_edges(strip: Strip) -> Iterator[_Quad]:
             half = 0.5 * np.array([1.02 * long_m, wide_m])
             turn = 0.0 if side > 0.0 else np.pi
             yield _Quad("decal-tufts", _rectangle(place, aside_m, half, turn), 1.0)
-

@@ -280,7 +280,7 @@ def shelter(size: Size) -> tuple[Part, ...]:
     front, back = 0.03 - 0.5 * depth, 0.5 * depth - 0.03
     ends = [s * 0.5 * (length - 0.06) for s in (-1, 1)]
     posts = [(x, y) for x in ends for y in (front, back)]
-    posts += [(x, back) for x in (-length / 6.0, length / 6.0)]
+    posts.append((0.0, back))
     frame = [
         box((0.06, 0.06, h - 0.05), (x, y, 0.5 * h - 0.025), skip=("top", "bottom"))
         for x, y in posts

@@ -169,7 +169,7 @@ def crown_twigs(whole: Crown, count: int, share: float) -> Twigs:
     normals = cards - middle + 0.3 * (high - low) * out[:, None]
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     first = 4 * np.arange(count)[:, None]
-    front = np.concatenate([first + (0, 1, 2), first + (0, 2, 3)])
+    front = np.concatenate([first + np.array((0, 1, 2)), first + np.array((0, 2, 3))])
     triangles = np.concatenate([front, front[:, ::-1]]).astype(np.int32)
     mesh = Mesh(cards.reshape(-1, 3), normals.reshape(-1, 3), triangles)
     return Twigs(mesh, np.clip(shade, 0.0, 1.0).ravel(), spots.reshape(-1, 2))

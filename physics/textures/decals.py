@@ -82,9 +82,7 @@ def _drain(noise: Noise) -> Picture:
     """Draw the grate of a drain with dark slots."""
     x, y = _plane(noise)
     edge = np.maximum(np.abs(x), np.abs(y))
-    slot = smooth_step(0.15, 0.35, np.cos(np.pi * 8.0 * x)) * (
-        1.0 - smooth_step(0.76, 0.80, edge)
-    )
+    slot = smooth_step(0.15, 0.35, np.cos(np.pi * 8.0 * x)) * (1.0 - smooth_step(0.76, 0.80, edge))
     slot *= smooth_step(0.04, 0.07, np.abs(y))
     rgb = plain_colour(noise, (0.34, 0.32, 0.30), 0.03, 0.03)
     rgb = blend_colours(rgb, (0.04, 0.04, 0.04), slot)
@@ -156,9 +154,7 @@ def _gum(noise: Noise) -> Picture:
 def _ellipse(size: int, middle: Field, axes: Field, turn_deg: float) -> Field:
     mask = np.zeros((size, size), np.uint8)
     centre, half = np.rint(16.0 * middle).astype(int), np.rint(16.0 * axes).astype(int)
-    cv2.ellipse(
-        mask, centre.tolist(), half.tolist(), turn_deg, 0.0, 360.0, 255, -1, cv2.LINE_AA, 4
-    )
+    cv2.ellipse(mask, centre.tolist(), half.tolist(), turn_deg, 0.0, 360.0, 255, -1, cv2.LINE_AA, 4)
     return mask.astype(np.float32) / 255.0
 
 

@@ -74,9 +74,7 @@ def lettering(
 def poster(canvas: FacadeCanvas, x0: float, z0: float, wide_m: float, high_m: float) -> None:
     """Draw a printed poster: a picture of simple shapes, a word and lines of text."""
     rng = canvas.rng
-    paper, ink, block = (
-        _PRINTS[k] for k in rng.choice(len(_PRINTS), 3, replace=False).tolist()
-    )
+    paper, ink, block = (_PRINTS[k] for k in rng.choice(len(_PRINTS), 3, replace=False).tolist())
     x1, z1 = x0 + wide_m, z0 + high_m
     canvas.shade(x0 - 0.01, x1 + 0.015, z0 - 0.015, z1, 0.35)
     canvas.box(x0, x1, z0, z1, paper)
@@ -136,4 +134,4 @@ def _leaf(x_px: float, y_px: float, long_px: float, turn_rad: float) -> np.ndarr
     along = np.array([np.cos(turn_rad), np.sin(turn_rad)]) * long_px
     aside = 0.6 * np.array([-along[1], along[0]])
     middle = np.array([x_px, y_px])
-    return np.rint(16.0 * (middle + [along, aside, -along, -aside])).astype(np.int32)
+    return np.rint(16.0 * (middle + np.array([along, aside, -along, -aside]))).astype(np.int32)

@@ -399,9 +399,7 @@ def _foliage(light: Colour, dark: Colour, leaf: int) -> Generator:
     return make
 
 
-def _twigs(
-    light: Colour, dark: Colour, leaves: int, long_px: float, wide: float
-) -> Generator:
+def _twigs(light: Colour, dark: Colour, leaves: int, long_px: float, wide: float) -> Generator:
     """Return a generator of 2 x 2 pictures of twigs, cut out between the leaves by alpha.
 
     light, dark: sRGB colours of leaves

@@ -196,9 +196,7 @@ class Forms:
         """Return the programs of a material. shadows: they apply shadow maps."""
         if (material, shadows) not in self._programs:
             vertex, fragment, cut_out = _SHADERS[material]
-            made = programs(
-                self._context, KNOWN + vertex, LOOKED_UP + fragment, shadows, cut_out
-            )
+            made = programs(self._context, KNOWN + vertex, LOOKED_UP + fragment, shadows, cut_out)
             for uniform in made.uniforms("layers"):
                 if uniform is not None:
                     uniform.write(self._surfaces.known)

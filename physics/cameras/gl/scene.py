@@ -31,6 +31,7 @@ from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import STEP_M
 from physics.cameras.gl.surfaces import TileRows, surfaces
 from physics.cameras.gl.tiles import (
+    DECALS_M,
     decal_rows,
     decal_shaders,
     ground_layer,
@@ -268,8 +269,11 @@ class GlScene:
         form, things = self._stands
         form = np.where(away > _NEAR_M, self._far, form)
         self._seen.set(*_joined([(form[rows], things[rows]), self._lit]))
-        for layer in (self._ground, self._paint, self._decals, self._walls, self._scan):
+        for layer in (self._ground, self._paint, self._walls, self._scan):
             layer.show("colour", tiles.nonzero()[0])
+        x, y = np.multiply(cell, _CELL_M).tolist()
+        near = [tile_distance(key, x, y) < DECALS_M + _SLACK_M for key in self._keys]
+        self._decals.show("colour", (tiles & np.array(near)).nonzero()[0])
 
     def _stand(self, middle: Floats, anchor: Floats) -> None:
         """Prepare the shadow casters in the square around `middle`, visible or not."""

@@ -38,12 +38,15 @@ void main() {
 _FRAGMENT: Final = """
 in vec3 at; in vec3 normal; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
 void main() {
-    vec4 seen = texture(surfaces, vec3(spot, layer_label.x), -0.7);
+    vec4 seen = texture(surfaces, vec3(spot, layer_label.x), -0.6);
     vec3 albedo = decoded(seen.rgb) * mix(vec3(1.0), tint, seen.a);
     show_linear(albedo, vec3(0.0), normal, at, layer_label.y);
 }
 """
 
+
+DECALS_M: Final = 18.0
+"""Distance at which decals have faded out, metres."""
 
 _DECAL_VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
@@ -56,13 +59,13 @@ void main() {
 }
 """
 
-_DECAL_FRAGMENT: Final = """
+_DECAL_FRAGMENT: Final = f"""
 in vec3 spot; flat in float opacity;
-void main() {
+void main() {{
     vec4 seen = texture(surfaces, spot, -0.7);
-    float far = 1.0 / gl_FragCoord.w;
-    pixel = vec4(mix(vec3(0.5), seen.rgb, seen.a * opacity * clamp(1.3 - 0.03 * far, 0.0, 1.0)), 0.0);
-}
+    float near = clamp(2.0 - 2.0 / (gl_FragCoord.w * {DECALS_M}), 0.0, 1.0);
+    pixel = vec4(mix(vec3(0.5), seen.rgb, seen.a * opacity * near), 0.0);
+}}
 """
 """Shader of decals, which multiply the colours of the lit ground by twice their own."""
 
