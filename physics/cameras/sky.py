@@ -6,6 +6,8 @@ draws
     L = albedo * (ambient(n) + sun_colour * max(0, n . sun) * lit)
     L = mix(fog_colour, L, exp(-fog_per_m * distance))
     pixel = sRGB(filmic(L * exposure))
+
+By day exposure is metered on the ground of a street.
 """
 
 from __future__ import annotations

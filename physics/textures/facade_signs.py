@@ -6,6 +6,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
 from physics.textures.layers import Colour, srgb_to_linear
@@ -129,9 +130,10 @@ def climber(canvas: FacadeCanvas, x_m: float, wide_m: float, high_m: float) -> N
         canvas.fill(whole, cover, np.float32(tone) * srgb_to_linear(colour))
 
 
-def _leaf(x_px: float, y_px: float, long_px: float, turn_rad: float) -> np.ndarray:
+def _leaf(x_px: float, y_px: float, long_px: float, turn_rad: float) -> NDArray[np.int32]:
     """Return the outline of a leaf in sixteenths of a pixel."""
     along = np.array([np.cos(turn_rad), np.sin(turn_rad)]) * long_px
     aside = 0.6 * np.array([-along[1], along[0]])
     middle = np.array([x_px, y_px])
-    return np.rint(16.0 * (middle + np.array([along, aside, -along, -aside]))).astype(np.int32)
+    corners = middle + np.array([along, aside, -along, -aside])
+    return np.asarray(np.rint(16.0 * corners), dtype=np.int32)

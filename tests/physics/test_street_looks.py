@@ -63,12 +63,12 @@ def test_twigs_stay_above_heads_and_within_the_crown() -> None:
                 assert twigs.cover in CUT_OUT and twigs.spots is not None
                 assert crown.min() - 1e-9 <= twigs.mesh.vertices[:, 2].min()
                 assert twigs.mesh.vertices[:, 2].max() <= crown.max() + 1e-9
-                assert 0.0 <= twigs.spots.min() and twigs.spots.max() <= 1.0
+                assert twigs.spots.min() >= 0.0 and twigs.spots.max() <= 1.0
                 counts.append(len(twigs.mesh))
             assert crown.min() > 2.1 and counts[0] > counts[1]
     layers = prop_layers(256)
     shares = [(layers.rgba[layers.index(name), ..., 3] > 115).mean() for name in CUT_OUT]
-    assert 0.25 < min(shares) and max(shares) < 0.75
+    assert min(shares) > 0.25 and max(shares) < 0.75
 
 
 def test_decals_lie_on_roads_and_sidewalks(world: BulletWorld) -> None:
@@ -81,7 +81,7 @@ def test_decals_lie_on_roads_and_sidewalks(world: BulletWorld) -> None:
         for decal in surface.finish(key).decals:
             at = decal.mesh.vertices
             assert np.allclose(at[:, 2] - surface.heights(at[:, :2]), 0.004, atol=0.002)
-            assert 0.0 <= decal.opacity.min() and decal.opacity.max() <= 1.0
+            assert decal.opacity.min() >= 0.0 and decal.opacity.max() <= 1.0
             found.add(decal.layer)
     assert len(found) >= 6 and found <= set(decal_layers(256).names)
 
