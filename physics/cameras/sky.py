@@ -6,6 +6,8 @@ draws
     L = albedo * (ambient(n) + sun_colour * max(0, n . sun) * lit)
     L = mix(fog_colour, L, exp(-fog_per_m * distance))
     pixel = sRGB(filmic(L * exposure))
+
+By day exposure is metered on the ground of a street.
 """
 
 from __future__ import annotations
@@ -51,6 +53,10 @@ _ADAPTED: Final = 0.85
 darkness.
 """
 _KEY: Final = 0.85
+_GROUND_KEY: Final = 0.68
+"""Brightness of the ground by day, where exposure is metered on the lower half of a picture."""
+_IN_SUN: Final = 0.5
+"""Share of the ground of a street that the sun reaches, for metering."""
 _LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 """Light of a lamp-lit street at night, some 28 lx."""
 _NIGHT: Final = 2.2e-4 * np.array([0.62, 0.72, 1.0])
@@ -178,16 +184,13 @@ def _assembled(
     ground = GROUND_ALBEDO * (up + beam * max(float(sun[2]), 0.0))
     horizon = _horizon(sky, len(sky) // 2)
     near = np.exp(-np.maximum(-ways[..., 2:], 0.0) / HORIZON_FADE)
-    below = sky if light.hdri else ground + (horizon - ground) * near
-    whole = np.where(above, sky, below).astype(np.float32)
+    floor = sky if light.hdri else ground + (horizon - ground) * near
+    whole = np.where(above, sky, floor).astype(np.float32)
     compass = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0])
     side = (
         np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0)
         + 0.7 * lamps * _LAMPS
     )
-    # Metered light: a bright ground, and some of the sky over the street.
-    bright = float((up + beam * max(float(sun[2]), 0.0) + 0.5 * horizon) @ LUMINANCE)
-    exposure = _KEY * 2.0**light.exposure_ev * max(bright, 1e-5) ** -_ADAPTED
     glare = _disc(ways, sun, beam)
     over = (
         up
@@ -195,6 +198,14 @@ def _assembled(
         else (1.0 - HOUSES) * up + HOUSES * HOUSE_ALBEDO * (side + _on_walls(sun, beam))
     )
     ambient = np.stack([over, side, ground])
+    direct = beam * max(float(sun[2]), 0.0)
+    # Metered light: by day on the ground of a street, at night also on the sky over it.
+    bright = float((up + direct + 0.5 * horizon) @ LUMINANCE)
+    below = float((over + _IN_SUN * direct) @ LUMINANCE)
+    metered = [
+        key * max(one, 1e-5) ** -_ADAPTED for key, one in ((_GROUND_KEY, below), (_KEY, bright))
+    ]
+    exposure = 2.0**light.exposure_ev * (metered[0] + lamps * (metered[1] - metered[0]))
     whole += np.where(above, glare, 0.0).astype(np.float32)
     for array in (sun, beam, ambient, whole, horizon):
         array.flags.writeable = False

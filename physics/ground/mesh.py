@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -68,6 +68,15 @@ class Mesh:
         return Mesh((self.vertices - pivot) @ turn.T + pivot, self.normals @ turn.T, self.triangles)
 
 
+Detail = Literal["always", "plain", "near", "far"]
+"""Cameras and distances that show a part.
+
+always: every camera at every distance
+plain: cameras without textures, and exports
+near, far: cameras with textures, at short or long distance
+"""
+
+
 class Part(NamedTuple):
     """A mesh with one colour.
 
@@ -76,6 +85,8 @@ class Part(NamedTuple):
         ""; only cameras with textures show it
     shade: (V,) fraction of light that reaches each vertex
     glows: True if the part emits its colour as light
+    detail: cameras and distances that show the part
+    spots: (V, 2) texture coordinates from 0 to 1, for layers with cut-outs
     """
 
     mesh: Mesh
@@ -83,6 +94,13 @@ class Part(NamedTuple):
     cover: str = ""
     shade: Floats | None = None
     glows: bool = False
+    detail: Detail = "always"
+    spots: Floats | None = None
+
+
+def parts_seen(parts: Sequence[Part], detail: Detail) -> tuple[Part, ...]:
+    """Return the parts that one kind of camera or distance shows."""
+    return tuple(part for part in parts if part.detail in ("always", detail))
 
 
 _idle_rows: list[list[float]] = []

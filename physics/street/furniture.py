@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, OBSTACLE_VARIANTS, Obstacle, ObstacleKind
-from physics.ground.mesh import Part
+from physics.ground.mesh import Detail, Part, parts_seen
 from physics.street import furniture_shapes as shapes
 from physics.street import obstacle_shapes
 from physics.street.furniture_shapes import METAL, WOOD, Size, Solid
@@ -337,14 +337,15 @@ def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.objec
 
 
 @cache
-def parts_of(kind: str, variant: int, look: int = 0) -> tuple[Part, ...]:
+def parts_of(kind: str, variant: int, look: int = 0, detail: Detail = "plain") -> tuple[Part, ...]:
     """Return the drawn parts of a prop.
 
     look: paint index for kinds that are `grown`, else 0
+    detail: camera and distance; "plain" is without textures
     """
     entry = KINDS[kind]
     size = entry.size_m(variant)
-    return entry.parts(size, look) if entry.grown else entry.parts(size)
+    return parts_seen(entry.parts(size, look) if entry.grown else entry.parts(size), detail)
 
 
 @cache

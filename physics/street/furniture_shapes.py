@@ -15,8 +15,18 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from physics.ground.mesh import Part, box, disc, frustum, join
-from physics.street.tree_shapes import SPECIES, crown, tree_trunk
+from physics.street.tree_shapes import (
+    SHRUB_TWIGS,
+    SPECIES,
+    TREE_TWIGS,
+    Crown,
+    crown,
+    crown_core,
+    crown_twigs,
+    tree_trunk,
+)
 from physics.street.vehicles import vehicle_parts
+from physics.textures.walls import PANE as GLASS
 
 Size = tuple[float, float, float]
 """Length along the street, depth across it, and height, in metres."""
@@ -162,19 +172,40 @@ def park_bench(size: Size) -> tuple[Part, ...]:
     return Part(join(slats), None, "planks"), Part(join(legs), METAL)
 
 
-def tree(size: Size, look: int) -> tuple[Part, ...]:
-    """Return a tree; `look` selects the species."""
-    species = SPECIES[look % len(SPECIES)]
-    leaves = crown(species, size[2])
+def tree(size: Size, paint: int) -> tuple[Part, ...]:
+    """Return a tree; `paint` selects the species."""
+    species = SPECIES[paint % len(SPECIES)]
+    whole = crown(species, size[2])
+    core = crown_core(whole)
     stem = tree_trunk(species, size[2], 0.5 * size[0])
-    return Part(stem, BARK, "bark"), Part(leaves.mesh, None, species.cover, leaves.shade)
+    parts = [
+        Part(stem, BARK, "bark"),
+        Part(whole.mesh, None, species.cover, whole.shade, detail="plain"),
+    ]
+    for distance, look in TREE_TWIGS.items():
+        twigs = crown_twigs(whole, *look)
+        parts.append(Part(core.mesh, None, species.cover, core.shade, detail=distance))
+        parts.append(
+            Part(twigs.mesh, None, species.leaves, twigs.shade, detail=distance, spots=twigs.spots)
+        )
+    return tuple(parts)
 
 
 def planter(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     tub = box((length, depth, 0.55 * h), (0.0, 0.0, 0.275 * h), skip=("bottom",))
     wide, narrow = (0.46 * length, 0.46 * depth), (0.3 * length, 0.25 * depth)
-    return Part(tub, _STONE, "stone"), Part(frustum(wide, narrow, 0.55 * h, h, 8), None, "hedge")
+    shrub = frustum(wide, narrow, 0.55 * h, h, 8)
+    shade = np.interp(shrub.vertices[:, 2], (0.55 * h, h), (0.6, 1.0))
+    parts = [Part(tub, _STONE, "stone"), Part(shrub, None, "hedge", detail="plain")]
+    core = crown_core(Crown(shrub, shade))
+    for distance, look in SHRUB_TWIGS.items():
+        twigs = crown_twigs(Crown(shrub, shade), *look)
+        parts.append(Part(core.mesh, None, "hedge", core.shade, detail=distance))
+        parts.append(
+            Part(twigs.mesh, None, "leaves-small", twigs.shade, detail=distance, spots=twigs.spots)
+        )
+    return tuple(parts)
 
 
 def bollard(size: Size) -> tuple[Part, ...]:
@@ -246,7 +277,20 @@ def shelter(size: Size) -> tuple[Part, ...]:
         )
         for s in (-1, 1)
     ]
-    return Part(join([roof, seat]), None), Part(join(panes), PANE)
+    front, back = 0.03 - 0.5 * depth, 0.5 * depth - 0.03
+    ends = [s * 0.5 * (length - 0.06) for s in (-1, 1)]
+    posts = [(x, y) for x in ends for y in (front, back)]
+    posts.append((0.0, back))
+    frame = [
+        box((0.06, 0.06, h - 0.05), (x, y, 0.5 * h - 0.025), skip=("top", "bottom"))
+        for x, y in posts
+    ]
+    rail = box((length, 0.05, 0.05), (0.0, back, 0.22), skip=("front", "back", "bottom"))
+    return (
+        Part(join([roof, seat]), None),
+        Part(join([*frame, rail]), METAL),
+        Part(join(panes), PANE, GLASS),
+    )
 
 
 def boxes(size: Size) -> tuple[Part, ...]:

@@ -21,6 +21,7 @@ from physics.ground.tiles import Key, Tile, build_tile, surface_look, tile_indic
 from physics.street.building_style import wall_style_of
 from physics.street.buildings import Building, BuildingRows, with_foundation
 from physics.street.covers import frontage_covers, land_covers
+from physics.street.decals import tile_decals
 from physics.street.furniture import Prop
 from physics.street.mapped import MappedObjects
 from physics.street.paint import tile_markings
@@ -129,7 +130,8 @@ class StreetSurface(PlaceSurface):
                 )
             )
         styles = [wall_style_of(building, self.street_map) for building in self.buildings(key)]
-        return TexturedDetails(tuple(laid), tuple(painted), tuple(styles))
+        decals = tile_decals(self.street_map, tile, self.seed)
+        return TexturedDetails(tuple(laid), tuple(painted), tuple(styles), decals)
 
     def tile(self, key: Key) -> Tile:
         """Return the ground of a tile from the cache, or build it."""

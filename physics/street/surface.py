@@ -25,6 +25,7 @@ from cosim.spec.obstacle import Obstacle
 from physics.ground.mesh import Mesh
 from physics.ground.tiles import Key
 from physics.street.buildings import Building
+from physics.street.decals import Decals
 from physics.street.furniture import Prop, obstacle_prop
 from physics.street.props import SignalPost
 from physics.textures.facades import WallStyle
@@ -85,11 +86,13 @@ class TexturedDetails:
     laid: thin covers, drawn before the ground under them
     painted: markings that change colours only
     styles: style of each building of the chunk
+    decals: pictures on the ground that change colours only, drawn after the markings
     """
 
     laid: tuple[Patch, ...] = ()
     painted: tuple[Patch, ...] = ()
     styles: tuple[WallStyle, ...] = ()
+    decals: tuple[Decals, ...] = ()
 
 
 class Surface(ABC):

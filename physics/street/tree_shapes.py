@@ -1,15 +1,17 @@
-"""Tree models: a tapered trunk with branches, and a crown as one closed surface.
+"""Tree models: a tapered trunk with branches, and a crown as one closed surface or as twigs.
 
-The crown is the outer envelope of several spheres as seen from its centre. Hidden parts of the
-spheres cost no triangles. Every camera draws the same opaque solid, so labels need no transparency.
+The surface is the outer envelope of several spheres as seen from its centre. Hidden parts of the
+spheres cost no triangles. Cameras with textures draw twigs on that surface around a dark core.
+A twig is a card with the picture of a few dozen leaves, which is cut out between them.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
 
 import numpy as np
 
@@ -25,6 +27,18 @@ _SHARPNESS: Final = 16.0
 """Exponent of the power mean that joins the clumps; larger values give deeper creases."""
 
 
+_CORE: Final = 0.70
+"""Size of the core behind the twigs, as a fraction of the crown."""
+Distance = Literal["near", "far"]
+"""Distance at which a crown is drawn with its own number of twigs."""
+TREE_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (88, 0.50), "far": (32, 0.72)}
+"""Number of twigs of a crown, and their size as a fraction of the crown's radius."""
+SHRUB_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (60, 0.42), "far": (16, 0.8)}
+"""The same of a shrub."""
+_TWIG_PICTURES: Final = 2
+"""Pictures of twigs along each side of a layer of leaves."""
+
+
 @dataclass(frozen=True, slots=True)
 class Species:
     """Growth parameters of a tree species. The representation seeds the crown's shape.
@@ -34,7 +48,8 @@ class Species:
     full: relative height of the widest part of the crown, 0 to 1
     clumps: number of spheres
     loose: radius of the spheres as a fraction of the crown's
-    cover: layer of `physics.textures.walls`
+    cover: layer of `physics.textures.walls` for the closed surface
+    leaves: layer of twigs
     """
 
     clear: float
@@ -43,13 +58,14 @@ class Species:
     clumps: int
     loose: float
     cover: str
+    leaves: str = field(repr=False)
 
 
 SPECIES: Final = (
-    Species(0.36, 0.245, 0.42, 9, 0.50, "foliage"),
-    Species(0.40, 0.215, 0.45, 8, 0.46, "foliage"),
-    Species(0.33, 0.165, 0.36, 8, 0.50, "foliage-dark"),
-    Species(0.42, 0.250, 0.55, 7, 0.55, "foliage"),
+    Species(0.36, 0.245, 0.42, 9, 0.50, "foliage", "leaves"),
+    Species(0.40, 0.215, 0.45, 8, 0.46, "foliage", "leaves-long"),
+    Species(0.33, 0.165, 0.36, 8, 0.50, "foliage-dark", "leaves-small"),
+    Species(0.42, 0.250, 0.55, 7, 0.55, "foliage", "leaves"),
 )
 """A spreading tree, an oval tree, a narrow dark tree and an umbrella-shaped tree."""
 
@@ -95,6 +111,83 @@ def crown(species: Species, height_m: float) -> Crown:
     crease = np.clip((reach / near - 0.66) / 0.34, 0.0, 1.0)
     shade = (0.50 + 0.50 * up**0.8) * (0.55 + 0.45 * crease)
     return Crown(Mesh(at, smooth_normals(at, triangles), triangles), shade)
+
+
+@dataclass(frozen=True, slots=True)
+class Twigs:
+    """Cards around the core of a crown.
+
+    mesh: cards with both sides; normals point away from the crown's middle
+    shade: (V,) fraction of light that reaches each vertex
+    spots: (V, 2) texture coordinates
+    """
+
+    mesh: Mesh
+    shade: Floats
+    spots: Floats
+
+
+def crown_core(whole: Crown) -> Crown:
+    """Return a smaller and darker crown that fills the gaps between twigs."""
+    at = whole.mesh.vertices
+    middle = 0.5 * (at.min(axis=0) + at.max(axis=0))
+    inner = middle + _CORE * (at - middle)
+    mesh = Mesh(inner, whole.mesh.normals, whole.mesh.triangles)
+    return Crown(mesh, 0.42 * whole.shade)
+
+
+def crown_twigs(whole: Crown, count: int, share: float) -> Twigs:
+    """Return the twigs of a crown.
+
+    share: size of a twig as a fraction of the crown's radius
+    """
+    at = whole.mesh.vertices
+    low, high = at.min(axis=0), at.max(axis=0)
+    middle = 0.5 * (low + high)
+    rng = np.random.default_rng([len(at), count, zlib.crc32(np.round(at, 3).tobytes())])
+    foot, out = _spread_over(whole.mesh, count, rng)
+    depth = rng.uniform(0.62, 0.97, count) ** 0.7
+    centre = middle + depth[:, None] * (foot - middle)
+    half = 0.5 * share * 0.5 * float((high - low)[:2].mean()) * rng.uniform(0.8, 1.25, count)
+    # Twigs lean out of the crown, turned about any axis, so that none is seen edge-on everywhere.
+    facing = out + rng.normal(0.0, 0.75, (count, 3))
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    along = np.cross(facing, rng.normal(0.0, 1.0, (count, 3)))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(facing, along)
+    corner = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+    cards = centre[:, None] + half[:, None, None] * (
+        corner[None, :, :1] * along[:, None] + corner[None, :, 1:] * across[:, None]
+    )
+    cards[..., 2] = np.clip(cards[..., 2], low[2], high[2])
+    up = (cards[..., 2] - low[2]) / (high[2] - low[2])
+    inner = np.linalg.norm(cards - middle, axis=2) / np.linalg.norm(foot - middle, axis=1)[:, None]
+    shade = (0.48 + 0.52 * up) * (0.45 + 0.55 * np.clip((inner - 0.45) / 0.5, 0.0, 1.0))
+    shade *= rng.uniform(0.78, 1.0, count)[:, None]
+    picture = rng.integers(0, _TWIG_PICTURES, (count, 1, 2))
+    spots = (picture + 0.5 + 0.49 * corner) / _TWIG_PICTURES
+    normals = cards - middle + 0.3 * (high - low) * out[:, None]
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    first = 4 * np.arange(count)[:, None]
+    front = np.concatenate([first + np.array((0, 1, 2)), first + np.array((0, 2, 3))])
+    triangles = np.concatenate([front, front[:, ::-1]]).astype(np.int32)
+    mesh = Mesh(cards.reshape(-1, 3), normals.reshape(-1, 3), triangles)
+    return Twigs(mesh, np.clip(shade, 0.0, 1.0).ravel(), spots.reshape(-1, 2))
+
+
+def _spread_over(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return (N, 3) points spread evenly over a surface, and its normals there."""
+    corners = mesh.vertices[mesh.triangles]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    ends = np.cumsum(area)
+    which = np.searchsorted(ends, (np.arange(count) + rng.random(count)) / count * ends[-1])
+    which = np.minimum(which, len(area) - 1)
+    share = rng.dirichlet((1.0, 1.0, 1.0), count)[:, :, None]
+    normals = (share * mesh.normals[mesh.triangles[which]]).sum(axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return (share * corners[which]).sum(axis=1), normals
 
 
 def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:

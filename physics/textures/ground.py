@@ -25,10 +25,13 @@ from physics.textures.surface import (
     random_courses,
     relief_shading,
     scale_brightness,
+    sharpen,
 )
 
 _GRASS_TINT: Final = 0.3
 """Fraction of the tint in grass, which keeps most of its own green."""
+_CRISP: Final = 0.7
+"""Gain of the fine detail of the ground."""
 _GREY: Final = ((0.57, 0.56, 0.54), (0.55, 0.54, 0.51), (0.59, 0.58, 0.56))
 _WORN: Final = (*_GREY, (0.52, 0.51, 0.48))
 _RED: Final = ((0.55, 0.39, 0.33), (0.51, 0.36, 0.31), (0.58, 0.42, 0.35), (0.48, 0.35, 0.31))
@@ -39,7 +42,18 @@ _DARK: Final = (0.36, 0.35, 0.34)
 @lru_cache(maxsize=4)
 def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Return every ground layer; 256 pixels suit a laptop."""
-    return stack_layers("ground", GROUND_RECIPES, size_px, seed)
+    crisp = {name: Recipe(one.metres, _crisp(one.make)) for name, one in GROUND_RECIPES.items()}
+    return stack_layers("ground", crisp, size_px, seed)
+
+
+def _crisp(make: Generator) -> Generator:
+    """Return a generator with more contrast in fine detail, which filters of pictures lose."""
+
+    def crisp(noise: Noise) -> Picture:
+        plain = make(noise)
+        return Picture(sharpen(np.asarray(plain.rgb, np.float32), _CRISP), plain.alpha)
+
+    return crisp
 
 
 def _asphalt(
@@ -302,10 +316,10 @@ def _cast(noise: Noise) -> Picture:
 
 
 GROUND_RECIPES: Final[Mapping[str, Recipe]] = {
-    "asphalt": Recipe(3.0, _asphalt(0.050)),
-    "asphalt-worn": Recipe(4.0, _asphalt(0.055, 0.37, worn=1.0)),
-    "asphalt-patched": Recipe(6.0, _asphalt(0.050, 0.35, worn=0.6, patches=True)),
-    "asphalt-fine": Recipe(2.0, _asphalt(0.035, 0.40)),
+    "asphalt": Recipe(3.0, _asphalt(0.065, 0.40)),
+    "asphalt-worn": Recipe(4.0, _asphalt(0.070, 0.44, worn=1.0)),
+    "asphalt-patched": Recipe(6.0, _asphalt(0.065, 0.42, worn=0.6, patches=True)),
+    "asphalt-fine": Recipe(2.0, _asphalt(0.050, 0.45)),
     "concrete-cast": Recipe(3.0, _cast),
     "slabs-square": _stones(2.0, _rows(5, [0.4]), _GREY, _DARK, joint_m=0.007, spread=0.035),
     "slabs-running": _stones(

@@ -19,6 +19,7 @@ from physics.textures.facade_canvas import (
     sill,
     surround,
 )
+from physics.textures.facade_signs import SHOP_WORDS, climber, lettering, poster, scrawl
 from physics.textures.layers import Colour, srgb_to_linear
 from physics.textures.noise import smooth_step
 
@@ -119,19 +120,15 @@ def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -
 
 
 def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -> None:
-    """Draw a sign board across the bay with an abstract mark instead of letters."""
+    """Draw a sign board across the bay, mostly with a word."""
     canvas.box(0.0, BAY_M, z0, z1, colour)
     canvas.box(0.0, BAY_M, z1 - 0.05, z1, scaled(colour, 1.3))
     canvas.shade(0.0, BAY_M, z0 - 0.12, z0, 0.4, 0.12)
-    if canvas.rng.random() < 0.75:
-        mark = (0.82, 0.79, 0.70) if sum(colour) < 1.5 else (0.26, 0.25, 0.24)
-        x, end = canvas.rng.uniform(0.7, 1.0), canvas.rng.uniform(2.0, 2.3)
-        middle = 0.5 * (z0 + z1)
-        while x < end:
-            wide = canvas.rng.uniform(0.05, 0.13)
-            tall = canvas.rng.choice([0.07, 0.07, 0.10])
-            canvas.box(x, x + wide, middle - 0.07, middle - 0.07 + 2 * tall * 0.9, mark, 0.85)
-            x += wide + canvas.rng.choice([0.035, 0.035, 0.12])
+    if canvas.rng.random() < 0.8:
+        mark = (0.88, 0.85, 0.76) if sum(colour) < 1.5 else (0.22, 0.21, 0.20)
+        word = SHOP_WORDS[int(canvas.rng.integers(len(SHOP_WORDS)))]
+        x = canvas.rng.uniform(1.1, 1.9)
+        lettering(canvas, x, z0 + 0.2 * (z1 - z0), 0.62 * (z1 - z0), word, mark, 1.9)
 
 
 def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
@@ -142,6 +139,8 @@ def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
     canvas.box(0.1, right, 0.08, 0.45, scaled(colour, 1.12))
     canvas.shade(0.1, right, 0.42, 0.45, 0.4)
     _display(canvas, 0.1, right, 0.5, 2.45)
+    if canvas.rng.random() < 0.6:
+        poster(canvas, canvas.rng.uniform(0.2, right - 0.6), 0.6, 0.36, 0.5)
     for x in np.linspace(0.1, right, 2 if not door else 1, endpoint=False)[1:]:
         canvas.box(float(x) - 0.03, float(x) + 0.03, 0.5, 2.45, colour)
     canvas.frame(0.1, right, 0.46, 2.49, 0.04, scaled(colour, 1.25))
@@ -232,6 +231,11 @@ def _home(canvas: FacadeCanvas) -> None:
         for x in np.arange(x0 + 0.1, x1, 0.13):
             canvas.box(float(x) - 0.01, float(x) + 0.01, 1.02, 2.42, (0.14, 0.14, 0.15))
         canvas.box(x0, x1, 1.7, 1.72, (0.14, 0.14, 0.15))
+    if canvas.number == 1:
+        climber(canvas, 0.45, 0.85, 2.5)
+    elif canvas.number == 2:
+        climber(canvas, 2.55, 0.9, 1.3)
+        climber(canvas, 0.4, 0.8, 0.9)
 
 
 def _garage(canvas: FacadeCanvas) -> None:
@@ -248,6 +252,8 @@ def _garage(canvas: FacadeCanvas) -> None:
         srgb_to_linear(colour) * np.broadcast_to(ribs, cover.shape)[..., None].astype(np.float32),
     )
     canvas.box(1.42, 1.58, 0.9, 0.95, (0.20, 0.20, 0.21))
+    if canvas.number == 1:
+        scrawl(canvas, 0.5, 2.3, 0.7, 1.7)
     canvas.shade(0.22, 2.78, 2.1, 2.5, 0.55, 0.4)
 
 
@@ -266,6 +272,13 @@ def _lobby(canvas: FacadeCanvas) -> None:
 
 def _blank(canvas: FacadeCanvas) -> None:
     _plinth(canvas)
+    if canvas.number == 0:
+        for x in (0.65, 1.32):
+            poster(canvas, x, 0.95, 0.6, 0.85)
+    elif canvas.number == 1:
+        scrawl(canvas, 0.6, 2.4, 0.5, 1.5)
+    else:
+        climber(canvas, 1.6, 1.5, 2.9)
     if canvas.rng.random() < 0.5:
         canvas.box(2.2, 2.7, 0.5, 1.1, (0.55, 0.55, 0.54))
         canvas.frame(2.2, 2.7, 0.5, 1.1, 0.025, (0.44, 0.44, 0.44))

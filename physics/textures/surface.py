@@ -219,6 +219,13 @@ def add_water_streaks(rgb: Rgb, noise: Noise, depth: float) -> Rgb:
     return np.asarray(rgb * (1.0 - np.float32(depth) * runs[..., None]), dtype=np.float32)
 
 
+def sharpen(rgb: Rgb, amount: float, soft_px: float = 2.0) -> Rgb:
+    """Raise the contrast of details smaller than about `soft_px` pixels of a 256 px texture."""
+    sigma = soft_px * len(rgb) / 256.0
+    soft = np.stack([blur_field(np.ascontiguousarray(rgb[..., c]), sigma) for c in range(3)], -1)
+    return np.asarray(rgb + np.float32(amount) * (rgb - soft), dtype=np.float32)
+
+
 def scale_brightness(rgb: Rgb, factor: Field) -> Rgb:
     """Multiply an image by (S, S) factors."""
     return np.asarray(rgb * factor[..., None], dtype=np.float32)

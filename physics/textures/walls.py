@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Final
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stack_layers
 from physics.textures.noise import Field, Noise, blur_field, cells, pixel_centres, smooth_step
@@ -397,6 +399,53 @@ def _foliage(light: Colour, dark: Colour, leaf: int) -> Generator:
     return make
 
 
+def _twigs(light: Colour, dark: Colour, leaves: int, long_px: float, wide: float) -> Generator:
+    """Return a generator of 2 x 2 pictures of twigs, cut out between the leaves by alpha.
+
+    light, dark: sRGB colours of leaves
+    leaves: number of leaves of a twig
+    long_px: length of a leaf in pixels of a 256 px texture
+    wide: width of a leaf as a fraction of its length
+    """
+
+    def make(noise: Noise) -> Picture:
+        rng, half = noise.rng, noise.size // 2
+        mean = 0.5 * (np.asarray(light) + np.asarray(dark))
+        rgb = np.tile(mean.astype(np.float32), (noise.size, noise.size, 1))
+        alpha = np.zeros((noise.size, noise.size), np.float32)
+        for corner in ((0, 0), (0, half), (half, 0), (half, half)):
+            area = slice(corner[0], corner[0] + half), slice(corner[1], corner[1] + half)
+            scale = noise.size / 256.0
+            colour, cover = rgb[area].copy(), np.zeros((half, half), np.float32)
+            for k in range(leaves):
+                tone = np.float32((k + 0.5) / leaves * 0.7 + 0.3 * rng.random())
+                hue = np.asarray(dark) + (np.asarray(light) - np.asarray(dark)) * tone
+                leaf = _leaf(rng, half, scale * long_px, wide)
+                mask = np.zeros((half, half), np.uint8)
+                cv2.fillPoly(mask, [np.rint(16.0 * leaf).astype(np.int32)], 255, cv2.LINE_AA, 4)
+                share = mask.astype(np.float32) / 255.0
+                colour = blend_colours(colour, hue.astype(np.float32)[None, None], share)
+                cover = np.maximum(cover, share)
+            rgb[area], alpha[area] = colour, cover
+        return Picture(rgb * (1.0 + 0.08 * noise.grain(1.0))[..., None], alpha)
+
+    return make
+
+
+def _leaf(
+    rng: np.random.Generator, side_px: int, long_px: float, wide: float
+) -> NDArray[np.floating]:
+    """Return the (8, 2) outline of a leaf on a round twig, in pixels."""
+    reach = 0.5 * side_px - 0.62 * long_px
+    turn, away = rng.uniform(0.0, 2.0 * np.pi), reach * np.sqrt(rng.random())
+    middle = 0.5 * side_px + away * np.array([np.cos(turn), np.sin(turn)])
+    way = turn + rng.normal(0.0, 0.9)
+    at = np.array([-0.5, -0.25, 0.05, 0.3, 0.5, 0.3, 0.05, -0.25])
+    off = np.array([0.0, 0.42, 0.5, 0.3, 0.0, -0.3, -0.5, -0.42]) * wide * rng.uniform(0.6, 1.0)
+    turned = np.array([[np.cos(way), np.sin(way)], [-np.sin(way), np.cos(way)]])
+    return np.asarray(middle + long_px * rng.uniform(0.75, 1.15) * np.stack([at, off], 1) @ turned)
+
+
 def _brushed(noise: Noise) -> Picture:
     tone: Field = 1.0 + 0.015 * noise.streaks(256, 64, 1) + 0.01 * noise.clouds(4)
     return Picture(scale_brightness(plain_colour(noise, (0.62, 0.63, 0.64), 0.01, 0.006), tone))
@@ -453,6 +502,9 @@ PROPS: Final[Mapping[str, Recipe]] = {
     "foliage-dark": Recipe(1.5, _foliage((0.30, 0.41, 0.22), (0.07, 0.11, 0.06), 22)),
     "foliage-autumn": Recipe(1.5, _foliage((0.62, 0.45, 0.20), (0.18, 0.12, 0.06), 22)),
     "hedge": Recipe(1.0, _foliage((0.36, 0.47, 0.23), (0.08, 0.12, 0.06), 32)),
+    "leaves": Recipe(1.5, _twigs((0.46, 0.56, 0.26), (0.18, 0.25, 0.10), 74, 20.0, 0.62)),
+    "leaves-long": Recipe(1.5, _twigs((0.44, 0.55, 0.27), (0.16, 0.23, 0.10), 90, 24.0, 0.34)),
+    "leaves-small": Recipe(1.5, _twigs((0.36, 0.47, 0.26), (0.12, 0.18, 0.09), 130, 14.0, 0.60)),
     "planks": _boards(0.6, 0.1, upright=False, colour=(0.55, 0.41, 0.28)),
     "metal-brushed": Recipe(0.5, _brushed),
     "metal-painted": Recipe(1.0, _painted),
@@ -462,3 +514,8 @@ PROPS: Final[Mapping[str, Recipe]] = {
     ),
 }
 """Recipe of every prop layer by name."""
+
+PANE: Final = "pane"
+"""Cover of clear glass, which is no layer."""
+CUT_OUT: Final = ("leaves", "leaves-long", "leaves-small")
+"""Prop layers whose alpha is the visible fraction of the surface, not the fraction of tint."""

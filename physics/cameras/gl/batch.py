@@ -95,9 +95,10 @@ class BatchDrawing:
         """
         first = 0
         for few in _batches(pictures):
-            self._cast(few, self._arrange(few))
-            self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+            shots = self._arrange(few)
             self._surfaces.bind()
+            self._cast(few, shots)
+            self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self._context.front_face = "cw"  # draw upside down, to read the top row first
             for start, some in self._together(few, target.size):
                 for i in self._draw_some(start, some, target):
@@ -211,13 +212,24 @@ class BatchDrawing:
         self._draw_pass(i, stage, "colour")
         # Paint and the shade at feet change colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
-        target.use_colours()
-        stage.scene.draw_paint()
-        self._crowd.draw_contact(i)
-        target.use()
+        with target.only("colours"):
+            stage.scene.draw_paint()
+            gl.enable(moderngl.BLEND)
+            gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
+            stage.scene.draw_decals()
+            gl.blend_func = moderngl.DEFAULT_BLENDING
+            gl.disable(moderngl.BLEND)
+            self._crowd.draw_contact(i)
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
         stage.backdrop.draw()
+        # Glass shows what is behind it; its labels and depth are its own.
+        gl.enable(moderngl.BLEND)
+        with target.only("colours"):
+            stage.scene.draw_panes(labels=False)
+        gl.disable(moderngl.BLEND)
+        with target.only("labels"):
+            stage.scene.draw_panes(labels=True)
 
     def _draw_layers(self, i: int, picture: PictureOrder, layers: Layers) -> None:
         """Draw objects before the sky, and the scan's mesh apart."""

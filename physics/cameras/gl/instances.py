@@ -3,12 +3,18 @@
 A form is a mesh with the colours of its parts.
 An instance is a form with a position, rotation and paint.
 All forms are in one buffer, and the counts of a draw in another (multi-draw indirect).
+
+The triangles of a form are grouped by material, and each material has a program:
+
+solid      opaque surfaces
+cut-out    leaves: texels of low alpha are discarded, also from shadow maps
+pane       clear glass, blended over the finished picture; it casts no shadow
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
-from typing import Final
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Final, Literal
 
 import moderngl
 import numpy as np
@@ -18,6 +24,7 @@ from physics.cameras.gl.corners import LAYOUT, CornerRows, corners, joined_corne
 from physics.cameras.gl.shading import Pass, Programs, programs
 from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.ground.mesh import Part
+from physics.textures.walls import CUT_OUT, PANE
 
 INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 4)])
 """at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, with the label as fourth
@@ -31,6 +38,9 @@ _GLOW = 128
 
 If the colour is the instance's, rgb is the share of light that reaches the corner.
 """
+Material = Literal["solid", "cut-out", "pane"]
+MATERIALS: Final[tuple[Material, ...]] = ("solid", "cut-out", "pane")
+"""Groups of triangles, each with a program."""
 _BARE = 255
 _LAMP = 254
 """Fourth channel of a corner's normal besides surface layers: no surface, or emissive at night."""
@@ -79,25 +89,99 @@ void main() {{
 }}
 """
 
+_CUT_VERTEX: Final = """
+in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
+in vec3 thing_at; in vec4 thing_turn; in vec4 thing_paint;
+out vec3 at; out vec3 normal; out vec3 spot; flat out vec4 albedo_label; out float shade;
+vec3 turned(vec3 v) { return v + 2.0 * cross(thing_turn.xyz, cross(thing_turn.xyz, v) + thing_turn.w * v); }
+void main() {
+    at = thing_at + turned(in_at);
+    normal = turned(unpacked(in_normal));
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    shade = in_colour.r;
+    spot = vec3(in_colour.gb, layer);
+    vec3 tint = tint_of(thing_paint.rgb, layer);
+    tint = mix(vec3(dot(tint, vec3(0.35, 0.55, 0.10))), tint, 0.72);
+    albedo_label = vec4(tint, thing_paint.a * 255.0);
+    gl_Position = project(at);
+}
+"""
+
+_CUT: Final = """
+in vec3 spot;
+vec4 leaf() {
+    vec4 seen = texture(surfaces, spot, -1.25);
+    if (seen.a < 0.45) discard;
+    return seen;
+}
+"""
+
+_CUT_FRAGMENT: Final = f"""{_CUT}
+in vec3 at; in vec3 normal; flat in vec4 albedo_label; in float shade;
+void main() {{
+    vec3 colour = albedo_label.rgb * decoded(leaf().rgb) * shade;
+    // Leaves let light through, so the side away from the sun is lit, too.
+    show_linear(colour, vec3(0.0), normalize(normal + 0.6 * sun.xyz), at, albedo_label.a);
+}}
+"""
+
+_CUT_SHADOW: Final = f"{LOOKED_UP}{_CUT}void main() {{ leaf(); }}\n"
+
+_PANE_FRAGMENT: Final = """
+in vec3 at; in vec3 normal; in vec3 albedo; flat in float label;
+void main() {
+    vec3 n = normalize(normal), ray = normalize(at - eye.xyz);
+    float facing = abs(dot(n, ray));
+    float mirror = 0.06 + 0.74 * pow(1.0 - facing, 4.0);
+    vec3 up = reflect(ray, n);
+    vec3 seen = mix(side_light.rgb * 0.45, fog.rgb * 1.2, smoothstep(-0.05, 0.35, up.z));
+    float dirt = 0.10;
+    float share = mirror + dirt - mirror * dirt;
+    vec3 light = (side_light.rgb + 0.4 * sun_light.rgb * max(dot(n, sun.xyz), 0.0)) * albedo;
+    pixel = vec4(on_screen(mix(light, seen, mirror / share)), share);
+}
+"""
+_PANE_LABEL: Final = """
+out vec4 pixel;
+flat in float label;
+void main() { pixel = vec4(0.0, 0.0, 0.0, label / 255.0); }
+"""
+
+
+_SHADERS: Final[Mapping[Material, tuple[str, str, str]]] = {
+    "solid": (_VERTEX, _FRAGMENT, ""),
+    "cut-out": (_CUT_VERTEX, _CUT_FRAGMENT, _CUT_SHADOW),
+    "pane": (_VERTEX, _PANE_FRAGMENT, _PANE_LABEL),
+}
+"""Vertex shader and two fragment shaders of each material.
+
+The second one draws into shadow maps; a pane's draws labels instead.
+"""
+
 
 class Forms:
-    """Registry of all forms by key, in one vertex and one index buffer; a new key extends it."""
+    """Registry of all forms by key, in one vertex and one index buffer; a new key extends it.
+
+    draws: (F, M, 3) count, first index and first corner of each form's materials
+    """
 
     def __init__(
         self,
         context: moderngl.Context,
         surfaces: Surfaces,
-        programs_of: dict[bool, Programs] | None = None,
+        programs_of: dict[tuple[Material, bool], Programs] | None = None,
     ) -> None:
         self._context = context
         self._surfaces = surfaces
-        self._programs: dict[bool, Programs] = {} if programs_of is None else programs_of
+        self._programs: dict[tuple[Material, bool], Programs] = (
+            {} if programs_of is None else programs_of
+        )
         self._corners: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._ids: dict[Hashable, int] = {}
-        self._starts: list[tuple[int, int, int]] = []
+        self._starts: list[list[tuple[int, int, int]]] = []
         self.rank = np.zeros(0, dtype=np.int64)
-        self.draws = np.zeros((0, 3), dtype=np.uint32)
+        self.draws = np.zeros((0, len(MATERIALS), 3), dtype=np.uint32)
         self.version = 0
         self._held = -1
         self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
@@ -108,16 +192,16 @@ class Forms:
         """
         return Forms(self._context, self._surfaces, self._programs)
 
-    def programs(self, shadows: bool) -> Programs:
-        """Return the programs of all forms. shadows: they apply shadow maps."""
-        if shadows not in self._programs:
-            self._programs[shadows] = made = programs(
-                self._context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows
-            )
+    def programs(self, material: Material, shadows: bool) -> Programs:
+        """Return the programs of a material. shadows: they apply shadow maps."""
+        if (material, shadows) not in self._programs:
+            vertex, fragment, cut_out = _SHADERS[material]
+            made = programs(self._context, KNOWN + vertex, LOOKED_UP + fragment, shadows, cut_out)
             for uniform in made.uniforms("layers"):
                 if uniform is not None:
                     uniform.write(self._surfaces.known)
-        return self._programs[shadows]
+            self._programs[material, shadows] = made
+        return self._programs[material, shadows]
 
     def id(self, key: Hashable, parts: Callable[[], Sequence[Part]]) -> int:
         """Return the number of a form. A new key calls `parts` to create the form."""
@@ -126,12 +210,17 @@ class Forms:
         return self._ids[key]
 
     def _add(self, key: Hashable, parts: Sequence[Part]) -> None:
-        rows, indices = joined_corners([(part.mesh, self._rows(part)) for part in parts])
-        first, base = sum(map(len, self._indices)), sum(map(len, self._corners))
-        self._corners.append(rows)
-        self._indices.append(indices)
         self._ids[key] = len(self._ids)
-        self._starts.append((len(self._indices[-1]), first, base))
+        starts = []
+        for material in MATERIALS:
+            first, base = sum(map(len, self._indices)), sum(map(len, self._corners))
+            own = [(p.mesh, self._rows(p)) for p in parts if _material_of(p) == material]
+            if own:
+                rows, indices = joined_corners(own)
+                self._corners.append(rows)
+                self._indices.append(indices)
+            starts.append((len(self._indices[-1]) if own else 0, first, base))
+        self._starts.append(starts)
         by_name = sorted(self._ids, key=repr)  # order independent of insertion
         self.rank = np.zeros(len(by_name), dtype=np.int64)
         self.rank[[self._ids[name] for name in by_name]] = np.arange(len(by_name))
@@ -141,12 +230,11 @@ class Forms:
     def _rows(self, part: Part) -> CornerRows:
         shade = np.ones(len(part.mesh.vertices)) if part.shade is None else part.shade
         colour = np.tile(part.colour, (len(shade), 1)) if part.colour else np.ones((len(shade), 3))
-        rows = corners(
-            part.mesh,
-            colour * shade[:, None],
-            _GLOW if part.glows else _OWN if part.colour else _PAINT,
-        )
-        named = {"": _BARE, "lamp": _LAMP}
+        colour = colour * shade[:, None]
+        if part.spots is not None:
+            colour[:, 1:] = part.spots
+        rows = corners(part.mesh, colour, _GLOW if part.glows else _OWN if part.colour else _PAINT)
+        named = {"": _BARE, "lamp": _LAMP, PANE: _BARE}
         rows["normal"][:, 3] = (
             named[part.cover] if part.cover in named else self._surfaces.surfaces.index(part.cover)
         )
@@ -170,6 +258,10 @@ class Forms:
         self._buffers = None
 
 
+def _material_of(part: Part) -> Material:
+    return "pane" if part.cover == PANE else "cut-out" if part.cover in CUT_OUT else "solid"
+
+
 class Things:
     """Set of instances in runs of one form each, replaced as a whole. One call draws all runs."""
 
@@ -180,8 +272,8 @@ class Things:
         self._room = 0
         self._instances: moderngl.Buffer | None = None
         self._commands: moderngl.Buffer | None = None
-        self._arrays: dict[bool, list[moderngl.VertexArray]] = {}
-        self._ends = [0, 0]
+        self._arrays: dict[tuple[Material, bool], list[moderngl.VertexArray]] = {}
+        self._ends: dict[Material, list[int]] = {material: [0, 0] for material in MATERIALS}
 
     def set(
         self,
@@ -196,39 +288,56 @@ class Things:
         rows: (N,) rows of INSTANCE
         part: (N,) index of the part, below `parts`
         """
+        self._ends = {material: [0] * (parts + 1) for material in MATERIALS}
         if not len(form):
-            self._ends = [0] * (parts + 1)
             return
         rank = self._forms.rank
         kinds = len(self._forms.rank)
         order, key, commands = runs_of(rank[form] if part is None else rank[form] + kinds * part)
         draws = self._forms.draws[form[order[commands[:, 4]]]]
-        commands[:, 0], commands[:, 2:4] = draws[:, 0], draws[:, 1:]
-        self._ends = key.searchsorted(kinds * np.arange(parts + 1)).tolist()
+        limits = kinds * np.arange(parts + 1)
+        runs: list[NDArray[np.uint32]] = []
+        for k, material in enumerate(MATERIALS):
+            drawn = draws[:, k, 0] > 0
+            own = commands[drawn]
+            own[:, 0], own[:, 2:4] = draws[drawn, k, 0], draws[drawn, k, 1:]
+            ends = sum(map(len, runs)) + key[drawn].searchsorted(limits)
+            self._ends[material] = ends.tolist()
+            runs.append(own)
         if len(form) > self._room:
             self._make_room(2 * len(form))
         assert self._instances is not None and self._commands is not None
         self._instances.write(rows[order])
-        self._commands.write(commands)
+        self._commands.write(np.concatenate(runs))
 
     def draw(self, stage: Pass, shadows: bool, part: int = 0) -> None:
-        """Draw one part. shadows: it is shaded by shadow maps."""
-        first = self._ends[part]
-        count = self._ends[part + 1] - self._ends[part]
+        """Draw solid and cut-out surfaces of one part. shadows: shaded by shadow maps."""
+        self._draw("solid", stage != "colour", shadows, part)
+        self._draw("cut-out", stage != "colour", shadows, part)
+
+    def draw_panes(self, labels: bool) -> None:
+        """Draw the panes of the first part over the picture: their colours, or their labels."""
+        self._draw("pane", labels, False, 0)
+
+    def _draw(self, material: Material, second: bool, shadows: bool, part: int) -> None:
+        """Draw a material with its first or second program."""
+        first = self._ends[material][part]
+        count = self._ends[material][part + 1] - first
         if count:
-            if self._bound != self._forms.version or shadows not in self._arrays:
-                self._bind(shadows)
+            if self._bound != self._forms.version or (material, shadows) not in self._arrays:
+                self._bind(material, shadows)
             assert self._commands is not None
-            array = self._arrays[shadows][stage != "colour"]
+            array = self._arrays[material, shadows][second]
             array.render_indirect(self._commands, moderngl.TRIANGLES, count=count, first=first)
 
     def _make_room(self, count: int) -> None:
         self._drop()
         self._room = max(64, count)
         self._instances = self._context.buffer(reserve=self._room * INSTANCE.itemsize, dynamic=True)
-        self._commands = self._context.buffer(reserve=self._room * 20, dynamic=True)
+        size = self._room * len(MATERIALS) * 20
+        self._commands = self._context.buffer(reserve=size, dynamic=True)
 
-    def _bind(self, shadows: bool) -> None:
+    def _bind(self, material: Material, shadows: bool) -> None:
         at_corners, triangles = self._forms.buffers()
         if self._bound != self._forms.version:
             self._unbind()
@@ -236,9 +345,9 @@ class Things:
             (at_corners, *LAYOUT),
             (self._instances, "3f 4f 4f1 /i", "thing_at", "thing_turn", "thing_paint"),
         ]
-        self._arrays[shadows] = [
+        self._arrays[material, shadows] = [
             self._context.vertex_array(program, content, triangles, skip_errors=True)
-            for program in self._forms.programs(shadows)
+            for program in self._forms.programs(material, shadows)
         ]
         self._bound = self._forms.version
 
@@ -258,7 +367,7 @@ class Things:
     def release(self) -> None:
         self._drop()
         self._room = 0
-        self._ends = [0, 0]
+        self._ends = {material: [0, 0] for material in MATERIALS}
 
 
 def runs_of(key: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.uint32]]:

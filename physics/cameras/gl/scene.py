@@ -30,11 +30,18 @@ from physics.cameras.gl.scans import scan_layer, scan_rows, scan_shaders
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import STEP_M
 from physics.cameras.gl.surfaces import TileRows, surfaces
-from physics.cameras.gl.tiles import ground_layer, ground_rows, tile_shaders
+from physics.cameras.gl.tiles import (
+    DECALS_M,
+    decal_rows,
+    decal_shaders,
+    ground_layer,
+    ground_rows,
+    tile_shaders,
+)
 from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.dynamics.world import BulletWorld
-from physics.ground.mesh import Part
+from physics.ground.mesh import Detail, Part
 from physics.ground.tiles import (
     Key,
     tile_bounds,
@@ -50,6 +57,9 @@ _CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
 _SLACK_M: Final = _CELL_M * math.sqrt(0.5)
 """Maximum distance of an eye from the middle of its cell, metres."""
+_NEAR_M: Final = 16.0
+"""Distance within which objects have all their details, metres."""
+_DETAILS: Final[tuple[Detail, ...]] = ("near", "far")
 _TILE_REACH_M: Final = 34.0
 """Maximum distance of a tile's content from its middle, including objects over its border,
 metres.
@@ -65,6 +75,7 @@ class _Tile:
     """Content of a tile; its rows are relative to its middle.
 
     middle: (2,) world metres
+    far: (N,) forms of its objects at a distance
     thing_xy: (N, 2) positions of its objects
     seen_m: (N,) drawing distances of its objects
     """
@@ -72,9 +83,11 @@ class _Tile:
     middle: Floats
     ground: TileRows | None
     paint: TileRows | None
+    decals: TileRows | None
     walls: TileRows | None
     scan: TileRows | None
     things: _Placed
+    far: NDArray[np.intp]
     thing_xy: Floats
     seen_m: Floats
     posts: list[props.SignalPost]
@@ -111,6 +124,7 @@ class GlScene:
         walls = wall_shaders(context, self._surfaces, light.shadows, light.lamps > 0.0)
         self._ground = ground_layer(context, ground)
         self._paint = ground_layer(context, ground)
+        self._decals = ground_layer(context, decal_shaders(context, self._surfaces))
         self._walls = wall_layer(context, walls)
         self._scan = scan_layer(
             context, scan_shaders(context, self._surfaces, light.shadows and not splats, splats)
@@ -171,10 +185,19 @@ class GlScene:
         """Draw road paint after the ground, without labels and depth."""
         self._paint.draw("colour")
 
+    def draw_decals(self) -> None:
+        """Draw pictures on the ground; the blending multiplies colours."""
+        self._decals.draw("colour")
+
+    def draw_panes(self, labels: bool) -> None:
+        """Draw clear glass over the finished picture: its colours, or its labels and depth."""
+        self._seen.draw_panes(labels)
+
     def release(self) -> None:
         for held in (
             self._ground,
             self._paint,
+            self._decals,
             self._walls,
             self._scan,
             self._seen,
@@ -202,6 +225,7 @@ class GlScene:
         for layer, rows in (
             (self._ground, [tile.ground for tile in tiles]),
             (self._paint, [tile.paint for tile in tiles]),
+            (self._decals, [tile.decals for tile in tiles]),
             (self._walls, [tile.walls for tile in tiles]),
             (self._scan, [tile.scan for tile in tiles]),
         ):
@@ -223,25 +247,33 @@ class GlScene:
         self._seen_for = None
         self._still_for = None
         self._lit_for = []
-        for layer in (self._ground, self._paint, self._walls, self._scan):
+        for layer in (self._ground, self._paint, self._decals, self._walls, self._scan):
             layer.place(anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
         self._stands = _joined([*placed, _at(self._obstacles, self._obstacle_xy, anchor)])
+        self._far = np.concatenate(
+            [*(self._tiles[key].far for key in self._keys), self._obstacles[0]]
+        )
         self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]))
 
     def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
         """Select everything visible from any eye in the cell with a heading in the sector."""
         offset = self._stands_xy - np.multiply(cell, _CELL_M)
-        chosen = np.hypot(offset[:, 0], offset[:, 1]) < self._stands_seen_m + _SLACK_M
+        away = np.hypot(offset[:, 0], offset[:, 1])
+        chosen = away < self._stands_seen_m + _SLACK_M
         tiles = np.ones(len(self._keys), dtype=bool)
         if half is not None:
             chosen &= _within(offset, sector, half, PROP_MARGIN_M)
             tiles = _within(self._middles - np.multiply(cell, _CELL_M), sector, half, _TILE_REACH_M)
         rows = chosen.nonzero()[0]
         form, things = self._stands
+        form = np.where(away > _NEAR_M, self._far, form)
         self._seen.set(*_joined([(form[rows], things[rows]), self._lit]))
         for layer in (self._ground, self._paint, self._walls, self._scan):
             layer.show("colour", tiles.nonzero()[0])
+        x, y = np.multiply(cell, _CELL_M).tolist()
+        near = [tile_distance(key, x, y) < DECALS_M + _SLACK_M for key in self._keys]
+        self._decals.show("colour", (tiles & np.array(near)).nonzero()[0])
 
     def _stand(self, middle: Floats, anchor: Floats) -> None:
         """Prepare the shadow casters in the square around `middle`, visible or not."""
@@ -261,24 +293,34 @@ class GlScene:
         held = self._surface.kept("gl", key, lambda: self._made(key))
         words = msgspec.msgpack.decode(held["words"].data, type=_Words)
         pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
-        form = [self._forms.id(("prop", *form), partial(parts_of, *form)) for form in words.forms]
-        things = np.array([*form, *[pole] * len(words.posts)], dtype=np.intp), held["things"]
-        ground, paint, walls, scan = (
+        forms = [self._form(*form) for form in words.forms] + [(pole, pole)] * len(words.posts)
+        near, far = np.array(forms, dtype=np.intp).reshape(-1, 2).T
+        ground, paint, decals, walls, scan = (
             (held[name], held[f"{name}_triangles"]) if name in held else None
-            for name in ("ground", "paint", "walls", "scan")
+            for name in ("ground", "paint", "decals", "walls", "scan")
         )
         return _Tile(
             _middle(key),
             ground,
             paint,
+            decals,
             walls,
             scan,
-            things,
+            (near, held["things"]),
+            far,
             held["thing_xy"],
             held["seen_m"],
             words.posts,
             held["post_z"],
         )
+
+    def _form(self, kind: str, variant: int, look: int) -> tuple[int, int]:
+        """Return the numbers of a prop's forms, near and at a distance."""
+        near, far = (parts_of(kind, variant, look, detail) for detail in _DETAILS)
+        one = self._forms.id(("prop", kind, variant, look), lambda: near)
+        if len(near) == len(far) and all(a is b for a, b in zip(near, far, strict=True)):
+            return one, one
+        return one, self._forms.id(("prop", kind, variant, look, "far"), lambda: far)
 
     def _made(self, key: Key) -> Arrays:
         """Build the data of a tile that depend on its surface alone."""
@@ -294,6 +336,7 @@ class GlScene:
             "scan": scan_rows(scanned, middle),
             "ground": ground_rows(self._surfaces, ground, middle),
             "paint": ground_rows(self._surfaces, finish.painted, middle),
+            "decals": decal_rows(self._surfaces, finish.decals, middle),
             "walls": wall_rows(self._surfaces, chunk.buildings, finish.styles, middle),
         }
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
@@ -351,10 +394,7 @@ class GlScene:
         standing = grounded_obstacles(obstacles, self._surface)
         if not standing:
             return _NOTHING
-        form = [
-            self._forms.id(("prop", *prop.form), partial(parts_of, *prop.form))
-            for prop, _ in standing
-        ]
+        form = [self._form(*prop.form)[0] for prop, _ in standing]
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in standing])
         xyz = np.array([(0.0, 0.0, z) for _, z in standing])
         rows = instances(

@@ -14,7 +14,8 @@ fragment shader   Calls `show(albedo, normal, at, label)` once, or `glow(colour,
                   label: float, an id of cosim.core.state.LABELS
                   `show_linear` takes a linear albedo and a radiance emitted by the surface.
                   sRGB textures are decoded when they are read.
-                  The shadow pass skips it: do not write depth or discard.
+                  The shadow pass skips it: do not write depth. Code that discards has a shadow
+                  shader that discards, too.
 
 Positions are relative to the anchor, a ground point near the eye on a lattice of ANCHOR_M.
 In float32 they are then accurate to 0.01 mm anywhere in a city.
@@ -135,11 +136,10 @@ float sunlit(vec3 at, vec3 normal) {
 }
 
 vec3 on_screen(vec3 light) {
-    // Narkowicz's fit of the ACES curve, then sRGB to a level or two.
-    vec3 x = light * sun_light.w;
-    x = min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0);
-    vec3 s = sqrt(x);
-    return s * (1.1366 - 0.1366 * s);
+    // The ACES curve (Narkowicz's fit) in sRGB, which reaches white at 1.96, as a polynomial of
+    // the root of light: to two levels below 0.8, without a division.
+    vec3 s = min(sqrt(light * sun_light.w), 1.4);
+    return s * (0.1725 + s * (6.1673 + s * (-11.3129 + s * (7.7517 - s * 1.8716))));
 }
 
 float fogged() {
@@ -167,11 +167,14 @@ _NOTHING = "#version 430\nvoid main() {}\n"
 
 
 @lru_cache(maxsize=64)
-def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: bool) -> Programs:
+def programs(
+    context: moderngl.Context, vertex: str, fragment: str, shadows: bool, cut_out: str = ""
+) -> Programs:
     """Create a drawable's programs, for the picture and for shadow maps.
 
     vertex, fragment: GLSL without a version line
     shadows: `show` reads the shadow maps
+    cut_out: fragment shader of the shadow maps, where parts of the surface are discarded
 
     Equal programs are shared during the context's lifetime, so set their uniforms before each draw.
     """
@@ -182,7 +185,8 @@ def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: boo
             fragment_shader=head + _DECODED + _FRAGMENT + fragment,
         ),
         context.program(
-            vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex, fragment_shader=_NOTHING
+            vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex,
+            fragment_shader=f"#version 430\n{cut_out}" if cut_out else _NOTHING,
         ),
     )
 

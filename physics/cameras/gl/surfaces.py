@@ -17,13 +17,14 @@ from cosim.core.geometry import Floats
 from physics.cameras.gl.context import is_card
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Pass, programs
+from physics.textures.decals import decal_layers
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Layers, join_layers
 from physics.textures.walls import prop_layers, wall_layers
 
 SIZE_PX: Final = 256
-LAYERS_MAX: Final = 72
+LAYERS_MAX: Final = 96
 
 LOOKED_UP: Final = f"""
 layout(binding = {SURFACES_UNIT}) uniform sampler2DArray surfaces;
@@ -165,7 +166,9 @@ class TileLayer:
 @lru_cache(maxsize=1)
 def surfaces(context: moderngl.Context) -> Surfaces:
     """Return the context's textures, created once and with the same lifetime."""
-    flat = join_layers(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX))
+    flat = join_layers(
+        *(make(SIZE_PX) for make in (ground_layers, wall_layers, prop_layers, decal_layers))
+    )
     facades = facade_layers(SIZE_PX)
     known = np.ones((LAYERS_MAX, 4), dtype=np.float32)
     known[: len(flat), :3], known[: len(flat), 3] = flat.mean, flat.metres[:, 0]

@@ -7,8 +7,10 @@ readback.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
-from typing import Final
+from typing import Final, Literal
 
 import cv2
 import moderngl
@@ -36,11 +38,7 @@ class Target:
         self.size = size
         self._colour = context.texture(size, 4)
         self._depth = context.depth_renderbuffer(size)
-        self.frame, self._painted = (
-            context.framebuffer([self._colour], self._depth) for _ in range(2)
-        )
-        self._painted.color_mask = (True, True, True, False)
-        self._painted.depth_mask = False
+        self.frame = context.framebuffer([self._colour], self._depth)
         on_card = is_card(context) if parts_on_card is None else parts_on_card
         self._parting = _Parting(context, size) if on_card else None
 
@@ -53,9 +51,22 @@ class Target:
         """Make it the target of later draws."""
         self.frame.use()
 
-    def use_colours(self) -> None:
-        """Make it the target of later draws without changing labels and depth."""
-        self._painted.use()
+    @contextmanager
+    def only(self, part: Literal["colours", "labels"]) -> Iterator[None]:
+        """Limit draws within a `with` block to colours, or to labels and depth.
+
+        Masks of one framebuffer change without a flush, which a second framebuffer would need.
+        """
+        colours = part == "colours"
+        self.frame.color_mask = (colours, colours, colours, not colours)
+        self.frame.depth_mask = not colours
+        self.frame.use()
+        try:
+            yield
+        finally:
+            self.frame.color_mask = (True, True, True, True)
+            self.frame.depth_mask = True
+            self.frame.use()
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Read colours (H, W, 3) and labels (H, W), the top row first."""
@@ -96,7 +107,7 @@ class Target:
         ).astype(np.float32)
 
     def release(self) -> None:
-        for thing in (self.frame, self._painted, self._colour, self._depth, self._parting):
+        for thing in (self.frame, self._colour, self._depth, self._parting):
             if thing is not None:
                 thing.release()
 

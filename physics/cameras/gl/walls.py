@@ -100,7 +100,7 @@ void main() {{
     float front = abs(mod(cell.x, every) - (fronts.z - 16.0 * every)) < 0.5 ? fronts.y : fronts.x;
     float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {BAY_VARIANTS}.0);
     float up = ground_floor ? clamp(cells.y, 0.006, 0.994) : cells.y;  // its plinth does not show over its top
-    vec4 bay = texture(facades, vec3(cells.x, -up, layer));
+    vec4 bay = texture(facades, vec3(cells.x, -up, layer), -0.4);
     bool none = cell.y < 0.0 || cell.y >= kind.y;
     albedo = none ? albedo : decoded(bay.rgb) + bay.a * albedo;
     vec3 own = vec3(0.0);
