@@ -50,7 +50,7 @@ _ADAPTED: Final = 0.85
 darkness.
 """
 _KEY: Final = 0.85
-_LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
+STREET_LAMPLIGHT: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 """Light of a lamp-lit street at night, some 28 lx."""
 _NIGHT: Final = 2.2e-4 * np.array([0.62, 0.72, 1.0])
 """Radiance scale of the glow of a city's sky."""
@@ -170,7 +170,7 @@ def _assembled(
 ) -> Sky:
     ways = directions(len(sky))
     above = ways[..., 2:] > 0.0
-    up = irradiance(np.where(above, sky, 0.0), np.array([0.0, 0.0, 1.0])) + lamps * _LAMPS
+    up = irradiance(np.where(above, sky, 0.0), np.array([0.0, 0.0, 1.0])) + lamps * STREET_LAMPLIGHT
     ground = GROUND_ALBEDO * (up + beam * max(float(sun[2]), 0.0))
     horizon = _horizon(sky, len(sky) // 2)
     near = np.exp(-np.maximum(-ways[..., 2:], 0.0) / HORIZON_FADE)
@@ -179,7 +179,7 @@ def _assembled(
     compass = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0])
     side = (
         np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0)
-        + 0.7 * lamps * _LAMPS
+        + 0.7 * lamps * STREET_LAMPLIGHT
     )
     # Metered light: a bright ground, and some of the sky over the street.
     bright = float((up + beam * max(float(sun[2]), 0.0) + 0.5 * horizon) @ LUMINANCE)

@@ -18,7 +18,7 @@ from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.run_folder import RUN_AGAIN, load_log, trajectory_file
-from cosim.results.run_spec import RunSpec, names_by_robot
+from cosim.results.run_spec import RunSpec, names_by_conditions
 from cosim.results.table import table_of
 from cosim.spec.scenario import CityMap, Light, Scenario
 
@@ -115,7 +115,7 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
         progress(f"reading {path}")
         found.append(read_whole_run(path))
     _refuse_other_suites(found)
-    names = names_by_robot([whole.spec for whole in found])
+    names = names_by_conditions([whole.spec for whole in found])
     policies = [(whole.spec.suite, name) for whole, name in zip(found, names, strict=True)]
     suites = {
         policy: {suite for suite, other in policies if other == policy} for _, policy in policies

@@ -16,6 +16,7 @@ from cosim.core.state import Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
 from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Light
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.camera_base import WorldCamera
 from physics.cameras.gl.backdrop import Backdrop
 from physics.cameras.gl.batch import PictureOrder, Stage, batch_drawing
@@ -25,7 +26,7 @@ from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shadows import ShadowMaps
 from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
 from physics.cameras.gl.targets import Target
-from physics.cameras.sky import sky_of
+from physics.cameras.gl.weather import Look, look_of, weathered_sky
 from physics.cameras.view import Shot, View
 from physics.dynamics.world import BulletWorld
 
@@ -37,6 +38,7 @@ class GlCamera(WorldCamera):
     """Robot camera with OpenGL. Use it in a `with` block; the world need not be running.
 
     appearance: of a scanned place; splats are drawn where the scan has them
+    weather: changes sky, surfaces and air; not in a scanned place, whose colours contain its light
     """
 
     def __init__(
@@ -46,13 +48,20 @@ class GlCamera(WorldCamera):
         depth: bool = False,
         light: Light = NOON,
         appearance: Appearance = "splats",
+        weather: Weather = WEATHERS[CLEAR],
     ) -> None:
         super().__init__(world, spec, depth)
         scan = world.surface.scan
         self._splats = scan.splats if scan is not None and appearance == "splats" else None
         seed = world.surface.seed
-        self._sky = sky_of(light, seed) if scan is None else scan_sky(light, scan.facts, seed)
-        self._light = lighting_of(self._sky, haze=self._splats is None)
+        self._look: Look | None = None
+        if scan is None:
+            self._sky = weathered_sky(light, weather, seed)
+        else:
+            self._sky = scan_sky(light, scan.facts, seed)
+        self._light = lighting_of(self._sky, haze=self._splats is None, contact=light.shadows)
+        if scan is None:
+            self._look = look_of(weather, self._sky, seed, self._light.shadows)
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
@@ -62,11 +71,14 @@ class GlCamera(WorldCamera):
             world, light = self._world, self._light
             with context() as gl:
                 splats = self._splats
-                scene = GlScene(gl, batch_drawing(gl).forms, world, light, splats is not None)
+                look = self._look
+                scene = GlScene(gl, batch_drawing(gl).forms, world, light, splats is not None, look)
                 shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
                 cloud = None if splats is None else splat_pictures(gl).cloud(splats)
-                sky = Backdrop(gl, self._sky)
-                self._stage = Stage(world.surface, world.robot, scene, shadows, sky, light, cloud)
+                sky = Backdrop(gl, self._sky, 0 if look is None else look.variant)
+                self._stage = Stage(
+                    world.surface, world.robot, scene, shadows, sky, light, cloud, look
+                )
             self._context = gl
         return self
 

@@ -73,7 +73,7 @@ void main() {{
         vec4 seen = texture(surfaces, vec3(where, cover));
         colour *= decoded(seen.rgb);
     }} else if (shines < -0.5) {{
-        own = vec3({_LAMPLIGHT}) * side_light.w;
+        own = vec3({_LAMPLIGHT}) * colour * (1.6 * side_light.w);
     }}
     show_linear(colour, own, n, at, label);
 }}
@@ -87,11 +87,11 @@ class Forms:
         self,
         context: moderngl.Context,
         surfaces: Surfaces,
-        programs_of: dict[bool, Programs] | None = None,
+        programs_of: dict[int, Programs] | None = None,
     ) -> None:
         self._context = context
         self._surfaces = surfaces
-        self._programs: dict[bool, Programs] = {} if programs_of is None else programs_of
+        self._programs: dict[int, Programs] = {} if programs_of is None else programs_of
         self._corners: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._ids: dict[Hashable, int] = {}
@@ -108,7 +108,7 @@ class Forms:
         """
         return Forms(self._context, self._surfaces, self._programs)
 
-    def programs(self, shadows: bool) -> Programs:
+    def programs(self, shadows: int) -> Programs:
         """Return the programs of all forms. shadows: they apply shadow maps."""
         if shadows not in self._programs:
             self._programs[shadows] = made = programs(
@@ -180,7 +180,7 @@ class Things:
         self._room = 0
         self._instances: moderngl.Buffer | None = None
         self._commands: moderngl.Buffer | None = None
-        self._arrays: dict[bool, list[moderngl.VertexArray]] = {}
+        self._arrays: dict[int, list[moderngl.VertexArray]] = {}
         self._ends = [0, 0]
 
     def set(
@@ -211,7 +211,7 @@ class Things:
         self._instances.write(rows[order])
         self._commands.write(commands)
 
-    def draw(self, stage: Pass, shadows: bool, part: int = 0) -> None:
+    def draw(self, stage: Pass, shadows: int, part: int = 0) -> None:
         """Draw one part. shadows: it is shaded by shadow maps."""
         first = self._ends[part]
         count = self._ends[part + 1] - self._ends[part]
@@ -228,7 +228,7 @@ class Things:
         self._instances = self._context.buffer(reserve=self._room * INSTANCE.itemsize, dynamic=True)
         self._commands = self._context.buffer(reserve=self._room * 20, dynamic=True)
 
-    def _bind(self, shadows: bool) -> None:
+    def _bind(self, shadows: int) -> None:
         at_corners, triangles = self._forms.buffers()
         if self._bound != self._forms.version:
             self._unbind()

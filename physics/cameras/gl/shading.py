@@ -60,6 +60,8 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from physics.cameras.gl.lighting import Lighting
+from physics.cameras.gl.variants import Variant
+from physics.cameras.gl.weather_shaders import BLOCK, FOG_GLOW, LAMPS, PATTERNS
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
 
 Pass = Literal["colour", "still", "moving"]
@@ -122,6 +124,9 @@ out vec4 pixel;
 layout(binding = 6) uniform sampler2DShadow still_shadow;
 layout(binding = 7) uniform sampler2DShadow moving_shadow;
 
+#ifdef WEATHER
+WEATHER_CODE
+#endif
 float sunlit(vec3 at, vec3 normal) {
 #ifdef SHADOWS
     vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
@@ -134,6 +139,9 @@ float sunlit(vec3 at, vec3 normal) {
 #endif
 }
 
+#ifdef WEATHER
+vec3 on_screen(vec3 light) { return light; }
+#else
 vec3 on_screen(vec3 light) {
     // Narkowicz's fit of the ACES curve, then sRGB to a level or two.
     vec3 x = light * sun_light.w;
@@ -141,12 +149,43 @@ vec3 on_screen(vec3 light) {
     vec3 s = sqrt(x);
     return s * (1.1366 - 0.1366 * s);
 }
+#endif
 
 float fogged() {
     float far = 1.0 / gl_FragCoord.w;
     return max(1.0 - exp(-fog.w * far), clamp((far - haze.x) * haze.y, 0.0, haze.z));
 }
 
+#ifdef WEATHER
+void glow(vec3 colour, float label) {
+    pixel = vec4(mix(decoded(colour) * 1.3 / sun_light.w, fog.rgb, fogged()), label / 255.0);
+}
+
+void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
+    float raised = smoothstep(0.35, 0.75, normal.z);
+    float facing = max(dot(normal, sun.xyz), 0.0);
+    vec3 light = side_light.rgb + normal.z * tilt_light.rgb + abs(normal.z) * flat_light.rgb;
+    light += sun_light.rgb * (facing * sunlit(at, normal));
+    float gloss = 0.0;
+#ifdef WET
+    float pool = puddle(at, label);
+    albedo *= mix(1.0, mix(0.78, 0.55, raised), surface.x) * mix(1.0, 0.55, pool);
+    if (is_ground(label)) gloss = mix(24.0, 90.0, pool) * surface.x;
+#endif
+#ifdef SNOW
+    albedo = mix(albedo, vec3(0.80, 0.83, 0.88), snow_on(at, raised, label));
+#endif
+#ifdef LAMPS
+    vec3 mirrored_lamps;
+    vec3 lamps = lamplight(at, normal, gloss, mirrored_lamps);
+    float lit = in_contact(at, normal);
+    light = lit * (light + lamps);
+    own += lit * mirrored_lamps;
+#endif
+    vec3 ray = normalize(at - eye.xyz);
+    pixel = vec4(mix(albedo * light + own, fog_towards(ray), fogged()), label / 255.0);
+}
+#else
 void glow(vec3 colour, float label) {
     pixel = vec4(mix(colour, on_screen(fog.rgb), fogged()), label / 255.0);
 }
@@ -157,29 +196,68 @@ void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
     light += sun_light.rgb * (facing * sunlit(at, normal));
     pixel = vec4(on_screen(mix(albedo * light + own, fog.rgb, fogged())), label / 255.0);
 }
+#endif
 
 void show(vec3 albedo, vec3 normal, vec3 at, float label) {
     show_linear(decoded(albedo), vec3(0.0), normal, at, label);
 }
 """
 
+_WEATHER: Final = (
+    PATTERNS
+    + FOG_GLOW
+    + "#ifdef LAMPS\n"
+    + LAMPS
+    + """
+float in_contact(vec3 at, vec3 normal) {
+    // Light that is left under people and vehicles at night.
+#ifdef SHADOWS
+    if (normal.z < 0.3 || sun.w == 0.0) return 1.0;
+    vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
+    vec2 off = abs(in_map.xy - 0.5);
+    if (max(off.x, off.y) > 0.49) return 1.0;
+    const float r = 0.004;
+    float lit = 0.25 * (texture(moving_shadow, in_map + vec3(r, 0.0, 0.0)) + texture(moving_shadow, in_map - vec3(r, 0.0, 0.0))
+        + texture(moving_shadow, in_map + vec3(0.0, r, 0.0)) + texture(moving_shadow, in_map - vec3(0.0, r, 0.0)));
+    return mix(0.35, 1.0, lit);
+#else
+    return 1.0;
+#endif
+}
+#endif
+#ifdef SNOW
+float snow_on(vec3 at, float raised, float label) {
+    vec2 here = ground_at(at);
+    float patchy = 0.6 * noise(here, 1.3) + 0.4 * noise(here, 0.35);
+    float cover = label < 1.5 ? 0.72 : label < 3.5 ? 0.86 : label > 9.5 && label < 10.5 ? 0.2 : 1.0;
+    return surface.z * raised * mix(smoothstep(0.25, 0.75, patchy + cover - 0.45), 1.0, cover * cover * cover);
+}
+#endif
+"""
+)
+"""Code of the variants with `Variant.WEATHER`."""
+
 _NOTHING = "#version 430\nvoid main() {}\n"
 
 
 @lru_cache(maxsize=64)
-def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: bool) -> Programs:
+def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: int) -> Programs:
     """Create a drawable's programs, for the picture and for shadow maps.
 
     vertex, fragment: GLSL without a version line
-    shadows: `show` reads the shadow maps
+    shadows: flags of a `Variant`; as a bool, whether `show` reads the shadow maps
 
     Equal programs are shared during the context's lifetime, so set their uniforms before each draw.
     """
-    head = _BLOCK + ("#define SHADOWS\n" if shadows else "")
+    variant = Variant(shadows)
+    head = _BLOCK + variant.defines + (BLOCK if variant & Variant.WEATHER else "")
     return Programs(
         context.program(
             vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex,
-            fragment_shader=head + _DECODED + _FRAGMENT + fragment,
+            fragment_shader=head
+            + _DECODED
+            + _FRAGMENT.replace("WEATHER_CODE", _WEATHER)
+            + fragment,
         ),
         context.program(
             vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex, fragment_shader=_NOTHING

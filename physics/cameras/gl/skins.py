@@ -163,7 +163,7 @@ class Skins:
     def draw(
         self,
         stage: Pass,
-        shadows: bool,
+        shadows: int,
         instances: moderngl.Buffer,
         commands: moderngl.Buffer,
         count: int,
@@ -186,7 +186,7 @@ class Skins:
         self._buffers = []
         self._arrays = {}
 
-    def _bind(self, shadows: bool, instances: moderngl.Buffer) -> None:
+    def _bind(self, shadows: int, instances: moderngl.Buffer) -> None:
         if not self._buffers:
             rows, indices = np.concatenate(self._rows), np.concatenate(self._indices)
             self._buffers = [self._context.buffer(held.tobytes()) for held in (rows, indices)]
@@ -205,7 +205,7 @@ class Skins:
 def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody]) -> Skins:
     """Create skins of meshes with four joints per corner."""
 
-    def drawn(shadows: bool) -> Programs:
+    def drawn(shadows: int) -> Programs:
         return programs(context, _SKIN + _MESH, _FRAGMENT, shadows)
 
     return Skins(context, made, lru_cache(drawn), _MESH_LAYOUT)
@@ -214,7 +214,7 @@ def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody
 def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -> Skins:
     """Create skins of tubes with two joints per turned ring and four per fixed ring."""
 
-    def drawn(shadows: bool) -> Programs:
+    def drawn(shadows: int) -> Programs:
         seen, cast = (
             programs(
                 context,

@@ -43,7 +43,7 @@ void main() {
 """
 
 
-def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
+def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: int) -> SurfaceShaders:
     """Create the program of the ground of all tiles."""
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 

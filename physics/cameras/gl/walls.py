@@ -115,7 +115,7 @@ void main() {{
 
 
 def wall_shaders(
-    context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool
+    context: moderngl.Context, surfaces: Surfaces, shadows: int, night: bool
 ) -> SurfaceShaders:
     """Create the program of all buildings. night: some of their windows are lit."""
     return SurfaceShaders(
