@@ -22,13 +22,13 @@ from physics.ground.tiles import tiles_within
 from physics.street.furniture import KINDS
 from physics.street.surface import Surface
 
-STREET_LAMPS_MAX: Final = 11
+STREET_LAMPS_MAX: Final = 8
 """Maximum number of street lamps of a picture; the others of LAMPS_MAX are headlights."""
 _ARM_M: Final = 1.3
 """Distance of a lamp's glass from its pole in metres."""
 _RANGE_M: Final = 26.0
-_LAMP: Final = 0.011 * np.array([1.0, 0.80, 0.55])
-"""Light of a street lamp, radiance of a white surface at 1 m: some 45 lx under a lamp of 5.5 m."""
+_LAMP: Final = 0.024 * np.array([1.0, 0.80, 0.55])
+"""Light of a street lamp, radiance of a white surface at 1 m: some 60 lx under a lamp of 7 m."""
 _LAMP_ENDS: Final = -0.02
 """Cosine from straight down at which a street lamp's light ends."""
 _HEADLIGHT: Final = 0.035 * np.array([1.0, 0.95, 0.86])
@@ -70,6 +70,10 @@ class Lamps(NamedTuple):
         return rows
 
 
+_SEEN_M: Final = 45.0
+"""Distance from that point within which lamps are chosen."""
+
+
 def lamp_heads(forms: Sequence[tuple[str, int, int]], things: CornerRows, middle: Floats) -> Floats:
     """Return (N, 3) world positions of the glasses of a tile's street lamps.
 
@@ -86,15 +90,18 @@ def lamp_heads(forms: Sequence[tuple[str, int, int]], things: CornerRows, middle
 
 def nearest(heads: Floats, eye_m: Floats, heading_rad: float) -> NDArray[np.intp]:
     """Return the rows of the lamps that light a view most, at most STREET_LAMPS_MAX."""
-    towards = eye_m[:2] + _AHEAD_M * np.array([math.cos(heading_rad), math.sin(heading_rad)])
-    far = np.hypot(*(heads[:, :2] - towards).T)
-    return np.asarray(np.argsort(far, kind="stable")[:STREET_LAMPS_MAX])
+    way = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    off = heads[:, :2] - eye_m[:2]
+    far = np.hypot(*(off - _AHEAD_M * way).T)
+    order = np.argsort(far, kind="stable")
+    order = order[(far[order] < _SEEN_M) & (off[order] @ way > -_RANGE_M)]
+    return np.asarray(order[:STREET_LAMPS_MAX])
 
 
 def walls_around(surface: Surface, head: Floats) -> NDArray[np.float32]:
     """Return (WALL_ANGLES,) distances from a lamp to the nearest wall by direction, metres.
 
-    The directions are the middles of equal parts of -pi to pi, counter-clockwise from east.
+    The directions are those of points at equal distances on a square, as in the shader.
     """
     x, y = float(head[0]), float(head[1])
     reach = np.full(WALL_ANGLES, 2.0 * _RANGE_M)
@@ -107,8 +114,15 @@ def walls_around(surface: Surface, head: Floats) -> NDArray[np.float32]:
     if outlines:
         begin = np.concatenate([ring[:-1] for ring in outlines]) - (x, y)
         along = np.concatenate([np.diff(ring, axis=0) for ring in outlines])
-        angle = (np.arange(WALL_ANGLES) + 0.5) / WALL_ANGLES * 2.0 * math.pi - math.pi
-        ray = np.column_stack([np.cos(angle), np.sin(angle)])[:, None]
+        turn = 4.0 * (np.arange(WALL_ANGLES) + 0.5) / WALL_ANGLES
+        side = 1.0 - np.abs(turn % 2.0 - 1.0)  # 0, 1, 0, 1, 0 around the square
+        ray = np.column_stack(
+            [
+                np.where((turn < 1.0) | (turn > 3.0), 1.0 - side, side - 1.0),
+                np.sign(2.0 - turn) * side,
+            ]
+        )
+        ray = (ray / np.hypot(*ray.T)[:, None])[:, None]
         cross = ray[..., 0] * along[:, 1] - ray[..., 1] * along[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             far = (begin[:, 0] * along[:, 1] - begin[:, 1] * along[:, 0]) / cross
@@ -163,8 +177,9 @@ def lamps_of(heads: Floats, vehicles: Vehicles, surface: Surface, eye_m: Floats)
     heads: (N, 3) of `nearest`
     """
     n = len(heads)
-    near = np.argsort(np.hypot(*(vehicles.xy - eye_m[:2]).T), kind="stable")
-    near = near[: (LAMPS_MAX - n + 1) // 2]
+    far = np.hypot(*(vehicles.xy - eye_m[:2]).T)
+    near = np.argsort(far, kind="stable")
+    near = near[far[near] < _SEEN_M][: (LAMPS_MAX - n) // 2]
     heading, size = vehicles.heading[near], vehicles.size[near]
     ahead = np.column_stack([np.cos(heading), np.sin(heading)])
     half = 0.5 * size[:, :1]
@@ -172,9 +187,8 @@ def lamps_of(heads: Floats, vehicles: Vehicles, surface: Surface, eye_m: Floats)
     front = np.column_stack([vehicles.xy[near] + (half + 0.05) * ahead, z])
     rear = np.column_stack([vehicles.xy[near] - (half + 0.25) * ahead, z])
     down = np.full(len(near), -_HEADLIGHT_DOWN)
-    m = LAMPS_MAX - n
     count = np.ones(len(near))
-    lights = Lamps(
+    return Lamps(
         np.concatenate([heads, front, rear]),
         np.concatenate(
             [np.tile(one, (k, 1)) for one, k in ((_LAMP, n), (_HEADLIGHT, len(near)))]
@@ -191,4 +205,3 @@ def lamps_of(heads: Floats, vehicles: Vehicles, surface: Surface, eye_m: Floats)
         np.concatenate([np.full(n, _RANGE_M), _HEADLIGHT_RANGE_M * count, _TAIL_RANGE_M * count]),
         np.concatenate([np.arange(n, dtype=float), -count, -count]),
     )
-    return Lamps(*(column[: n + m] for column in lights))

@@ -95,7 +95,7 @@ def lighting_of(sky: Sky, haze: bool = True, contact: bool = False) -> Lighting:
         sky.fog_colour,
         _horizon(sky),
         sky.fog_per_m,
-        sky.exposure,
+        sky.exposure * (1.0 + LAMPS_SPREAD * sky.lamps),
         sky.lamps,
         sky.shadows or contact,
         haze,

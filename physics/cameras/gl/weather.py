@@ -22,7 +22,7 @@ from physics.cameras.sun import sun_direction
 
 _CLOCK: Final = Clock()
 _ROWS: Final = 64
-"""Rows (vec4) of a block, of which 52 are used; graphics cards require aligned starts of blocks."""
+"""Rows (vec4) of a block, of which 46 are used; graphics cards require aligned starts of blocks."""
 _FULL_RAIN_MM_H: Final = 20.0
 _FULL_SNOW_MM_H: Final = 2.0
 _NIGHT_NOISE: Final = 8.0e-4

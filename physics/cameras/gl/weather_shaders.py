@@ -18,7 +18,7 @@ from typing import Final
 from physics.cameras.gl.splat_shaders import METRES
 
 WEATHER_BINDING: Final = 1
-LAMPS_MAX: Final = 16
+LAMPS_MAX: Final = 14
 WALLS_UNIT: Final = 16
 AIR_COLOUR_UNIT: Final = 17
 AIR_DEPTH_UNIT: Final = 18
@@ -69,7 +69,8 @@ LAMPS: Final = f"""
 layout(binding = {WALLS_UNIT}) uniform sampler2D walls_around;
 float unblocked(vec3 from_lamp, float row) {{
     if (row < 0.0) return 1.0;
-    float turn = atan(from_lamp.y, from_lamp.x) * 0.15915494 + 0.5;
+    float up_side = from_lamp.y / (abs(from_lamp.x) + abs(from_lamp.y) + 1.0e-6);
+    float turn = 0.25 * (from_lamp.x < 0.0 ? 2.0 - up_side : up_side < 0.0 ? 4.0 + up_side : up_side);
     float wall = texture(walls_around, vec2(turn, (row + 0.5) / {LAMPS_MAX}.0)).r;
     return 1.0 - smoothstep(wall + 0.25, wall + 0.9, length(from_lamp.xy));
 }}
@@ -239,26 +240,26 @@ vec3 snowed(vec3 light, vec2 flat_ray, float far, vec3 around) {
 """
 
 _LENS: Final = """
-vec2 dropped(vec2 uv, float tall, out float rim) {
-    // Offset of the view through drops on the lens; rim darkens their edges. uv: in picture heights
+vec2 dropped(vec2 uv, out float cover) {
+    // Offset of the view through drops on the lens, out of focus. uv: in picture heights
     vec2 moved = vec2(0.0);
-    rim = 0.0;
+    cover = 0.0;
     for (int k = 0; k < 2; k++) {
-        float side = k == 0 ? 0.21 : 0.085;
+        float side = k == 0 ? 0.17 : 0.06;
         vec2 cell = floor(uv / side);
         vec2 key = cell + vec2(57.0 * moment.y + 19.0 * float(k), 31.0 * moment.y);
         float slot = floor(moment.x / 5.0 + hashed(key + 3.0));
         key += mod(slot, 61.0) * 7.0;
-        if (hashed(key) > (k == 0 ? 0.30 : 0.22) * falling.z) continue;
-        float radius = side * (0.16 + 0.20 * hashed(key + 2.0)) * (k == 0 ? 0.85 : 1.0);
+        if (hashed(key) > (k == 0 ? 0.34 : 0.28) * falling.z) continue;
+        float radius = side * (0.14 + 0.22 * hashed(key + 2.0));
         vec2 middle = (cell + 0.4 + 0.2 * vec2(hashed(key + 5.0), hashed(key + 8.0))) * side;
         vec2 off = (uv - middle) / radius;
-        off.y *= off.y > 0.0 ? 0.9 : 1.15;
+        off.y *= off.y > 0.0 ? 1.05 : 0.85;
+        off += 0.16 * (vec2(noise(off + 40.0 + key, 0.9), noise(off.yx + 70.0 + key, 0.9)) - 0.5);
         float r = length(off);
         if (r > 1.0) continue;
-        float bent = sqrt(1.0 - 0.85 * r * r);
-        moved = -off * radius * (2.6 * bent + 1.2);
-        rim = 0.35 * smoothstep(0.72, 1.0, r) + 0.02;
+        moved = -off * radius * (2.4 * sqrt(1.0 - 0.85 * r * r) + 1.0);
+        cover = 1.0 - smoothstep(0.55, 1.0, r);
     }
     return moved;
 }
@@ -310,44 +311,40 @@ in vec2 spot;
     + _SENSOR
     + """
 void main() {
-    ivec2 here = ivec2(gl_FragCoord.xy), size = textureSize(air, 0), from = here;
-    float tall = float(size.y), rim = 0.0;
-    float deep = texelFetch(air_depth, here, 0).r, label = texelFetch(air, here, 0).a;
-    vec2 seen_at = spot;
-    if (falling.z > 0.0) {
-        vec2 moved = dropped(vec2(here) / tall, tall, rim);
-        if (rim > 0.0) {
-            from = clamp(here + ivec2(moved * tall), ivec2(0), size - 1);
-            seen_at = (vec2(from) + 0.5) / vec2(size) * 2.0 - 1.0;
-        }
-    }
-    float far = metres(texelFetch(air_depth, from, 0).r);
-    vec4 own = texelFetch(air, from, 0);
-    vec2 flat_ray = vec2(seen_at.x * right.w, -seen_at.y * up.w);
+    ivec2 here = ivec2(gl_FragCoord.xy), size = textureSize(air, 0);
+    float tall = float(size.y);
+    float deep = texelFetch(air_depth, here, 0).r;
+    vec4 own = texelFetch(air, here, 0);
+    float far = metres(deep), lod = log2(max(tall / 180.0, 1.0));
+    vec2 flat_ray = vec2(spot.x * right.w, -spot.y * up.w), uv = gl_FragCoord.xy / vec2(size);
     vec3 ray = ahead.xyz + flat_ray.x * right.xyz + flat_ray.y * up.xyz;
-    vec3 light = rim > 0.0 ? textureLod(air, (vec2(from) + 0.5) / vec2(size), 1.5).rgb : own.rgb;
+    float long_ray = length(ray);
+    vec3 light = own.rgb;
 #ifdef WET
     float kind = own.a * 255.0;
-    if (is_ground(kind) && far < 70.0 && rim == 0.0)
-        light = wetted(light, eye.xyz + far * ray, normalize(ray), kind, far);
+    if (is_ground(kind) && far < 70.0) light = wetted(light, eye.xyz + far * ray, ray / long_ray, kind, far);
 #endif
-    float long_ray = length(ray);
 #ifdef LAMPS
     if (night.x > 0.0) light += halos(ray / long_ray, min(far, 60.0) * long_ray);
 #endif
-    vec2 uv = (vec2(from) + 0.5) / vec2(size);
     if (falling.x + falling.y > 0.0) {
-        vec3 around = 0.75 * (side_light.rgb + tilt_light.rgb) + 0.7 * textureLod(air, uv, 4.0).rgb;
+        vec3 around = 0.75 * (side_light.rgb + tilt_light.rgb) + 0.7 * textureLod(air, uv, 3.5 + lod).rgb;
         if (falling.x > 0.0) light = rained(light, flat_ray, far, around);
         if (falling.y > 0.0) light = snowed(light, flat_ray, far, around);
     }
+    if (falling.z > 0.0) {
+        float cover;
+        vec2 moved = dropped(gl_FragCoord.xy / tall, cover);
+        if (cover > 0.0) {
+            vec3 through = textureLod(air, clamp(uv + moved * vec2(tall / float(size.x), 1.0), 0.0, 1.0), 2.6 + lod).rgb;
+            light = mix(light, 0.94 * through, cover);
+        }
+    }
     if (falling.w > 0.0) {
-        float lod = log2(max(tall / 180.0, 1.0));
         vec3 bloom = 0.5 * textureLod(air, uv, 2.0 + lod).rgb + 0.3 * textureLod(air, uv, 3.2 + lod).rgb + 0.2 * textureLod(air, uv, 4.4 + lod).rgb;
         light = mix(light, bloom, falling.w);
     }
-    light *= 1.0 - rim;
-    pixel = vec4(toned(light, here), label);
+    pixel = vec4(toned(light, here), own.a);
     gl_FragDepth = deep;
 }
 """
