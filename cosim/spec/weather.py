@@ -25,6 +25,7 @@ class Weather(msgspec.Struct, frozen=True, kw_only=True):
     puddles: share of walkable ground under water
     snow: 0 to 1, cover of surfaces that face upwards
     visibility_m: meteorological visibility; None for that of the scenario's light
+    fog_top_m: height of the fog over the ground
     cloud_cover: 0 to 1; None for that of the scenario's light
     sun_deg: elevation of the sun at its azimuth of the scenario's hour; None for the scenario's own
     grip: factor of every coefficient of friction of the ground, for wheels and feet
@@ -41,6 +42,7 @@ class Weather(msgspec.Struct, frozen=True, kw_only=True):
     puddles: float = 0.0
     snow: float = 0.0
     visibility_m: float | None = None
+    fog_top_m: float = 60.0
     cloud_cover: float | None = None
     sun_deg: float | None = None
     grip: float = 1.0
@@ -109,7 +111,8 @@ WEATHERS: Final[Mapping[str, Weather]] = MappingProxyType(
             Weather(
                 name="low_sun",
                 summary="sun at 7 degrees through thin fog",
-                visibility_m=220.0,
+                visibility_m=250.0,
+                fog_top_m=14.0,
                 cloud_cover=0.1,
                 sun_deg=7.0,
             ),

@@ -20,6 +20,7 @@ from physics.cameras.gl.air import AirDrawing, LinearTarget
 from physics.cameras.gl.backdrop import Backdrop
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.instances import Forms
+from physics.cameras.gl.lamps import casting_people
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shading import Pass, SceneBlocks, camera_matrix
@@ -153,7 +154,8 @@ class BatchDrawing:
         for i, (one, anchor) in enumerate(zip(pictures, shots.anchors, strict=True)):
             if (look := one.stage.look) is not None:
                 lamps = one.stage.scene.lamps(one.taken.view, one.street.vehicles)
-                self._weather.put(i, look, lamps, anchor, one.street.tick)
+                people = casting_people(one.street.people, one.stage.surface, one.taken.view)
+                self._weather.put(i, look, lamps, people, anchor, one.street.tick)
         self._weather.upload()
 
     def _cast(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:

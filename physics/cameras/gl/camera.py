@@ -59,7 +59,12 @@ class GlCamera(WorldCamera):
             self._sky = weathered_sky(light, weather, seed)
         else:
             self._sky = scan_sky(light, scan.facts, seed)
-        self._light = lighting_of(self._sky, haze=self._splats is None, contact=light.shadows)
+        self._light = lighting_of(
+            self._sky,
+            haze=self._splats is None,
+            contact=light.shadows,
+            bright=1.0 + 0.45 * weather.snow if scan is None else 1.0,
+        )
         if scan is None:
             self._look = look_of(weather, self._sky, seed, self._light.shadows)
         self._lights: dict[tuple[int, int], Lighting] = {}

@@ -15,9 +15,10 @@ import shapely
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import Vehicles
+from cosim.core.state import Age, People, Vehicles
 from physics.cameras.gl.corners import CornerRows
-from physics.cameras.gl.weather_shaders import LAMPS_MAX, WALL_ANGLES, WALLS_UNIT
+from physics.cameras.gl.weather_shaders import LAMPS_MAX, PEOPLE_MAX, WALL_ANGLES, WALLS_UNIT
+from physics.cameras.view import View
 from physics.ground.tiles import tiles_within
 from physics.street.furniture import KINDS
 from physics.street.surface import Surface
@@ -26,9 +27,9 @@ STREET_LAMPS_MAX: Final = 8
 """Maximum number of street lamps of a picture; the others of LAMPS_MAX are headlights."""
 _ARM_M: Final = 1.3
 """Distance of a lamp's glass from its pole in metres."""
-_RANGE_M: Final = 26.0
-_LAMP: Final = 0.024 * np.array([1.0, 0.80, 0.55])
-"""Light of a street lamp, radiance of a white surface at 1 m: some 60 lx under a lamp of 7 m."""
+_RANGE_M: Final = 34.0
+_LAMP: Final = 0.030 * np.array([1.0, 0.80, 0.55])
+"""Light of a street lamp, radiance of a white surface at 1 m: some 80 lx under a lamp of 7 m."""
 _LAMP_ENDS: Final = -0.02
 """Cosine from straight down at which a street lamp's light ends."""
 _HEADLIGHT: Final = 0.035 * np.array([1.0, 0.95, 0.86])
@@ -70,6 +71,11 @@ class Lamps(NamedTuple):
         return rows
 
 
+_CAST_AHEAD_M: Final = 5.0
+_CAST_M: Final = 14.0
+"""Distance from a point so far ahead of the eye within which people cast shadows by lamps."""
+_PERSON_M: Final = 1.72
+_CHILD_M: Final = 1.2
 _SEEN_M: Final = 45.0
 """Distance from that point within which lamps are chosen."""
 
@@ -130,6 +136,16 @@ def walls_around(surface: Surface, head: Floats) -> NDArray[np.float32]:
         hit = np.isfinite(far) & (far > 0.0) & (share >= 0.0) & (share <= 1.0)
         reach = np.minimum(reach, np.where(hit, far, np.inf).min(axis=1))
     return reach.astype(np.float32)
+
+
+def casting_people(people: People, surface: Surface, view: View) -> Floats:
+    """Return (N, 4) feet and heights in metres of the people whose shadows by lamps are drawn."""
+    way = np.array([math.cos(view.heading_rad), math.sin(view.heading_rad)])
+    far = np.hypot(*(people.xy - view.eye_m[:2] - _CAST_AHEAD_M * way).T)
+    near = np.argsort(far, kind="stable")[:PEOPLE_MAX]
+    near = near[far[near] < _CAST_M]
+    heights = np.where(people.age[near] == Age.CHILD, _CHILD_M, _PERSON_M)
+    return np.column_stack([people.xy[near], surface.heights(people.xy[near]), heights])
 
 
 class WallMap:

@@ -22,7 +22,7 @@ It hides the edge of the drawn world, as in the bullet camera.
 """
 
 
-LAMPS_SPREAD: Final = 0.72
+LAMPS_SPREAD: Final = 0.55
 """Share of the lamplight of `physics.cameras.sky` that comes from single lamps."""
 _ABOVE: Final = np.array([0.0, 0.0, 1.0])
 
@@ -73,12 +73,15 @@ class Lighting:
         ]
 
 
-def lighting_of(sky: Sky, haze: bool = True, contact: bool = False) -> Lighting:
+def lighting_of(
+    sky: Sky, haze: bool = True, contact: bool = False, bright: float = 1.0
+) -> Lighting:
     """Convert a sky to shader values.
 
     haze: of distant objects
     contact: at night, moving objects darken the ground right below them: the shadow maps are then
         seen from straight above
+    bright: factor of the exposure
     """
     up, side, down = sky.ambient
     if sky.lamps > 0.0:
@@ -95,7 +98,7 @@ def lighting_of(sky: Sky, haze: bool = True, contact: bool = False) -> Lighting:
         sky.fog_colour,
         _horizon(sky),
         sky.fog_per_m,
-        sky.exposure * (1.0 + LAMPS_SPREAD * sky.lamps),
+        sky.exposure * bright * (1.0 + 0.9 * sky.lamps),
         sky.lamps,
         sky.shadows or contact,
         haze,

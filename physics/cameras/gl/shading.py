@@ -173,7 +173,10 @@ void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
     if (is_ground(label)) gloss = mix(24.0, 90.0, pool) * surface.x;
 #endif
 #ifdef SNOW
-    albedo = mix(albedo, vec3(0.80, 0.83, 0.88), snow_on(at, raised, label));
+    float lies = snow_on(at, raised, label);
+    vec2 on_snow = ground_at(at);
+    float heaped = 0.5 * noise(on_snow, 0.5) + 0.3 * noise(on_snow, 0.125) + 0.2 * noise(on_snow, 2.0);
+    albedo = mix(albedo, vec3(0.86, 0.88, 0.92) * (is_ground(label) ? 0.80 + 0.26 * heaped : 1.0), lies);
 #endif
 #ifdef LAMPS
     vec3 mirrored_lamps;
@@ -229,8 +232,9 @@ float in_contact(vec3 at, vec3 normal) {
 float snow_on(vec3 at, float raised, float label) {
     vec2 here = ground_at(at);
     float patchy = 0.6 * noise(here, 1.3) + 0.4 * noise(here, 0.35);
-    float cover = label < 1.5 ? 0.72 : label < 3.5 ? 0.86 : label > 9.5 && label < 10.5 ? 0.2 : 1.0;
-    return surface.z * raised * mix(smoothstep(0.25, 0.75, patchy + cover - 0.45), 1.0, cover * cover * cover);
+    // Least on people, who move, and where wheels and feet do.
+    float cover = label < 1.5 ? 0.50 : label < 3.5 ? 0.66 : label > 9.5 && label < 10.5 ? 0.05 : 1.1;
+    return surface.z * raised * smoothstep(0.28, 0.62, patchy + cover - 0.5);
 }
 #endif
 """

@@ -22,12 +22,12 @@ from physics.cameras.sun import sun_direction
 
 _CLOCK: Final = Clock()
 _ROWS: Final = 64
-"""Rows (vec4) of a block, of which 46 are used; graphics cards require aligned starts of blocks."""
+"""Rows (vec4) of a block, of which 52 are used; graphics cards require aligned starts of blocks."""
 _FULL_RAIN_MM_H: Final = 20.0
 _FULL_SNOW_MM_H: Final = 2.0
-_NIGHT_NOISE: Final = 8.0e-4
+_NIGHT_NOISE: Final = 5.0e-4
 """Sensor noise at night: variance of a pixel per light, where 1 is the white level."""
-_GLOW_FROM_PER_M: Final = 0.008
+_GLOW_FROM_PER_M: Final = 0.004
 """Extinction from which fog glows around the sun, 1/m."""
 
 
@@ -64,7 +64,7 @@ def weathered_sky(light: Light, weather: Weather, seed: int) -> Sky:
     if weather.sun_deg is not None:
         east, north, _ = sun_direction(light.hour, light.day_of_year, light.latitude_deg).tolist()
         to_sun = direction_at(weather.sun_deg, east, north)
-    return sky_of(weathered(light, weather), seed, to_sun)
+    return sky_of(weathered(light, weather), seed, to_sun, weather.fog_top_m)
 
 
 def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None:
@@ -112,15 +112,30 @@ class WeatherBlocks:
             self._rows = np.zeros((2 * count, _ROWS, 4), dtype=np.float32)
             self._buffer = self._context.buffer(reserve=self._rows.nbytes)
 
-    def put(self, place: int, look: Look, lamps: Lamps | None, anchor: Floats, tick: int) -> None:
-        """Set one block. lamps: None without night."""
+    def put(
+        self,
+        place: int,
+        look: Look,
+        lamps: Lamps | None,
+        people: Floats,
+        anchor: Floats,
+        tick: int,
+    ) -> None:
+        """Set one block.
+
+        lamps: None without night
+        people: (N, 4) feet in world metres and height of those that cast shadows
+        """
         rows = self._rows[place]
         count = 0 if lamps is None else len(lamps.at)
         rows[0], rows[1] = look.surface, look.falling
         rows[2] = _CLOCK.time_s(tick), look.seed, look.noise, count
         rows[3] = look.night
         if lamps is not None:
-            rows[4 : 4 + 3 * LAMPS_MAX] = lamps.rows(anchor, look.brightness).reshape(-1, 4)
+            end = 4 + 3 * LAMPS_MAX
+            rows[4:end] = lamps.rows(anchor, look.brightness).reshape(-1, 4)
+            rows[3, 3] = len(people)
+            rows[end : end + len(people)] = people - (*anchor.tolist(), 0.0, 0.0)
 
     def upload(self) -> None:
         if self._buffer is not None:

@@ -5,10 +5,12 @@ The block `Weather` (binding WEATHER_BINDING) is read by variants with WEATHER o
     vec4 surface     wetness, share of puddles, snow cover, share of windows lit
     vec4 falling     rain and snow in the air, 0 to 1; drops on the lens, 0 to 1; bloom
     vec4 moment      time in seconds, seed 0 to 1, sensor noise, number of lamps
-    vec4 night       scattering of lamplight per metre, stars, glow of fog at the sun, -
+    vec4 night       scattering of lamplight per metre, stars, glow of fog at the sun, number of
+                     people who cast shadows
     vec4 lamp_at     xyz from the anchor; w 1 / range^2
     vec4 lamp_light  rgb radiance times square metres; w row of the wall map, -1 without
     vec4 lamp_way    xyz direction; w cosine at which its light ends
+    vec4 person      xyz feet, from the anchor; w height in metres
 """
 
 from __future__ import annotations
@@ -19,6 +21,9 @@ from physics.cameras.gl.splat_shaders import METRES
 
 WEATHER_BINDING: Final = 1
 LAMPS_MAX: Final = 14
+PEOPLE_MAX: Final = 6
+CASTING_LAMPS: Final = 3
+"""Number of lamps whose light people block."""
 WALLS_UNIT: Final = 16
 AIR_COLOUR_UNIT: Final = 17
 AIR_DEPTH_UNIT: Final = 18
@@ -35,6 +40,7 @@ layout(std140, binding = {WEATHER_BINDING}) uniform Weather {{
     vec4 lamp_at[{LAMPS_MAX}];
     vec4 lamp_light[{LAMPS_MAX}];
     vec4 lamp_way[{LAMPS_MAX}];
+    vec4 person[{PEOPLE_MAX}];
 }};
 """
 
@@ -83,6 +89,21 @@ vec3 reaching(int k, vec3 to, float far2) {{
     if (cone == 0.0) return vec3(0.0);
     return lamp_light[k].rgb * (fade * fade * cone / (far2 + 0.3)) * unblocked(-to, lamp_light[k].w);
 }}
+float past_people(vec3 at, vec3 to) {{
+    // Share of a lamp's light that people leave; each is an upright post.
+    float lit = 1.0, flat_m = length(to.xy);
+    vec2 way = to.xy / max(flat_m, 0.01);
+    int count = int(night.w);
+    for (int k = 0; k < count; k++) {{
+        vec2 off = person[k].xy - at.xy;
+        float along = dot(off, way), aside = abs(off.x * way.y - off.y * way.x);
+        float high = at.z + to.z * along / max(flat_m, 0.01) - person[k].z;
+        float soft = 0.04 + 0.03 * max(along, 0.0);
+        float shade = smoothstep(0.20 + soft, 0.20 - soft, aside) * smoothstep(person[k].w + soft, person[k].w - soft, high);
+        lit *= 1.0 - shade * smoothstep(0.28, 0.40, along) * step(along, flat_m) * step(-0.5, high);
+    }}
+    return lit;
+}}
 vec3 lamplight(vec3 at, vec3 normal, float gloss, out vec3 mirrored) {{
     // gloss: exponent of the highlight on water, 0 without
     vec3 sum = vec3(0.0), seen = normalize(eye.xyz - at);
@@ -93,6 +114,7 @@ vec3 lamplight(vec3 at, vec3 normal, float gloss, out vec3 mirrored) {{
         float far2 = dot(to, to);
         vec3 light = reaching(k, to, far2);
         if (light.r == 0.0) continue;
+        if (k < {CASTING_LAMPS}) light *= past_people(at, to);
         vec3 way = to * inversesqrt(far2);
         sum += light * max(0.12 + 0.88 * dot(normal, way), 0.0);
         if (gloss > 0.0) {{
@@ -204,13 +226,13 @@ vec3 rained(vec3 light, vec2 flat_ray, float far, vec3 around) {
         float fall = at.y + (7.5 + 2.0 * chance) * moment.x + 31.0 * chance;
         float row = floor(fall / 1.1);
         float drawn = hashed(vec2(column + 5.0 * float(k), mod(row, 997.0)));
-        if (drawn > 0.45 * falling.x) continue;
+        if (drawn > 0.62 * falling.x) continue;
         float along = fract(fall / 1.1) * 1.1 - 0.6 * fract(drawn * 91.0);
         float length_m = 0.16 + 0.10 * chance;
         float wide = max(0.0011, 0.55 * pixel_tan * away);
         float aside = (fract(at.x / 0.045) - 0.2 - 0.6 * fract(drawn * 37.0)) * 0.045;
         float body = smoothstep(wide, 0.0, abs(aside)) * smoothstep(0.0, 0.05, along) * smoothstep(length_m, length_m - 0.06, along);
-        float share = body * min(0.0011 / wide, 1.0) * 0.55;
+        float share = body * min(0.0011 / wide, 1.0) * 0.75;
         light = mix(light, around, share);
     }
     return light;
@@ -228,11 +250,11 @@ vec3 snowed(vec3 light, vec2 flat_ray, float far, vec3 around) {
         vec2 cell = floor(at / side);
         vec2 key = mod(cell, 997.0) + 13.0 * float(k);
         float drawn = hashed(key);
-        if (drawn > 0.55 * falling.y) continue;
+        if (drawn > 0.75 * falling.y) continue;
         vec2 middle = 0.2 + 0.6 * vec2(hashed(key + 5.0), hashed(key + 9.0));
-        float radius = max(0.0035 + 0.004 * fract(drawn * 57.0), 0.7 * pixel_tan * away);
+        float radius = max(0.005 + 0.006 * fract(drawn * 57.0), 0.8 * pixel_tan * away);
         float off = length((at / side - cell - middle) * side);
-        float share = smoothstep(radius, 0.3 * radius, off) * min(0.006 / radius, 1.0);
+        float share = smoothstep(radius, 0.3 * radius, off) * min(0.009 / radius, 1.0);
         light = mix(light, around, 0.85 * share);
     }
     return light;
@@ -250,15 +272,15 @@ vec2 dropped(vec2 uv, out float cover) {
         vec2 key = cell + vec2(57.0 * moment.y + 19.0 * float(k), 31.0 * moment.y);
         float slot = floor(moment.x / 5.0 + hashed(key + 3.0));
         key += mod(slot, 61.0) * 7.0;
-        if (hashed(key) > (k == 0 ? 0.34 : 0.28) * falling.z) continue;
-        float radius = side * (0.14 + 0.22 * hashed(key + 2.0));
-        vec2 middle = (cell + 0.4 + 0.2 * vec2(hashed(key + 5.0), hashed(key + 8.0))) * side;
+        if (hashed(key) > (k == 0 ? 0.30 : 0.15) * falling.z) continue;
+        float radius = side * (0.12 + 0.18 * hashed(key + 2.0));
+        vec2 middle = (cell + 0.3 + 0.4 * vec2(hashed(key + 5.0), hashed(key + 8.0))) * side;
         vec2 off = (uv - middle) / radius;
         off.y *= off.y > 0.0 ? 1.05 : 0.85;
         off += 0.16 * (vec2(noise(off + 40.0 + key, 0.9), noise(off.yx + 70.0 + key, 0.9)) - 0.5);
         float r = length(off);
         if (r > 1.0) continue;
-        moved = -off * radius * (2.4 * sqrt(1.0 - 0.85 * r * r) + 1.0);
+        moved = -off * (0.30 + 0.40 * sqrt(1.0 - 0.85 * r * r));
         cover = 1.0 - smoothstep(0.55, 1.0, r);
     }
     return moved;
@@ -337,7 +359,7 @@ void main() {
         vec2 moved = dropped(gl_FragCoord.xy / tall, cover);
         if (cover > 0.0) {
             vec3 through = textureLod(air, clamp(uv + moved * vec2(tall / float(size.x), 1.0), 0.0, 1.0), 2.6 + lod).rgb;
-            light = mix(light, 0.94 * through, cover);
+            light = mix(light, max(0.94 * through, 0.8 * light), cover);
         }
     }
     if (falling.w > 0.0) {
