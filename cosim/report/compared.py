@@ -12,6 +12,8 @@ from cosim.results.compare import MIN_CHANGED, ComparedRun, RunComparison
 from cosim.results.discerned import DISCERNED, DISCERNED_IN_WORDS
 from cosim.results.intervals import BOOTSTRAP, MIN_N
 from cosim.results.metrics import SUCCESS_IN_WORDS
+from cosim.results.table import summary_of
+from cosim.spec.weather import WEATHERS
 
 _HLINES: Final[list[Any]] = [
     {"selector": f"{rule}rule", "props": ":hline"} for rule in ("top", "mid", "bottom")
@@ -44,6 +46,12 @@ _GROUP_METRICS: Final = {
     DISCERNED: "D",
     "route_completion": "RC",
     "failures_per_100m": "FC",
+}
+_WEATHER_METRICS: Final = {
+    "success": "SR",
+    "route_completion": "RC",
+    "failures_per_100m": "FC",
+    "velocity_mean_mps": "V, m/s",
 }
 _LATEX_ESCAPES: Final = {
     "\\": r"\textbackslash{}",
@@ -114,6 +122,47 @@ def _plain(value: float) -> str:
 
 def _signed(value: float) -> str:
     return f"{value + 0.0:+.{3 if abs(value) < 10.0 else 2 if abs(value) < 100.0 else 1}f}"
+
+
+def summary_by_weather(result: RunComparison) -> pd.DataFrame:
+    """Return a row for each weather, policy and metric of all runs: `summary_of` with these.
+
+    Columns: weather, policy, metric, and those of `summary_of`; weathers in the order of
+    `WEATHERS`.
+    """
+    runs = (result.before, *result.others)
+    names = [str(run.table["policy"].iloc[0]) for run in runs]
+    parts = []
+    for weather in WEATHERS:
+        for run, policy in zip(runs, names, strict=True):
+            rows = run.table[run.table["weather"] == weather]
+            if len(rows):
+                part = summary_of(rows).reset_index()
+                part.insert(0, "weather", weather)
+                part.insert(1, "policy", policy)
+                parts.append(part)
+    return pd.concat(parts, ignore_index=True)
+
+
+def table_by_weather(summary: pd.DataFrame) -> TextTable:
+    """Build the table of `summary_by_weather`: a row for each weather and policy."""
+    rows = []
+    for (weather, policy), of in summary.groupby(["weather", "policy"], sort=False):
+        means = of.set_index("metric")
+        cells = (
+            "-"
+            if name not in means.index or pd.isna(means.loc[name, "mean"])
+            else f"{_plain(means.loc[name, 'mean'])} "
+            f"({_bound(means.loc[name, 'low'])} to {_bound(means.loc[name, 'high'])})"
+            for name in _WEATHER_METRICS
+        )
+        rows.append((str(weather), str(policy), *cells))
+    heads = ("weather", "policy", *_WEATHER_METRICS.values())
+    return TextTable("By weather: means, with 95 % intervals", heads, tuple(rows), 2)
+
+
+def _bound(value: float) -> str:
+    return "-" if pd.isna(value) else _plain(value)
 
 
 def flips_in_words(result: RunComparison, other: ComparedRun) -> tuple[str, ...]:
