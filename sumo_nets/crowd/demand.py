@@ -14,7 +14,7 @@ from cosim.core.state import Age
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import walk_graph_of
 from cosim.spec.scenario import CrowdSpec
-from cosim.spec.weather import Weather
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
 from sumo_nets.crowd.following_gaps import FollowingGaps
 from sumo_nets.crowd.free_space import EntrySpot, LocalWalkableArea, Spots
@@ -89,7 +89,7 @@ class Pedestrians:
         closed: frozenset[Port],
         together: GroupCohesion,
         gaps: FollowingGaps,
-        weather: Weather,
+        weather: Weather = WEATHERS[CLEAR],
     ) -> None:
         self._engine = engine
         self._entrances = entrances

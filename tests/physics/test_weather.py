@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -41,6 +42,17 @@ def test_clear_weather_is_not_encoded() -> None:
     assert content_hash(rainy) != content_hash(plain)
     read = msgspec.json.decode(msgspec.json.encode(rainy), type=Scenario)
     assert read == rainy and read.conditions is WEATHERS["rain"]
+
+
+def test_the_documents_have_every_weather() -> None:
+    """The table of docs/scenarios.md has the names, factors and rates of the rows."""
+    text = (Path(__file__).parents[2] / "docs" / "scenarios.md").read_text()
+    rows = [line.strip("| \n").split("|") for line in text.splitlines() if line.startswith("| `")]
+    table = {cells[0].strip(" `"): [c.strip() for c in cells[1:]] for cells in rows}
+    for name, weather in WEATHERS.items():
+        falling, *_, grip, hurry = table[name]
+        assert float(falling or 0.0) == weather.rain_mm_h + weather.snow_mm_h, name
+        assert (float(grip), float(hurry)) == (weather.grip, weather.hurry), name
 
 
 def test_bad_weather_is_refused() -> None:

@@ -28,8 +28,8 @@ STREET_LAMPS_MAX: Final = 8
 _ARM_M: Final = 1.3
 """Distance of a lamp's glass from its pole in metres."""
 _RANGE_M: Final = 34.0
-_LAMP: Final = 0.030 * np.array([1.0, 0.80, 0.55])
-"""Light of a street lamp, radiance of a white surface at 1 m: some 80 lx under a lamp of 7 m."""
+_LAMP: Final = 0.018 * np.array([1.0, 0.80, 0.55])
+"""Light of a street lamp, radiance of a white surface at 1 m: some 47 lx under a lamp of 7 m."""
 _LAMP_ENDS: Final = -0.02
 """Cosine from straight down at which a street lamp's light ends."""
 _HEADLIGHT: Final = 0.035 * np.array([1.0, 0.95, 0.86])

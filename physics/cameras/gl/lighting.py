@@ -98,7 +98,7 @@ def lighting_of(
         sky.fog_colour,
         _horizon(sky),
         sky.fog_per_m,
-        sky.exposure * bright * (1.0 + 0.9 * sky.lamps),
+        sky.exposure * bright * (1.0 + 0.7 * sky.lamps),
         sky.lamps,
         sky.shadows or contact,
         haze,
