@@ -29,9 +29,9 @@ vec3 starlight(vec3 ray) {{
     vec2 on_sky = 90.0 * vec2(atan(ray.y, ray.x), asin(ray.z)), cell = floor(on_sky);
     float drawn = hashed(mod(cell, 251.0));
     float off = length(on_sky - cell - 0.25 - 0.5 * vec2(hashed(cell + 3.0), hashed(cell + 7.0)));
-    float star = drawn < 0.03 ? smoothstep(0.13, 0.02, off) * (0.3 + 30.0 * drawn) : 0.0;
+    float star = drawn < 0.03 ? fading(0.13, 0.02, off) * (0.3 + 30.0 * drawn) : 0.0;
     float apart = acos(clamp(dot(ray, normalize(vec3(0.55, -0.62, 0.46))), -1.0, 1.0));
-    float moon = smoothstep(0.0075, 0.0065, apart) * 2.0e-2 + 1.2e-4 * exp(-apart / 0.03);
+    float moon = fading(0.0075, 0.0065, apart) * 2.0e-2 + 1.2e-4 * exp(-apart / 0.03);
     return vec3(6.0e-4 * star * smoothstep(0.08, 0.4, ray.z)) + moon * vec3(1.0, 0.96, 0.86);
 }}
 #endif

@@ -45,6 +45,7 @@ layout(std140, binding = {WEATHER_BINDING}) uniform Weather {{
 """
 
 PATTERNS: Final = """
+float fading(float high, float low, float x) { return 1.0 - smoothstep(low, high, x); }
 float hashed(vec2 cell) {
     vec3 p = fract(cell.xyx * vec3(0.1031, 0.1030, 0.0973));
     p += dot(p, p.yzx + 33.33);
@@ -67,7 +68,7 @@ float puddle(vec3 at, float label) {
     vec2 here = ground_at(at);
     float hollow = 0.55 * noise(here, 2.0) + 0.30 * noise(here, 0.8) + 0.15 * noise(here, 0.25);
     float level = 0.30 + 0.42 * surface.y;
-    return smoothstep(level + 0.035, level - 0.035, hollow);
+    return fading(level + 0.035, level - 0.035, hollow);
 }
 """
 
@@ -99,7 +100,7 @@ float past_people(vec3 at, vec3 to) {{
         float along = dot(off, way), aside = abs(off.x * way.y - off.y * way.x);
         float high = at.z + to.z * along / max(flat_m, 0.01) - person[k].z;
         float soft = 0.04 + 0.03 * max(along, 0.0);
-        float shade = smoothstep(0.20 + soft, 0.20 - soft, aside) * smoothstep(person[k].w + soft, person[k].w - soft, high);
+        float shade = fading(0.20 + soft, 0.20 - soft, aside) * fading(person[k].w + soft, person[k].w - soft, high);
         lit *= 1.0 - shade * smoothstep(0.28, 0.40, along) * step(along, flat_m) * step(-0.5, high);
     }}
     return lit;
@@ -120,7 +121,7 @@ vec3 lamplight(vec3 at, vec3 normal, float gloss, out vec3 mirrored) {{
         if (gloss > 0.0) {{
             vec3 half_way = normalize(way + seen);
             mirrored += light * (0.04 * gloss * pow(max(dot(normal, half_way), 0.0), gloss)
-                * (0.02 + 0.98 * pow(1.0 - max(dot(seen, half_way), 0.0), 5.0)) * 4.0);
+                * (0.02 + 0.98 * pow(1.0 - clamp(dot(seen, half_way), 0.0, 1.0), 5.0)) * 4.0);
         }}
     }}
     return sum;
@@ -231,7 +232,7 @@ vec3 rained(vec3 light, vec2 flat_ray, float far, vec3 around) {
         float length_m = 0.16 + 0.10 * chance;
         float wide = max(0.0011, 0.55 * pixel_tan * away);
         float aside = (fract(at.x / 0.045) - 0.2 - 0.6 * fract(drawn * 37.0)) * 0.045;
-        float body = smoothstep(wide, 0.0, abs(aside)) * smoothstep(0.0, 0.05, along) * smoothstep(length_m, length_m - 0.06, along);
+        float body = fading(wide, 0.0, abs(aside)) * smoothstep(0.0, 0.05, along) * fading(length_m, length_m - 0.06, along);
         float share = body * min(0.0011 / wide, 1.0) * 0.75;
         light = mix(light, around, share);
     }
@@ -254,7 +255,7 @@ vec3 snowed(vec3 light, vec2 flat_ray, float far, vec3 around) {
         vec2 middle = 0.2 + 0.6 * vec2(hashed(key + 5.0), hashed(key + 9.0));
         float radius = max(0.005 + 0.006 * fract(drawn * 57.0), 0.8 * pixel_tan * away);
         float off = length((at / side - cell - middle) * side);
-        float share = smoothstep(radius, 0.3 * radius, off) * min(0.009 / radius, 1.0);
+        float share = fading(radius, 0.3 * radius, off) * min(0.009 / radius, 1.0);
         light = mix(light, around, 0.85 * share);
     }
     return light;
