@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Final, NamedTuple
@@ -148,21 +149,25 @@ def table_by_weather(summary: pd.DataFrame) -> TextTable:
     """Build the table of `summary_by_weather`: a row for each weather and policy."""
     rows = []
     for (weather, policy), of in summary.groupby(["weather", "policy"], sort=False):
-        means = of.set_index("metric")
+        found = {
+            str(name): (mean, low, high)
+            for name, mean, low, high in of[["metric", "mean", "low", "high"]].itertuples(
+                index=False
+            )
+        }
         cells = (
-            "-"
-            if name not in means.index or pd.isna(means.loc[name, "mean"])
-            else f"{_plain(means.loc[name, 'mean'])} "
-            f"({_bound(means.loc[name, 'low'])} to {_bound(means.loc[name, 'high'])})"
-            for name in _WEATHER_METRICS
+            _mean_in_words(*found[name]) if name in found else "-" for name in _WEATHER_METRICS
         )
         rows.append((str(weather), str(policy), *cells))
     heads = ("weather", "policy", *_WEATHER_METRICS.values())
     return TextTable("By weather: means, with 95 % intervals", heads, tuple(rows), 2)
 
 
-def _bound(value: float) -> str:
-    return "-" if pd.isna(value) else _plain(value)
+def _mean_in_words(mean: float, low: float, high: float) -> str:
+    """Return a mean with its interval; "-" without a value."""
+    if math.isnan(mean):
+        return "-"
+    return _plain(mean) if math.isnan(low) else f"{_plain(mean)} ({_plain(low)} to {_plain(high)})"
 
 
 def flips_in_words(result: RunComparison, other: ComparedRun) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from cosim.core.state import Age, People, Vehicles
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.weather_shaders import LAMPS_MAX, PEOPLE_MAX, WALL_ANGLES, WALLS_UNIT
 from physics.cameras.view import View
-from physics.ground.tiles import tiles_within
+from physics.ground.tiles import Key, tiles_within
 from physics.street.furniture import KINDS
 from physics.street.surface import Surface
 
@@ -104,22 +104,19 @@ def nearest(heads: Floats, eye_m: Floats, heading_rad: float) -> NDArray[np.intp
     return np.asarray(order[:STREET_LAMPS_MAX])
 
 
-def walls_around(surface: Surface, head: Floats) -> NDArray[np.float32]:
+def walls_around(outlines: Sequence[shapely.Polygon], head: Floats) -> NDArray[np.float32]:
     """Return (WALL_ANGLES,) distances from a lamp to the nearest wall by direction, metres.
 
     The directions are those of points at equal distances on a square, as in the shader.
+    outlines: of the buildings around it
     """
     x, y = float(head[0]), float(head[1])
     reach = np.full(WALL_ANGLES, 2.0 * _RANGE_M)
-    outlines = [
-        shapely.get_coordinates(building.polygon.exterior)
-        for key in tiles_within(x, y, _RANGE_M)
-        for building in surface.buildings(key)
-        if building.polygon.distance(shapely.Point(x, y)) < _RANGE_M
-    ]
-    if outlines:
-        begin = np.concatenate([ring[:-1] for ring in outlines]) - (x, y)
-        along = np.concatenate([np.diff(ring, axis=0) for ring in outlines])
+    near = [one for one in outlines if one.distance(shapely.Point(x, y)) < _RANGE_M]
+    if near:
+        rings = [shapely.get_coordinates(one.exterior) for one in near]
+        begin = np.concatenate([ring[:-1] for ring in rings]) - (x, y)
+        along = np.concatenate([np.diff(ring, axis=0) for ring in rings])
         turn = 4.0 * (np.arange(WALL_ANGLES) + 0.5) / WALL_ANGLES
         side = 1.0 - np.abs(turn % 2.0 - 1.0)  # 0, 1, 0, 1, 0 around the square
         ray = np.column_stack(
@@ -155,6 +152,7 @@ class WallMap:
         self._context = context
         self._surface = surface
         self._known: dict[tuple[float, ...], NDArray[np.float32]] = {}
+        self._outlines: dict[Key, list[shapely.Polygon]] = {}
         self._held: list[tuple[float, ...]] = []
         self._texture: moderngl.Texture | None = None
 
@@ -171,10 +169,19 @@ class WallMap:
         rows = np.full((LAMPS_MAX, WALL_ANGLES), 2.0 * _RANGE_M, dtype=np.float32)
         for row, (key, head) in enumerate(zip(keys, heads, strict=True)):
             if key not in self._known:
-                self._known[key] = walls_around(self._surface, head)
+                self._known[key] = walls_around(self._around(head), head)
             rows[row] = self._known[key]
         self._texture.write(rows)
         self._held = keys
+
+    def _around(self, head: Floats) -> list[shapely.Polygon]:
+        """Return the outlines of the buildings of the tiles around a lamp."""
+        keys = tiles_within(float(head[0]), float(head[1]), _RANGE_M)
+        for key in keys:
+            if key not in self._outlines:
+                buildings = self._surface.chunk(key).buildings
+                self._outlines[key] = [building.polygon for building in buildings]
+        return [outline for key in keys for outline in self._outlines[key]]
 
     def bind(self) -> None:
         if self._texture is not None:

@@ -139,7 +139,7 @@ class Skins:
         self,
         context: moderngl.Context,
         made: Callable[[int, int], SkinnedBody | FarBody],
-        drawn: Callable[[bool], Programs],
+        drawn: Callable[[int], Programs],
         layout: tuple[str, ...],
     ) -> None:
         self._context = context
@@ -149,7 +149,7 @@ class Skins:
         self._rows: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._buffers: list[moderngl.Buffer] = []
-        self._arrays: dict[bool, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
+        self._arrays: dict[int, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
 
     def start(self, outfit: int, level: int) -> tuple[int, int, int]:
         """Load a body, and return its count of indices, first index and first vertex."""
