@@ -26,7 +26,7 @@ from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shadows import ShadowMaps
 from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
 from physics.cameras.gl.targets import Target
-from physics.cameras.gl.weather import Look, look_of, weathered_sky
+from physics.cameras.gl.weather import SNOW_EXPOSURE, Look, look_of, weathered_sky
 from physics.cameras.view import Shot, View
 from physics.dynamics.world import BulletWorld
 
@@ -57,16 +57,12 @@ class GlCamera(WorldCamera):
         self._look: Look | None = None
         if scan is None:
             self._sky = weathered_sky(light, weather, seed)
+            self._look = look_of(weather, self._sky, seed, light.shadows)
         else:
             self._sky = scan_sky(light, scan.facts, seed)
-        self._light = lighting_of(
-            self._sky,
-            haze=self._splats is None,
-            contact=light.shadows,
-            bright=1.0 + 0.45 * weather.snow if scan is None else 1.0,
-        )
-        if scan is None:
-            self._look = look_of(weather, self._sky, seed, self._light.shadows)
+        contact = light.shadows and self._look is not None
+        bright = 1.0 if self._look is None else 1.0 + SNOW_EXPOSURE * weather.snow
+        self._light = lighting_of(self._sky, self._splats is None, contact, bright)
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}

@@ -136,7 +136,7 @@ def walls_around(outlines: Sequence[shapely.Polygon], head: Floats) -> NDArray[n
 
 
 def casting_people(people: People, surface: Surface, view: View) -> Floats:
-    """Return (N, 4) feet and heights in metres of the people whose shadows by lamps are drawn."""
+    """Return (N, 4) feet and heights in metres of the people whose shadows are drawn without sun."""
     way = np.array([math.cos(view.heading_rad), math.sin(view.heading_rad)])
     far = np.hypot(*(people.xy - view.eye_m[:2] - _CAST_AHEAD_M * way).T)
     near = np.argsort(far, kind="stable")[:PEOPLE_MAX]

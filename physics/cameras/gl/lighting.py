@@ -79,8 +79,8 @@ def lighting_of(
     """Convert a sky to shader values.
 
     haze: of distant objects
-    contact: at night, moving objects darken the ground right below them: the shadow maps are then
-        seen from straight above
+    contact: without sun, moving objects darken the ground right below them: the shadow maps are
+        then seen from straight above
     bright: factor of the exposure
     """
     up, side, down = sky.ambient
@@ -88,7 +88,7 @@ def lighting_of(
         # Lamps light the street one by one; this is what its walls and ground reflect of them.
         spread = LAMPS_SPREAD * sky.lamps * STREET_LAMPLIGHT
         up, side = (np.maximum(one - spread, 0.05 * one) for one in (up, side))
-    contact = contact and sky.lamps > 0.0 and not sky.shadows
+    contact = contact and not sky.shadows
     return Lighting(
         _ABOVE if contact else sky.sun,
         sky.sun_colour,

@@ -166,7 +166,7 @@ void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
     float facing = max(dot(normal, sun.xyz), 0.0);
     vec3 light = side_light.rgb + normal.z * tilt_light.rgb + abs(normal.z) * flat_light.rgb;
     light += sun_light.rgb * (facing * sunlit(at, normal));
-    float gloss = 0.0;
+    float gloss = 0.0, lit = in_contact(at, normal);
 #ifdef WET
     float pool = puddle(at, label);
     albedo *= mix(1.0, mix(0.78, 0.55, raised), surface.x) * mix(1.0, 0.55, pool);
@@ -175,16 +175,16 @@ void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
 #ifdef SNOW
     float lies = snow_on(at, raised, label);
     vec2 on_snow = ground_at(at);
-    float heaped = 0.5 * noise(on_snow, 0.5) + 0.3 * noise(on_snow, 0.125) + 0.2 * noise(on_snow, 2.0);
-    albedo = mix(albedo, vec3(0.86, 0.88, 0.92) * (is_ground(label) ? 0.80 + 0.26 * heaped : 1.0), lies);
+    float heaped = 0.35 * noise(on_snow, 0.5) + 0.3 * noise(on_snow, 0.125) + 0.2 * noise(on_snow, 0.03125) + 0.15 * noise(on_snow, 2.0);
+    albedo = mix(albedo, vec3(0.86, 0.88, 0.92) * (is_ground(label) ? 0.70 + 0.42 * heaped : 1.0), lies);
 #endif
 #ifdef LAMPS
     vec3 mirrored_lamps;
     vec3 lamps = lamplight(at, normal, gloss, mirrored_lamps);
-    float lit = in_contact(at, normal);
-    light = lit * (light + lamps);
+    light += lamps;
     own += lit * mirrored_lamps;
 #endif
+    light *= lit;
     vec3 ray = normalize(at - eye.xyz);
     pixel = vec4(mix(albedo * light + own, fog_towards(ray), fogged()), label / 255.0);
 }
@@ -211,23 +211,29 @@ _WEATHER: Final = (
     + FOG_GLOW
     + "#ifdef LAMPS\n"
     + LAMPS
+    + "#endif\n"
     + """
 float in_contact(vec3 at, vec3 normal) {
-    // Light that is left under people and vehicles at night.
+    // Light that is left right under people and vehicles without sun.
 #ifdef SHADOWS
-    if (normal.z < 0.3 || sun.w == 0.0) return 1.0;
+    if (normal.z < 0.3 || sun.w == 0.0 || sun_light.r > 0.0) return 1.0;
     vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
     vec2 off = abs(in_map.xy - 0.5);
     if (max(off.x, off.y) > 0.49) return 1.0;
     const float r = 0.004;
     float lit = 0.25 * (texture(moving_shadow, in_map + vec3(r, 0.0, 0.0)) + texture(moving_shadow, in_map - vec3(r, 0.0, 0.0))
         + texture(moving_shadow, in_map + vec3(0.0, r, 0.0)) + texture(moving_shadow, in_map - vec3(0.0, r, 0.0)));
-    return mix(0.35, 1.0, lit);
+    lit = mix(0.42, 1.0, lit);
+    int count = int(night.w);
+    for (int k = 0; k < count; k++) {
+        vec3 off = at - person[k].xyz;
+        lit *= 1.0 - 0.62 * exp(-dot(off.xy, off.xy) / 0.075) * fading(0.35, 0.1, abs(off.z));
+    }
+    return lit;
 #else
     return 1.0;
 #endif
 }
-#endif
 #ifdef SNOW
 float snow_on(vec3 at, float raised, float label) {
     vec2 here = ground_at(at);

@@ -23,10 +23,13 @@ from physics.cameras.sun import sun_direction
 _CLOCK: Final = Clock()
 _ROWS: Final = 64
 """Rows (vec4) of a block, of which 52 are used; graphics cards require aligned starts of blocks."""
+_PEOPLE_ROW: Final = 4 + 3 * LAMPS_MAX
 _FULL_RAIN_MM_H: Final = 20.0
 _FULL_SNOW_MM_H: Final = 2.0
 _NIGHT_NOISE: Final = 5.0e-4
 """Sensor noise at night: variance of a pixel per light, where 1 is the white level."""
+SNOW_EXPOSURE: Final = 0.45
+"""Relative increase of the exposure on snow, which would otherwise be grey."""
 _GLOW_FROM_PER_M: Final = 0.004
 """Extinction from which fog glows around the sun, 1/m."""
 
@@ -132,10 +135,9 @@ class WeatherBlocks:
         rows[2] = _CLOCK.time_s(tick), look.seed, look.noise, count
         rows[3] = look.night
         if lamps is not None:
-            end = 4 + 3 * LAMPS_MAX
-            rows[4:end] = lamps.rows(anchor, look.brightness).reshape(-1, 4)
-            rows[3, 3] = len(people)
-            rows[end : end + len(people)] = people - (*anchor.tolist(), 0.0, 0.0)
+            rows[4:_PEOPLE_ROW] = lamps.rows(anchor, look.brightness).reshape(-1, 4)
+        rows[3, 3] = len(people)
+        rows[_PEOPLE_ROW : _PEOPLE_ROW + len(people)] = people - (*anchor.tolist(), 0.0, 0.0)
 
     def upload(self) -> None:
         if self._buffer is not None:
