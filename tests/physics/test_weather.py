@@ -105,11 +105,11 @@ def street_map() -> StreetMap:
 
 @pytest.fixture(scope="module")
 def frames(world: BulletWorld) -> Iterator[dict[str, Frame]]:
-    """The same view in every weather."""
+    """The same view in weathers that together have every variant of the programs."""
     found = {}
     robot, street = moment(world, 3)
-    for name, weather in WEATHERS.items():
-        with GlCamera(world, SPEC, depth=True, weather=weather) as camera:
+    for name in (CLEAR, "heavy_rain", "low_sun", "snow", "rainy_night"):
+        with GlCamera(world, SPEC, depth=True, weather=WEATHERS[name]) as camera:
             found[name] = camera.render(robot, street)
             assert same(found[name], camera.render(robot, street)), name
     yield found
@@ -125,7 +125,7 @@ def test_labels_and_depth_do_not_depend_on_the_weather(frames: dict[str, Frame])
         assert frame.labels is not None and frame.depth is not None
         assert np.array_equal(frame.labels, clear.labels), name
         np.testing.assert_allclose(frame.depth, clear.depth, rtol=2e-3)
-    assert len({frame.rgb.tobytes() for frame in frames.values()}) == len(WEATHERS)
+    assert len({frame.rgb.tobytes() for frame in frames.values()}) == len(frames)
 
 
 @needs_gl

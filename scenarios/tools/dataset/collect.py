@@ -420,6 +420,7 @@ def _written(
         "imu": demonstrator.manifest.imu,
         "people": demonstrator.manifest.people,
         "robot": robot,
+        "weather": spec.weather,
         "policy": demonstrator.manifest.name,
         "policy_source": spec.policy_source,
         "noise": spec.collecting.noise,
