@@ -105,9 +105,7 @@ WEATHERS: Final[Mapping[str, Weather]] = MappingProxyType(
                 benches=0.0,
                 children=0.5,
             ),
-            Weather(
-                name="fog", summary="dense fog, damp ground", visibility_m=70.0, cloud_cover=1.0
-            ),
+            Weather(name="fog", summary="dense fog", visibility_m=70.0, cloud_cover=1.0),
             Weather(
                 name="low_sun",
                 summary="sun at 7 degrees through thin fog",

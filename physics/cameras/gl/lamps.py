@@ -1,6 +1,6 @@
 """Lamps of a picture at night: street lamps with the houses that block them, and headlights.
 
-Houses are higher than lamps, so one distance per direction tells where a lamp's light ends.
+Houses are higher than lamps, so a lamp's light ends at one distance in each direction.
 """
 
 from __future__ import annotations
