@@ -52,6 +52,7 @@ _OF_COLLECT = Fields(
         "policy_data",
         "policy_memory",
         "robot",
+        "weather",
         "goal",
         "seed",
         "camera",

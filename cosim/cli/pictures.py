@@ -222,6 +222,7 @@ def look(
     ] = None,
     policy: Annotated[str, typer.Option(help="The policy that drives until then.")] = "route",
     robot: Annotated[str, typer.Option(help=help_of("robot"))] = "",
+    weather: Annotated[str, typer.Option(help=help_of("weather"))] = "",
     residents: Annotated[int | None, typer.Option(min=0, help=help_of("residents"))] = None,
     groups: Annotated[float | None, typer.Option(help=help_of("groups"))] = None,
     elderly: Annotated[float | None, typer.Option(help=help_of("elderly"))] = None,
@@ -233,7 +234,7 @@ def look(
     appearance: Appears = "splats",
 ) -> None:
     """Draw one picture of a scenario: by the robot's camera, from behind or from above."""
-    from scenarios.suites.catalog import one_scenario, with_crowd, with_robot
+    from scenarios.suites.catalog import one_scenario, with_crowd, with_robot, with_weather
     from scenarios.tools.viewing.look import look_at
 
     picked = view_of(view)
@@ -244,7 +245,7 @@ def look(
     else:
         found, of = _drawn(scenario, drawn_on, robot, suite or which), 1
     changed = with_crowd(
-        with_robot(found, robot),
+        with_weather(with_robot(found, robot), weather),
         residents=residents,
         groups=groups,
         elderly=elderly,

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 compare_app = typer.Typer()
 _OUTPUT_HELP = (
-    "Write it too: .csv (all metrics; flipped scenarios go into NAME.flipped.csv), .md, .tex; "
-    "repeatable."
+    "Write it too: .csv (all metrics; flipped scenarios go into NAME.flipped.csv), .md, .tex, "
+    ".png (means by weather, a line for each policy); repeatable."
 )
 
 
@@ -50,19 +50,21 @@ def compare(
     ],
     outputs: Annotated[list[Path] | None, typer.Option("-o", "--output", help=_OUTPUT_HELP)] = None,
 ) -> None:
-    """Compare runs with the first one, paired by scenario.
+    """Compare runs with the first one, paired by scenario; runs in several weathers also by these.
 
     Prints differences with their intervals over the suite, and by event, structure and split.
     Lists the scenarios whose result flipped.
     """
-    from cosim.report.compared import FORMATS
+    from cosim.report.compared import FORMATS, summary_by_weather
+    from cosim.report.curves import DRAWN, draw_curves
     from cosim.results.compare import compare_runs
     from scenarios.suites.exploits import exploit_of
 
     for path in outputs or ():
-        if path.suffix not in (".csv", *FORMATS):
+        if path.suffix not in (".csv", ".png", *FORMATS):
             raise UsageError(
-                f"{path}: its name must end in .csv, {', '.join(FORMATS)}: so the format is chosen"
+                f"{path}: its name must end in .csv, .png, {', '.join(FORMATS)}: so the format is "
+                "chosen"
             )
     with doing(f"comparing {len(folders)} runs"):
         comparison = compare_runs(folders)
@@ -71,6 +73,11 @@ def compare(
         if path.suffix == ".csv":
             _write(path, comparison.differences.to_csv(index=False))
             _write(path.with_suffix(".flipped.csv"), comparison.flipped.to_csv(index=False))
+        elif path.suffix == ".png":
+            title = f"{comparison.suite} by weather"
+            fields = ("weather", "policy")
+            picture = draw_curves(summary_by_weather(comparison), fields, DRAWN, title)
+            _write(path, picture)
         else:
             _write(path, FORMATS[path.suffix](comparison))
     print_comparison(out, comparison)
@@ -86,7 +93,13 @@ def compare(
 def print_comparison(out: Console, comparison: RunComparison) -> None:
     """Print a comparison of runs: terms, tables by suite and group, and flipped scenarios."""
     from cosim.cli.run_table import print_terms
-    from cosim.report.compared import flips_in_words, how_to_read, tables_of_comparison
+    from cosim.report.compared import (
+        flips_in_words,
+        how_to_read,
+        summary_by_weather,
+        table_by_weather,
+        tables_of_comparison,
+    )
 
     for run in (comparison.before, *comparison.others):
         out.print(f"{run.label}: {run.path}", soft_wrap=True, markup=False, highlight=False)
@@ -100,15 +113,21 @@ def print_comparison(out: Console, comparison: RunComparison) -> None:
             tables.show(out, columns, table.rows)
         for line in flips_in_words(comparison, other):
             out.print(line, soft_wrap=not out.is_terminal, markup=False, highlight=False)
+    summary = summary_by_weather(comparison)
+    if summary["weather"].nunique() > 1:
+        table = table_by_weather(summary)
+        out.print(table.title, soft_wrap=True, markup=False, highlight=False)
+        names, figures = table.heads[: table.names], table.heads[table.names :]
+        tables.show(out, [*tables.names(*names), *tables.figures(*figures)], table.rows)
     for note in (*comparison.notes, how_to_read(comparison)):
         out.print(note, soft_wrap=not out.is_terminal, markup=False, highlight=False)
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, content: str | bytes) -> None:
     from cosim.core.files import write_atomic
 
     try:
-        write_atomic(path, text.encode())
+        write_atomic(path, content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise unwritable(path, error) from error
 

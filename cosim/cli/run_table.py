@@ -39,6 +39,7 @@ from cosim.results.table import (
     why_inconclusive,
 )
 from cosim.spec.scenario import Scenario, read_suite
+from cosim.spec.weather import CLEAR
 
 
 def print_next_commands(err: Console, folder: Path, table: pd.DataFrame) -> None:
@@ -132,7 +133,7 @@ def print_table(
     columns = [*tables.names("episode"), *tables.labels("ended"), *tables.figures(*heads)]
     tables.show(out, columns, rows)
     print_terms(out, table, folder)
-    if words := _robot_in_words(folder):
+    if words := _conditions_in_words(folder):
         out.print(words, highlight=False, markup=False)
     counted = "/".join(name for _, name in COUNTS)
     shown = [letter for letter in LETTERS if letter != "D" or has_decoys(table)]
@@ -142,11 +143,12 @@ def print_table(
     print_statuses(out, table, scheduled)
 
 
-def _robot_in_words(folder: Path | None) -> str:
-    """Return robots and gait of a run; "" for the default robot, and without a run's folder."""
+def _conditions_in_words(folder: Path | None) -> str:
+    """Return robots, gait and weather of a run; "" for the defaults, and without a run's
+    folder."""
     if folder is None or not (folder / "run.json").is_file():
         return ""
-    return read_spec(folder).robot_in_words
+    return read_spec(folder).conditions_in_words
 
 
 def print_means(out: Console, table: pd.DataFrame) -> None:
@@ -257,6 +259,8 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
     renderers = table["renderer"].dropna().astype(str) if "renderer" in table else ()
     if any(appearance_of(renderer) == "mesh" for renderer in renderers):
         out.print("scanned places are drawn by their mesh", highlight=False, markup=False)
+    if "weather" in table and (weathers := sorted({*table["weather"]} - {CLEAR})):
+        out.print(f"weather {', '.join(weathers)}", highlight=False, markup=False)
     if words := injections_in_words(table):
         out.print(f"+ {words}", soft_wrap=True, highlight=False, markup=False)
     if words := _latency_in_words(table):

@@ -35,7 +35,7 @@ def list_all(
 
 
 def print_names(out: Console) -> None:
-    """Print a line for each suite, robot, camera, policy and goal."""
+    """Print a line for each suite, robot, camera, weather, policy and goal."""
     from cosim.policies import POLICIES
     from cosim.policies.follow.networks import weights_in_words
     from cosim.policies.follow.policy import Follow
@@ -46,6 +46,7 @@ def print_names(out: Console) -> None:
     from cosim.results.table import policy_in_words
     from cosim.spec.goal import GOALS
     from cosim.spec.robot import ROBOTS
+    from cosim.spec.weather import WEATHERS
     from physics.dynamics.legs.gait_file import weights_in_words as gait_weights_in_words
     from physics.robots.check import check_robot
     from scenarios.suites.catalog import SUITES, load_suite
@@ -66,6 +67,8 @@ def print_names(out: Console) -> None:
         )
         for name, mount in one.mounts.items():
             out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)
+    for weather in WEATHERS.values():
+        out.print(f"weather {weather.name}  {weather.summary}", soft_wrap=True)
     for name, make in POLICIES.items():
         called = policy_in_words(name, make().manifest.privileged)
         out.print(f"policy  {called}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Final, NamedTuple
@@ -12,6 +13,8 @@ from cosim.results.compare import MIN_CHANGED, ComparedRun, RunComparison
 from cosim.results.discerned import DISCERNED, DISCERNED_IN_WORDS
 from cosim.results.intervals import BOOTSTRAP, MIN_N
 from cosim.results.metrics import SUCCESS_IN_WORDS
+from cosim.results.table import summary_of
+from cosim.spec.weather import WEATHERS
 
 _HLINES: Final[list[Any]] = [
     {"selector": f"{rule}rule", "props": ":hline"} for rule in ("top", "mid", "bottom")
@@ -44,6 +47,12 @@ _GROUP_METRICS: Final = {
     DISCERNED: "D",
     "route_completion": "RC",
     "failures_per_100m": "FC",
+}
+_WEATHER_METRICS: Final = {
+    "success": "SR",
+    "route_completion": "RC",
+    "failures_per_100m": "FC",
+    "velocity_mean_mps": "V, m/s",
 }
 _LATEX_ESCAPES: Final = {
     "\\": r"\textbackslash{}",
@@ -114,6 +123,51 @@ def _plain(value: float) -> str:
 
 def _signed(value: float) -> str:
     return f"{value + 0.0:+.{3 if abs(value) < 10.0 else 2 if abs(value) < 100.0 else 1}f}"
+
+
+def summary_by_weather(result: RunComparison) -> pd.DataFrame:
+    """Return a row for each weather, policy and metric of all runs: `summary_of` with these.
+
+    Columns: weather, policy, metric, and those of `summary_of`; weathers in the order of
+    `WEATHERS`.
+    """
+    runs = (result.before, *result.others)
+    names = [str(run.table["policy"].iloc[0]) for run in runs]
+    parts = []
+    for weather in WEATHERS:
+        for run, policy in zip(runs, names, strict=True):
+            rows = run.table[run.table["weather"] == weather]
+            if len(rows):
+                part = summary_of(rows).reset_index()
+                part.insert(0, "weather", weather)
+                part.insert(1, "policy", policy)
+                parts.append(part)
+    return pd.concat(parts, ignore_index=True)
+
+
+def table_by_weather(summary: pd.DataFrame) -> TextTable:
+    """Build the table of `summary_by_weather`: a row for each weather and policy."""
+    rows = []
+    for (weather, policy), of in summary.groupby(["weather", "policy"], sort=False):
+        found = {
+            str(name): (mean, low, high)
+            for name, mean, low, high in of[["metric", "mean", "low", "high"]].itertuples(
+                index=False
+            )
+        }
+        cells = (
+            _mean_in_words(*found[name]) if name in found else "-" for name in _WEATHER_METRICS
+        )
+        rows.append((str(weather), str(policy), *cells))
+    heads = ("weather", "policy", *_WEATHER_METRICS.values())
+    return TextTable("By weather: means, with 95 % intervals", heads, tuple(rows), 2)
+
+
+def _mean_in_words(mean: float, low: float, high: float) -> str:
+    """Return a mean with its interval; "-" without a value."""
+    if math.isnan(mean):
+        return "-"
+    return _plain(mean) if math.isnan(low) else f"{_plain(mean)} ({_plain(low)} to {_plain(high)})"
 
 
 def flips_in_words(result: RunComparison, other: ComparedRun) -> tuple[str, ...]:

@@ -24,6 +24,8 @@ _TITLES: Final = {
     "pedestrian_distance_min_m": "nearest to a person's centre, m",
     "time_to_goal_s": "time to the goal, s",
 }
+DRAWN: Final = tuple(_TITLES)
+"""Metrics of a picture."""
 _SHARES: Final = ("success", "spl", "route_completion")
 _COLOURS: Final = (
     "#0072b2",

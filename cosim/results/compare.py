@@ -31,7 +31,7 @@ from cosim.results.metrics import (
     RATE_NEEDS_M,
     UNKNOWN_WITH_CRASH,
 )
-from cosim.results.run_spec import names_by_robot
+from cosim.results.run_spec import names_by_conditions
 from cosim.results.table import (
     crashed_in,
     injections_in_words,
@@ -398,11 +398,11 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
 
 
 def _labels(runs: Sequence[WholeRun]) -> list[str]:
-    """Return unique labels: policy names, with robots if there are several.
+    """Return unique labels: policy names, with robots and weather if there are several.
 
     Folder names where these do not differ, numbered if equal.
     """
-    names = names_by_robot([run.spec for run in runs])
+    names = names_by_conditions([run.spec for run in runs])
     if len({*names}) < len(names):
         names = [run.path.absolute().name for run in runs]
     return [
@@ -426,7 +426,7 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
         pairs = pairs_of(other.table)
         if pairs.invalid or pairs.single:
             yield f"{other.label}: D is over {pairs.in_words}"
-        if words := run.spec.robot_in_words:
+        if words := run.spec.conditions_in_words:
             yield f"{other.label}: {words}"
         if words := injections_in_words(other.table):
             yield f"{other.label}: {words}"
@@ -497,6 +497,7 @@ def _terms(table: pd.DataFrame) -> dict[str, str]:
     first = table.iloc[0]
     return {
         "robot": " and ".join(sorted({*table["robot"]})),
+        "weather": " and ".join(sorted({*table["weather"]})),
         "goal": first["goal_protocol"],
         "odometry": first["odometry"],
         _TRACK: first["track"],

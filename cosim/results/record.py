@@ -34,6 +34,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Scenario, Split, content_hash
+from cosim.spec.weather import CLEAR
 
 _SCHEMA = 1
 _MOST_BYTES = 256 << 20
@@ -80,6 +81,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
     hash: content hash of the whole spec
     decoy_of: id of the scenario whose decoy it is, "" for any other
     crowd_added: whether the crowd is not the suite's own (`CrowdSpec.added`)
+    weather: name of its weather
     """
 
     id: str
@@ -90,6 +92,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
     structure: str = ""
     decoy_of: str = ""
     crowd_added: bool = False
+    weather: str = CLEAR
     robot: str
 
     @classmethod
@@ -104,6 +107,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
             structure=scenario.structure,
             decoy_of=scenario.decoy_of,
             crowd_added=scenario.crowd.added,
+            weather=scenario.conditions.name,
             robot=scenario.robot,
         )
 
@@ -231,9 +235,9 @@ RECORD_FILE = FlatFile(
     {"scenario": ScenarioFacts, "setup": RunSetup, "manifest": Manifest},
     """
     scenario=scenario.id scenario_hash=scenario.hash suite suite_hash seed=scenario.seed
-    split structure decoy_of crowd_added run_seed=setup.seed episode robot policy=manifest.name
-    policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
-    nonstandard goal_protocol=manifest.goal odometry lidar=manifest.scan
+    split structure decoy_of crowd_added weather run_seed=setup.seed episode robot
+    policy=manifest.name policy_version=manifest.version policy_source policy_runs waypoints
+    camera cameras rate_hz nonstandard goal_protocol=manifest.goal odometry lidar=manifest.scan
     imu=manifest.imu people=manifest.people privileged latency_ms real_time renderer
     gait gait_hash versions status reason ended ticks state_hash measures failures walked_into
     red_light_entries events injections metric_schema schema clock

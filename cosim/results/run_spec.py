@@ -92,6 +92,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
         spec has as defaults
     scenarios: ids of the whole run
     shard: part of the run in this folder, None for all
+    weather: weather in place of the scenarios' own, "" for their own
     counterfactual: whether each episode is compared with its street without the robot
     shared_renderer: whether one process drew for all others; results do not depend on it
     """
@@ -103,17 +104,20 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     manifest: Manifest
     setup: RunSetup
     scenarios: tuple[str, ...]
+    weather: str = ""
     counterfactual: bool = False
     shared_renderer: bool = False
     shard: Shard | None = None
     schema: int = SCHEMA
 
     @property
-    def robot_in_words(self) -> str:
-        """Names and short hashes of robots and gait; "" for the default robot."""
+    def conditions_in_words(self) -> str:
+        """Names and short hashes of robots and gait, and the weather; "" for the defaults."""
         robots = [f"robot {n} ({h[:8]})" for n, h in self.robots.items() if n != COURIER.name]
         if self.setup.gait:
             robots.append(gait_in_words(self.setup.gait, self.setup.gait_hash))
+        if self.weather:
+            robots.append(f"weather {self.weather}")
         return ", ".join(robots)
 
     def apart(
@@ -154,7 +158,7 @@ RUN_FILE = FlatFile(
     RunSpec,
     {"setup": RunSetup, "manifest": Manifest},
     """
-    suite robots suite_version suite_hash policy policy_name=manifest.name
+    suite robots weather suite_version suite_hash policy policy_name=manifest.name
     policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
     goal_protocol=manifest.goal odometry lidar=manifest.scan imu=manifest.imu
     people=manifest.people latency_ms real_time
@@ -167,16 +171,28 @@ RUN_FILE = FlatFile(
 """Layout of run.json: flat, for compatibility with files written before `RunSpec` had parts."""
 
 
-def names_by_robot(specs: Sequence[RunSpec]) -> list[str]:
-    """Return the policy name of each run, with its robots if the policy drove others, too."""
+def names_by_conditions(specs: Sequence[RunSpec]) -> list[str]:
+    """Return the policy name of each run, with robots and weather if the policy had others, too."""
     robots = {spec.manifest.name: set[str]() for spec in specs}
+    weathers = {spec.manifest.name: set[str]() for spec in specs}
     for spec in specs:
         robots[spec.manifest.name].add(_robots_in_words(spec))
+        weathers[spec.manifest.name].add(spec.weather)
     return [
-        f"{name}, {_robots_in_words(spec)}" if len(robots[name]) > 1 else name
+        _varied_in_words(spec, robots[name], weathers[name])
         for spec in specs
         for name in [spec.manifest.name]
     ]
+
+
+def _varied_in_words(spec: RunSpec, robots: set[str], weathers: set[str]) -> str:
+    """Return robots and weather of a run, as far as these differ between runs of its policy."""
+    words = [spec.manifest.name]
+    if len(robots) > 1:
+        words.append(_robots_in_words(spec))
+    if len(weathers) > 1:
+        words.append(spec.weather or "own weather")
+    return ", ".join(words)
 
 
 def _robots_in_words(spec: RunSpec) -> str:

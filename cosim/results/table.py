@@ -48,6 +48,7 @@ _ORDER = (
     "structure",
     "decoy_of",
     "crowd_added",
+    "weather",
     "run_seed",
     "episode",
     "robot",

@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import msgspec
 
-from cosim.core.errors import UsageError
+from cosim.core.errors import UsageError, unknown
 from cosim.spec.connection import Connection
 from cosim.spec.demo_options import DemoOptions
 from cosim.spec.episode_id import check_seed
@@ -23,6 +23,8 @@ from cosim.spec.run_config import (
     Isolation,
     RunConfig,
 )
+from cosim.spec.scenario import Scenario
+from cosim.spec.weather import WEATHERS
 
 ONNX_GAIT: Final = "onnx:"
 """Beginning of the name of a gait that is an ONNX file."""
@@ -119,12 +121,13 @@ MOST_PACE = 100.0
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """Options of an episode. Only robot, gait, latency and collecting noise affect what happens in
-    the street.
+    """Options of an episode. Only robot, weather, gait, latency and collecting noise affect what
+    happens in the street.
 
     seed: seed of the run, for policy ids and seeds (`cosim.spec.episode_id`) and the order of
         episodes. If it is None, a run draws one, and a single Episode uses 0.
     robot: robot in place of the scenario's (`cosim.spec.robot`).
+    weather: weather in place of the scenario's (`cosim.spec.weather`).
     gait: gait of a robot with legs in place of its own (`physics.dynamics.legs.gait_file`). Its
         path is recorded as an absolute one.
     goal: goal protocol in place of the manifest's (`cosim.spec.goal`).
@@ -150,6 +153,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     seed: int | None = None
     robot: str = ""
+    weather: str = ""
     gait: str = ""
     goal: GoalProtocol | None = None
     own_camera: bool = False
@@ -171,6 +175,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
         return cls(
             seed=config.seed,
             robot=config.robot,
+            weather=config.weather,
             gait=absolute_gait(config.gait),
             own_camera=config.own_camera,
             goal=goal_called(config.goal) if config.goal else None,
@@ -184,6 +189,8 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
+        if self.weather and self.weather not in WEATHERS:
+            raise unknown("weather", self.weather, WEATHERS)
         if not (math.isfinite(self.latency_ms) and 0.0 <= self.latency_ms <= MOST_LATENCY_MS):
             raise UsageError(
                 f"latency_ms must be from 0 to {MOST_LATENCY_MS:g} ms, not {self.latency_ms:g}"
@@ -195,6 +202,11 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
             )
         if self.real_time and self.latency_ms:
             raise UsageError("real_time measures the latency of every answer: leave latency_ms out")
+
+    def scenario(self, scenario: Scenario) -> Scenario:
+        """Return a scenario with the robot and the weather of these options. Raises UsageError,
+        SpecError."""
+        return scenario.driven_by(self.robot).in_weather(self.weather)
 
 
 def absolute_gait(gait: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
-from cosim.core.errors import UsageError
+from cosim.core.errors import UsageError, unknown
 from cosim.spec.connection import Connection, checked_endpoint, connecting, listening
 from cosim.spec.ros2 import (
     LARGEST_DOMAIN,
@@ -23,6 +23,7 @@ from cosim.spec.ros2 import (
     Ros2Settings,
     Ros2Wait,
 )
+from cosim.spec.weather import WEATHERS
 
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 """Renderers of `--camera`; auto selects gl where it works."""
@@ -229,6 +230,13 @@ class RunConfig:
             panel=_STREET,
         ),
     ] = None
+    weather: Annotated[
+        str,
+        Option(
+            "Weather in place of the scenario's, by name (`cosim list`); marked in every row.",
+            panel=_STREET,
+        ),
+    ] = ""
     crowd: Annotated[
         int | None,
         Option(
@@ -493,6 +501,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         _ = self.latency_ms
+        if self.weather and self.weather not in WEATHERS:
+            raise unknown("weather", self.weather, WEATHERS)
         if self.resume and self.out is None:
             raise UsageError("--resume needs --out: the folder of the run to finish")
         if self.shard and self.latency == MEASURED:

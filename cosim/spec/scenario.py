@@ -36,6 +36,7 @@ from cosim.spec.validation import (
     Within,
     shown,
 )
+from cosim.spec.weather import CLEAR, Weather, weather_called, weather_fault
 
 _SCHEMA = 1
 """Version of the scenario files; other versions are refused."""
@@ -196,7 +197,7 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
 
 
 class Light(Ranged, frozen=True, kw_only=True):
-    """Time of day and weather; they affect only pictures.
+    """Time of day, clouds and fog; they affect only pictures.
 
     hour: solar time; the sun is highest at 12.
     cloud_cover: 0 (clear) to 1 (overcast).
@@ -235,6 +236,8 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         static, route, or "".
     decoy_of: id of the scenario whose decoy this is, or "". A decoy equals it until its event
         begins, and then needs another response of the robot.
+    weather: name in `cosim.spec.weather.WEATHERS`. The default, "clear", is not encoded, so that
+        the hashes of older scenarios stay the same; `conditions` is the weather itself.
     go_on_mps: mean speed of the robot from the trigger to 1 m past the person. A decoy without a
         reason to stop requires at least this speed and no stop. An event requires the opposite,
         that the robot gives way. 0 without these rules.
@@ -268,6 +271,7 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     ends_on_failure: bool = False
     ends_at: Literal["goal", "stop"] = "goal"
     light: Light = Light()
+    weather: str | msgspec.UnsetType = msgspec.UNSET
     split: Split = "val"
     structure: Annotated[str, _NAME] = ""
     decoy_of: Annotated[str, _NAME] = ""
@@ -278,12 +282,19 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     def called(self) -> str:
         return "scenario " if FOLDER.refusal("id", self.id) else f"scenario '{self.id}': "
 
+    def __post_init__(self) -> None:
+        if self.weather == CLEAR:
+            msgspec.structs.force_setattr(self, "weather", msgspec.UNSET)
+        super().__post_init__()
+
     def contradictions(self) -> Iterator[str]:
         if self.schema != _SCHEMA:
             yield (
                 f"scenario '{self.id}' has schema {shown(self.schema)}; this version reads "
                 f"{_SCHEMA}"
             )
+        if self.weather is not msgspec.UNSET:
+            yield _weather_fault(self.called, self.weather, self.light)
         if len(self.route) < 2:
             yield f"{self.called}route needs two points or more"
             return
@@ -323,6 +334,32 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     def start_pose(self) -> Pose:
         return Pose(*self.start)
 
+    @property
+    def conditions(self) -> Weather:
+        """Weather of the scenario."""
+        return weather_called(CLEAR if self.weather is msgspec.UNSET else self.weather)
+
+    @property
+    def weathered_crowd(self) -> CrowdSpec:
+        """Crowd in the scenario's weather, which keeps some children and residents indoors."""
+        now = self.conditions
+        if now.benches == now.children == 1.0:
+            return self.crowd
+        return msgspec.structs.replace(
+            self.crowd,
+            residents=round(now.benches * self.crowd.residents),
+            children=now.children * self.crowd.children,
+        )
+
+    def in_weather(self, weather: str) -> Scenario:
+        """Return the scenario in another weather; unchanged if `weather` is "". Raises SpecError.
+
+        >>> from cosim import load_suite
+        >>> load_suite("unit").scenarios[0].in_weather("rain").conditions.rain_mm_h
+        4.0
+        """
+        return msgspec.structs.replace(self, weather=weather) if weather else self
+
     def driven_by(self, robot: str) -> Scenario:
         """Return the scenario with another robot; unchanged if `robot` is "". Raises UsageError.
 
@@ -343,6 +380,18 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     def route_line(self) -> Polyline:
         """Reference route by arc length, made once."""
         return Polyline(self.route)
+
+
+def _weather_fault(called: str, weather: str, light: Light) -> str:
+    """Return the error of a weather in a light; "" without one."""
+    if fault := weather_fault(weather):
+        return f"{called}{fault}"
+    if light.hdri:
+        return (
+            f"{called}weather '{weather}' contradicts light.hdri, a photographed sky with its own "
+            f"weather: leave one of them out"
+        )
+    return ""
 
 
 class Suite(Ranged, frozen=True, kw_only=True):

@@ -14,6 +14,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.options import CameraName
 from cosim.spec.run_config import Appearance, CameraChoice
 from cosim.spec.scenario import Light
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.gl import context
 
 if TYPE_CHECKING:
@@ -59,18 +60,19 @@ def camera_of(
     spec: CameraSpec,
     *,
     light: Light | None = None,
+    weather: Weather = WEATHERS[CLEAR],
     depth: bool = False,
     appearance: Appearance = "splats",
 ) -> GlCamera | BulletCamera:
     """Create a camera in a world, for use in a `with` block.
 
-    light: for the gl camera; the other's light is always day
+    light, weather: for the gl camera; the other's pictures are always of a clear day
     appearance: of a scanned place in the gl camera; the other draws its mesh
     """
     if name == "gl":
         from physics.cameras.gl.camera import GlCamera
 
-        return GlCamera(world, spec, depth, light or Light(), appearance)
+        return GlCamera(world, spec, depth, light or Light(), appearance, weather)
     from physics.cameras.bullet_camera import BulletCamera
 
     return BulletCamera(world, spec, depth, egl=name == "bullet-egl")

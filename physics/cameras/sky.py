@@ -47,7 +47,7 @@ HOUSE_ALBEDO: Final = 0.4
 
 _FULL_KLX: Final = 128.0
 _CLEAR_M: Final = 30_000.0
-_FOG_TOP_M: Final = 60.0
+FOG_TOP_M: Final = 60.0
 _ADAPTED: Final = 0.85
 """Exponent of the light that exposure compensates; cameras and eyes do not fully adapt to
 darkness.
@@ -57,7 +57,7 @@ _GROUND_KEY: Final = 0.68
 """Brightness of the ground by day, where exposure is metered on the lower half of a picture."""
 _IN_SUN: Final = 0.5
 """Share of the ground of a street that the sun reaches, for metering."""
-_LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
+STREET_LAMPLIGHT: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 """Light of a lamp-lit street at night, some 28 lx."""
 _NIGHT: Final = 2.2e-4 * np.array([0.62, 0.72, 1.0])
 """Radiance scale of the glow of a city's sky."""
@@ -95,17 +95,23 @@ class Sky:
 
 
 @lru_cache(maxsize=8)
-def sky_of(light: Light, seed: int = 0, to_sun: tuple[float, float, float] | None = None) -> Sky:
+def sky_of(
+    light: Light,
+    seed: int = 0,
+    to_sun: tuple[float, float, float] | None = None,
+    fog_top_m: float = FOG_TOP_M,
+) -> Sky:
     """Compute the sky of a light.
 
     seed: of the clouds
     to_sun: direction of the sun in place of that of the light's hour
+    fog_top_m: height of the fog over the ground
 
     The sky of a scenario's default light is baked.
     Raises SpecError naming a broken picture of the user's.
     """
     if light != Light() or to_sun is not None:
-        return _photographed(light) if light.hdri else _procedural(light, seed, to_sun)
+        return _photographed(light) if light.hdri else _procedural(light, seed, to_sun, fog_top_m)
 
     def make() -> dict[str, NDArray[Any]]:
         return {
@@ -142,7 +148,12 @@ def irradiance(radiance: NDArray[np.floating], towards: Floats) -> Floats:
     return np.asarray(np.tensordot(weight, radiance.astype(float), axes=2))
 
 
-def _procedural(light: Light, seed: int, to_sun: tuple[float, float, float] | None = None) -> Sky:
+def _procedural(
+    light: Light,
+    seed: int,
+    to_sun: tuple[float, float, float] | None = None,
+    fog_top_m: float = FOG_TOP_M,
+) -> Sky:
     sun = sun_direction(light.hour, light.day_of_year, light.latitude_deg)
     if to_sun is not None:
         sun = np.array(to_sun)
@@ -152,14 +163,15 @@ def _procedural(light: Light, seed: int, to_sun: tuple[float, float, float] | No
     clear = clear_sky(ways, sun, TURBIDITY) / (_FULL_KLX / math.pi)
     sky, seen = clouded(clear, ways, sun, beam, light.cloud_cover, seed)
     fog_per_m = -math.log(0.05) / (light.fog_m if light.fog_m is not None else _CLEAR_M)
-    sky, beam = _fogged(sky, ways, sun, beam * seen, fog_per_m if light.fog_m is not None else 0.0)
+    foggy_per_m = fog_per_m if light.fog_m is not None else 0.0
+    sky, beam = _fogged(sky, ways, sun, beam * seen, foggy_per_m, fog_top_m)
     lamps = float(np.clip(0.5 - math.degrees(rise) / 8.0, 0.0, 1.0))
     sky += lamps * _NIGHT * (0.05 + 0.16 * np.exp(-np.maximum(ways[..., 2:], 0.0) / 0.25))
     return _assembled(light, sun, beam, sky, lamps, fog_per_m)
 
 
 def _fogged(
-    sky: Floats, ways: Floats, sun: Floats, beam: Floats, per_m: float
+    sky: Floats, ways: Floats, sun: Floats, beam: Floats, per_m: float, top_m: float
 ) -> tuple[Floats, Floats]:
     """Attenuate sky and sun by a layer of fog.
 
@@ -167,8 +179,8 @@ def _fogged(
     """
     if per_m == 0.0:
         return sky, beam
-    left = np.exp(-per_m * _FOG_TOP_M / np.maximum(ways[..., 2:], 0.02))
-    through = math.exp(-per_m * _FOG_TOP_M / max(float(sun[2]), 0.05))
+    left = np.exp(-per_m * top_m / np.maximum(ways[..., 2:], 0.02))
+    through = math.exp(-per_m * top_m / max(float(sun[2]), 0.05))
     up = irradiance(np.where(ways[..., 2:] > 0.0, sky, 0.0), np.array([0.0, 0.0, 1.0]))
     grey = 0.75 * (up + (1.0 - through) * beam * max(float(sun[2]), 0.0))
     grey = 0.6 * float(grey @ LUMINANCE) + 0.4 * grey
@@ -180,7 +192,7 @@ def _assembled(
 ) -> Sky:
     ways = directions(len(sky))
     above = ways[..., 2:] > 0.0
-    up = irradiance(np.where(above, sky, 0.0), np.array([0.0, 0.0, 1.0])) + lamps * _LAMPS
+    up = irradiance(np.where(above, sky, 0.0), np.array([0.0, 0.0, 1.0])) + lamps * STREET_LAMPLIGHT
     ground = GROUND_ALBEDO * (up + beam * max(float(sun[2]), 0.0))
     horizon = _horizon(sky, len(sky) // 2)
     near = np.exp(-np.maximum(-ways[..., 2:], 0.0) / HORIZON_FADE)
@@ -189,7 +201,7 @@ def _assembled(
     compass = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0])
     side = (
         np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0)
-        + 0.7 * lamps * _LAMPS
+        + 0.7 * lamps * STREET_LAMPLIGHT
     )
     glare = _disc(ways, sun, beam)
     over = (
@@ -249,5 +261,5 @@ def _photographed(light: Light) -> Sky:
     beam = spot * scale
     sky = rest.astype(float) * scale
     if light.fog_m is not None:
-        sky, beam = _fogged(sky, directions(len(sky)), sun, beam, fog_per_m)
+        sky, beam = _fogged(sky, directions(len(sky)), sun, beam, fog_per_m, FOG_TOP_M)
     return _assembled(light, sun, beam, sky, 0.0, fog_per_m)

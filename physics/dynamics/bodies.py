@@ -71,14 +71,16 @@ _Placement = tuple[tuple[float, float, float], tuple[float, float, float, float]
 class Bodies(BulletClient):
     """A running PyBullet client with all collision bodies of an episode.
 
+    grip: factor of the friction of the ground
     at_m: position of the robot's base frame
     watched: bodies that `robot_contacts` checks
 
     Inactive bodies of people and vehicles are parked far below the ground and reused.
     """
 
-    def __init__(self, robot: Robot, substep_s: float) -> None:
+    def __init__(self, robot: Robot, substep_s: float, grip: float = 1.0) -> None:
         super().__init__()
+        self._grip = grip
         self._com_height_m = robot.com_height_m
         self._legs = robot.drive if isinstance(robot.drive, Legs) else None
         self._identities: dict[int, tuple[BodyKind, str]] = {}
@@ -156,7 +158,7 @@ class Bodies(BulletClient):
 
     def _add_ground(self, mesh: Mesh, value: float) -> int:
         ground = self.add_concave(mesh)
-        self._call("changeDynamics", ground, -1, lateralFriction=value)
+        self._call("changeDynamics", ground, -1, lateralFriction=self._grip * value)
         return ground
 
     def _add_building(self, building: Building) -> list[int]:

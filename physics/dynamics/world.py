@@ -72,6 +72,7 @@ class BulletWorld:
 
     surface: ground with buildings and props
     barriers, obstacles: additional static bodies of the episode
+    grip: factor of the friction of the ground
     drive: replaces the robot's own drive, which is created when the robot is first placed
     """
 
@@ -82,12 +83,14 @@ class BulletWorld:
         robot: Robot = COURIER,
         obstacles: Sequence[Obstacle] = (),
         drive: Drive | None = None,
+        grip: float = 1.0,
     ) -> None:
         self.surface = surface
         self.robot = robot
         self.barriers = tuple(barriers)
         self.obstacles = tuple(obstacles)
         self._drive = drive
+        self._grip = grip
         self._watch: LegWatch | None = None
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
@@ -105,7 +108,7 @@ class BulletWorld:
 
     def __enter__(self) -> Self:
         if self._bodies is None:
-            self._bodies = Bodies(self.robot, SUBSTEP_S)
+            self._bodies = Bodies(self.robot, SUBSTEP_S, self._grip)
             for barrier in self.barriers:
                 size = (barrier.thickness_m, barrier.length_m)
                 z = self.surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)

@@ -102,7 +102,7 @@ class Episode:
         renderer: RendererAddress | None = None,
         commands: CommandLog | None = None,
     ) -> None:
-        self.scenario = scenario = scenario.driven_by(options.robot)
+        self.scenario = scenario = options.scenario(scenario)
         manifest = with_goal(manifest, options.goal)
         self.manifest = manifest
         self.options = options

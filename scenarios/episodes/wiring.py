@@ -38,6 +38,7 @@ from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import join_faults
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.choice import camera_of, camera_of_choice, drawn_appearance, renderer_of
 from physics.dynamics.drive import SUBSTEP_S
 from physics.dynamics.drives import gait_drive
@@ -117,7 +118,14 @@ def staged(
         gait = user_gait(options.gait, robot, SUBSTEP_S) if options.gait else None
         motors = None if gait is None else gait_drive(robot, gait)
         world = stack.enter_context(
-            BulletWorld(street, scenario.barriers, robot, scenario.obstacles, motors)
+            BulletWorld(
+                street,
+                scenario.barriers,
+                robot,
+                scenario.obstacles,
+                motors,
+                scenario.conditions.grip,
+            )
         )
         crowd = crowd_of(scenario)
         stack.enter_context(crowd)
@@ -128,6 +136,7 @@ def staged(
                 world,
                 spec,
                 light=scenario.light,
+                weather=scenario.conditions,
                 depth=spec.depth,
                 appearance=options.appearance,
             )
@@ -150,7 +159,7 @@ def staged(
             )
         look = None if camera is None else partial(draw_empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
-        if scenario.crowd.residents:
+        if scenario.weathered_crowd.residents:
             # Imported only where needed: it loads scipy.
             from scenarios.events.resident_director import with_residents
 
@@ -244,13 +253,14 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd |
     return sumo_crowd(
         net_path,
         street_map,
-        scenario.crowd,
+        scenario.weathered_crowd,
         scenario.seed,
         closed,
         start_xy,
         robot.footprint_m,
         before,
         pedestrian_obstacles(scenario, street_map),
+        scenario.conditions,
     )
 
 
@@ -264,6 +274,7 @@ def sumo_crowd(
     footprint_m: tuple[float, float] = COURIER.footprint_m,
     before: Entrances | None = None,
     standing: StandingObstacles | None = None,
+    weather: Weather = WEATHERS[CLEAR],
 ) -> SumoCrowd:
     """Create the crowd and traffic of a net by SUMO, not started. Raises MachineError if SUMO
     cannot be loaded."""
@@ -273,7 +284,7 @@ def sumo_crowd(
         raise MachineError(f"SUMO cannot be loaded: {error}. `cosim doctor` says more") from error
 
     return SumoCrowd(
-        net_path, street_map, spec, seed, closed, start_xy, footprint_m, before, standing
+        net_path, street_map, spec, seed, closed, start_xy, footprint_m, before, standing, weather
     )
 
 

@@ -63,7 +63,7 @@ def with_residents(
     people: Callable[[], People],
 ) -> Director:
     """Wrap a director to add the scenario's residents; unchanged if the scenario has none."""
-    count = scenario.crowd.residents
+    count = scenario.weathered_crowd.residents
     if not count:
         return director
     graph = behavior_graph(

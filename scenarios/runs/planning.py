@@ -158,8 +158,8 @@ def run_spec(
 ) -> RunSpec:
     """Build the identity of a run.
 
-    whole: the suite before a robot is applied.
-    picked: the scenarios of the run, with its robot.
+    whole: the suite before robot and weather are applied.
+    picked: the scenarios of the run, with its robot and weather.
     policy: name of the policy.
     shared: whether one renderer draws for all episodes.
     shard: the part of the run in the folder, None for all.
@@ -193,6 +193,7 @@ def run_spec(
         manifest=manifest,
         setup=setup,
         scenarios=tuple(s.id for s in picked),
+        weather=options.weather,
         counterfactual=options.counterfactual,
         shared_renderer=shared,
         shard=shard,

@@ -248,7 +248,7 @@ class _Renderer:
                 world = BulletWorld(
                     _surface(scenario.place), scenario.barriers, robot, scenario.obstacles
                 )
-                one.seat = self._atlas.join(world, scenario.light)
+                one.seat = self._atlas.join(world, scenario.light, scenario.conditions)
         except Exception as error:  # noqa: BLE001  concerns one scenario only
             return _refused(error)
         return self._rendered

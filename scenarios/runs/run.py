@@ -152,6 +152,7 @@ def run(
         resume=resume,
         shared_renderer=shared_renderer,
         robot=options.robot,
+        weather=options.weather,
         real_time=options.real_time,
         pace=options.pace,
         latency=repr(options.latency_ms) if options.latency_ms else "",
@@ -216,7 +217,9 @@ def execute_run(
         split_called(config.split),
         decoys=not config.no_decoys,
     )
-    of_run = tuple(scenario.driven_by(config.robot) for scenario in of_run)
+    of_run = tuple(
+        scenario.driven_by(config.robot).in_weather(config.weather) for scenario in of_run
+    )
     plan = _planned(config, given, whole, of_run, ends)
     reporter.planned(plan)
     with ExitStack() as stack:
@@ -376,6 +379,7 @@ def measured_latency(
     real_time = EpisodeOptions(
         seed=options.seed,
         robot=options.robot,
+        weather=options.weather,
         goal=options.goal,
         own_camera=options.own_camera,
         camera=options.camera,

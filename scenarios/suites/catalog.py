@@ -166,3 +166,14 @@ def with_robot(whole: Suite, robot: str) -> Suite:
     if scenarios == whole.scenarios:
         return whole
     return msgspec.structs.replace(whole, scenarios=scenarios)
+
+
+def with_weather(whole: Suite, weather: str) -> Suite:
+    """Return the suite in this weather; unchanged if `weather` is "". Raises SpecError.
+
+    Like the robot, the weather belongs to a run, not to its suite.
+    """
+    if not weather:
+        return whole
+    scenarios = tuple(scenario.in_weather(weather) for scenario in whole.scenarios)
+    return msgspec.structs.replace(whole, scenarios=scenarios)

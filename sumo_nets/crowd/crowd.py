@@ -36,6 +36,7 @@ from cosim.place.street_map import Port, StreetMap, ports_of
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from sumo_nets import engine
 from sumo_nets.crowd.braking import BrakingForRobot
 from sumo_nets.crowd.demand import (
@@ -99,10 +100,12 @@ class SumoCrowd(Crowd):
         footprint_m: tuple[float, float] = COURIER.footprint_m,
         before: Entrances | None = None,
         standing: StandingObstacles | None = None,
+        weather: Weather = WEATHERS[CLEAR],
     ) -> None:
         self._net_path = net_path
         self._map = street_map
         self._spec = spec
+        self._weather = weather
         self._seed = seed
         self._closed = closed | ports_of(street_map.uncrowded)
         self._ground = InnerGround(street_map) if street_map.scanned else None
@@ -246,7 +249,9 @@ class SumoCrowd(Crowd):
                 self._gaps,
             )
         logged = sumo, self.entrances, self._map, self._spec
-        people = Pedestrians(*logged, rng_persons, self._closed, self._together, self._gaps)
+        people = Pedestrians(
+            *logged, rng_persons, self._closed, self._together, self._gaps, self._weather
+        )
         return people, Drivers(*logged, rng_vehicles)
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:

@@ -14,6 +14,7 @@ from cosim.core.state import Age
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import walk_graph_of
 from cosim.spec.scenario import CrowdSpec
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
 from sumo_nets.crowd.following_gaps import FollowingGaps
 from sumo_nets.crowd.free_space import EntrySpot, LocalWalkableArea, Spots
@@ -88,6 +89,7 @@ class Pedestrians:
         closed: frozenset[Port],
         together: GroupCohesion,
         gaps: FollowingGaps,
+        weather: Weather = WEATHERS[CLEAR],
     ) -> None:
         self._engine = engine
         self._entrances = entrances
@@ -96,6 +98,7 @@ class Pedestrians:
         self._closed = closed
         self._together = together
         self._gaps = gaps
+        self._hurry = weather.hurry
         self.ages = entrances.ages
         self._graph = walk_graph_of(street_map)
         self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
@@ -110,7 +113,7 @@ class Pedestrians:
         self._edge_spots = Spots(_at_edge(street_map) if street_map.scanned else (), step_m=2.0)
         self._room = None if spec.density is None else LocalWalkableArea(street_map, spec.radius_m)
         rng_groups, self._rng_gaps = rng.spawn(2)
-        self._groups = GroupDraws(spec, rng_groups)
+        self._groups = GroupDraws(spec, rng_groups, weather.children)
 
     def fill(self, x_m: float, y_m: float) -> None:
         """Let all persons enter before the episode."""
@@ -207,7 +210,7 @@ class Pedestrians:
             if len(walk) == 1:
                 continue
             walk = self._one_way(walk, forward)
-            speed_mps = group.speed_at(drawn_mps)
+            speed_mps = self._hurry * group.speed_at(drawn_mps)
             names = [self._name(age) for age in group.ages]
             gaps_m = group.gaps_m(self._rng_gaps)
             for name, xy, gap_m in zip(names, places, gaps_m, strict=True):

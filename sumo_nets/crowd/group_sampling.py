@@ -47,9 +47,6 @@ CHILDREN_SHARE = 0.10
 ELDERLY_SHARE = 0.12
 """Share of elderly people where the spec sets no ages."""
 
-_ANY_AGES: Final = (1.0 - CHILDREN_SHARE - ELDERLY_SHARE, 1.0 - ELDERLY_SHARE)
-"""Upper limits of a uniform draw for adults and for children."""
-
 
 class PersonGroup(NamedTuple):
     """One or more persons that enter together, with their ages."""
@@ -92,12 +89,15 @@ class GroupDraws:
 
     Half of the members of families are children: one of two, one or two of three.
 
+    children: factor of the share of children where the spec sets no ages
     coming: the next group. It stays the same until it has entered; otherwise large groups, which
         find room less often, would be too rare.
     """
 
-    def __init__(self, spec: CrowdSpec, rng: np.random.Generator) -> None:
+    def __init__(self, spec: CrowdSpec, rng: np.random.Generator, children: float = 1.0) -> None:
         self._rng = rng
+        # Upper limits of a uniform draw for adults and for children.
+        self._any_limits = (1.0 - children * CHILDREN_SHARE - ELDERLY_SHARE, 1.0 - ELDERLY_SHARE)
         self._rng_ages = rng.spawn(1)[0]
         self._ages = spec.elderly > 0.0 or spec.children > 0.0
         mean_size = 2.0 + TRIO_SHARE
@@ -131,5 +131,5 @@ class GroupDraws:
     def _any_ages(self, size: int) -> tuple[Age, ...]:
         """Draw ages where the spec sets none; they do not affect walking."""
         return tuple(
-            [Age(bisect(_ANY_AGES, draw)) for draw in self._rng_ages.random(size).tolist()]
+            [Age(bisect(self._any_limits, draw)) for draw in self._rng_ages.random(size).tolist()]
         )

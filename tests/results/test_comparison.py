@@ -178,6 +178,26 @@ def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path:
     )
 
 
+def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """A run in rain is named so, is no resumption of one in clear weather, and is called neither
+    better nor worse; both are in a table by weather."""
+    ways = several(20)
+    clear = run_of(tmp_path / "c", [GOALS] * 20, "p", ways)
+    rain = run_of(tmp_path / "r", [HIT] * 20, "p", ways, weather="rain")
+    difference = read_spec(clear).apart(read_spec(rain))
+    assert difference is not None and difference[:3] == ("weather", "", "rain")
+    told = compare_runs([clear, rain])
+    assert (told.before.label, told.others[0].label) == ("p, own weather", "p, rain")
+    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    assert any("weather clear (p, own weather) and rain (p, rain)" in n for n in told.notes)
+    said = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "weather.png"))
+    assert said.returncode == 0, said.stderr
+    assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", said.stdout)
+    assert (tmp_path / "weather.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize("track", ["lidar", "people"])
 def test_runs_of_other_sensor_tracks_get_no_verdict_but_blind_ones_do(
     runs: Path, tmp_path: Path, track: str
@@ -525,7 +545,10 @@ def test_wrong_words_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> No
         and "a comparison needs two runs or more: cosim compare RUN OTHER ..." in said.stderr
     )
     said = cosim("compare", one, other, "-o", "table.pdf")
-    assert said.returncode == 2 and "table.pdf: its name must end in .csv, .md, .tex" in said.stderr
+    assert (
+        said.returncode == 2
+        and "table.pdf: its name must end in .csv, .png, .md, .tex" in said.stderr
+    )
     said = cosim("compare", one, other, "-o", str(tmp_path / "gone/table.md"))
     assert (
         said.returncode == 3

@@ -136,19 +136,23 @@ def seen_by_themselves(
     found = []
     for scenario in scenarios:
         world = BulletWorld(surface, scenario.barriers, robot_called(scenario.robot))
-        with GlCamera(world, spec, light=scenario.light) as camera:
+        light, weather = scenario.light, scenario.conditions
+        with GlCamera(world, spec, light=light, weather=weather) as camera:
             found.append([camera.render(robot, street) for street in streets])
     return found
 
 
 @pytest.mark.engine
 def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -> None:
-    """Of environments of other robots and lights, drawn together for as long as they stay: one that
+    """Of environments of other robots, lights and weathers, drawn together for as long as they stay: one that
     ends and one that speaks nonsense leave the others alone. Nothing has a name in /dev/shm, and
     all know when the renderer is killed."""
     before = shared_files()
     (one,) = scenarios_of("one")
-    other = msgspec.structs.replace(one, id="other", robot="scout", light=Light(fog_m=40.0))
+    fog = Light(fog_m=40.0)
+    other = msgspec.structs.replace(
+        one, id="other", robot="scout", light=fog, weather="rainy_night"
+    )
     busy = busy_street(place(one.place)[1], persons=20, frames=4)
     expected = seen_by_themselves((one, other), busy.robot, busy.streets)
     with renderer_for(tmp_path, Seeing()) as renderer:

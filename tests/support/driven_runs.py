@@ -21,7 +21,7 @@ from cosim.results.walked import walked_m
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import City, Scenario, Suite
-from scenarios.suites.catalog import with_robot
+from scenarios.suites.catalog import with_robot, with_weather
 from tests.logs import log_with
 from tests.run_specs import record_of, spec_of
 
@@ -145,15 +145,16 @@ def run_of(
     policy: str = "p",
     scenarios: Sequence[Scenario] = (),
     robot: str = "",
+    weather: str = "",
     gait: str = "",
 ) -> Path:
     """A finished run of one short way after the other, each as `episode_of` says; s-000, s-001 and
-    so on. robot: applied to the scenarios, as by `--robot`; gait: as by `--gait`"""
+    so on. robot, weather: applied to the scenarios, as by `--robot`; gait: as by `--gait`"""
     ways = tuple(scenarios) or tuple(short_way(f"s-{i:03d}") for i in range(len(hows)))
     suite = Suite(name=ways[0].suite, version="1", scenarios=ways)
-    of_run = with_robot(suite, robot)
+    of_run = with_weather(with_robot(suite, robot), weather)
     robots = {way.robot: "h" for way in of_run.scenarios}
-    spec = msgspec.structs.replace(spec_of(suite, policy), robots=robots)
+    spec = msgspec.structs.replace(spec_of(suite, policy), robots=robots, weather=weather)
     of_gait = {"gait": gait, "gait_hash": "0123456789abcdef" if gait else ""}
     spec = msgspec.structs.replace(spec, setup=msgspec.structs.replace(spec.setup, **of_gait))
     with RunFolder.create(path, spec, of_run) as folder:

@@ -231,6 +231,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         "waypoints": spec.manifest.waypoints.in_words
         if has_waypoints
         else "none: it answers with commands",
+        "weather": spec.weather or "the scenarios' own",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
         "gait": gait_in_words(spec.setup.gait, spec.setup.gait_hash)
         if spec.setup.gait

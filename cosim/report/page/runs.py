@@ -18,9 +18,10 @@ from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.run_folder import RUN_AGAIN, load_log, trajectory_file
-from cosim.results.run_spec import RunSpec, names_by_robot
+from cosim.results.run_spec import RunSpec, names_by_conditions
 from cosim.results.table import table_of
 from cosim.spec.scenario import CityMap, Light, Scenario
+from cosim.spec.weather import CLEAR, WEATHERS
 
 PaperTable = Literal["unit", "reactive", "long"]
 """Short ways past things; short ways with at most one event; long ways, which continue after
@@ -29,7 +30,14 @@ _COLUMNS: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
 """Columns that plots use; loading a whole log takes four times as long."""
 PAPER_SUITES: Final = ("unit", "reactive", "long-horizon")
 """Suites shown together with the paper's rows."""
-LIGHT_KINDS: Final = ("high sun", "low sun", "overcast", "fog")
+LIGHT_KINDS: Final = (
+    "high sun",
+    "low sun",
+    "overcast",
+    "fog",
+    *(name for name in WEATHERS if name not in (CLEAR, "overcast", "fog")),
+)
+"""Kinds of light by the scenario's light, and of weather, which come before these."""
 _OVERCAST: Final = 0.8
 _LOW_SUN_DEG: Final = 20.0
 
@@ -75,7 +83,7 @@ class ReportedRun:
             family=[table_of_paper(one) for one in of],
             place=[place_in_words(one) for one in of],
             real=[isinstance(one.place, CityMap) for one in of],
-            light=[light_in_words(one.light) for one in of],
+            light=[light_in_words(one) for one in of],
         )
 
     def log(self, scenario: str) -> Log | None:
@@ -115,7 +123,7 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
         progress(f"reading {path}")
         found.append(read_whole_run(path))
     _refuse_other_suites(found)
-    names = names_by_robot([whole.spec for whole in found])
+    names = names_by_conditions([whole.spec for whole in found])
     policies = [(whole.spec.suite, name) for whole, name in zip(found, names, strict=True)]
     suites = {
         policy: {suite for suite, other in policies if other == policy} for _, policy in policies
@@ -155,8 +163,11 @@ def place_in_words(scenario: Scenario) -> str:
     return f"city {where.seed}" + (f" ({where.size_m:g} m)" if where.size_m != 2000.0 else "")
 
 
-def light_in_words(light: Light) -> str:
-    """Return one of LIGHT_KINDS: fog before clouds before the sun's elevation."""
+def light_in_words(scenario: Scenario) -> str:
+    """Return one of LIGHT_KINDS: weather before fog, clouds and the sun's elevation."""
+    if (weather := scenario.conditions.name) != CLEAR:
+        return weather
+    light = scenario.light
     if light.fog_m is not None:
         return "fog"
     if light.cloud_cover >= _OVERCAST:

@@ -31,6 +31,7 @@ from cosim.results.table import ORACLE, crashed_in, estimate_of, why_inconclusiv
 from cosim.spec.robot import COURIER
 from cosim.spec.schedule import BEST_BLIND
 from cosim.spec.sensors import SensorTrack
+from cosim.spec.weather import CLEAR
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
 _SHARES: Final = {"success": "SR", "spl": "SPL", "route_completion": "RC"}
@@ -349,6 +350,7 @@ def _notes(table: pd.DataFrame) -> str:
     notes += [gait_in_words(*gait) for gait in gaits if gait[0]]
     if crashed := crashed_in(table):
         notes.append(f"{crashed} crashed")
+    notes += [f"weather {name}" for name in sorted({*table["weather"]} - {CLEAR})]
     notes += ["crowd added"] * bool(table["crowd_added"].any())
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
     return ", ".join(notes)

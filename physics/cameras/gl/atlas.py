@@ -23,6 +23,7 @@ from cosim.core.state import Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
 from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Light
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.gl.batch import batch_drawing
 from physics.cameras.gl.camera import NOON, GlCamera
 from physics.cameras.gl.context import context
@@ -74,10 +75,14 @@ class Atlas:
                 self._readback.release()
             self._context = None
 
-    def join(self, world: BulletWorld, light: Light = NOON) -> SeatKey:
+    def join(
+        self, world: BulletWorld, light: Light = NOON, weather: Weather = WEATHERS[CLEAR]
+    ) -> SeatKey:
         """Add an environment; the world need not be running."""
         self._running_context  # noqa: B018  raises if the atlas is not running
-        camera = GlCamera(world, self._spec, light=light, appearance=self._appearance)
+        camera = GlCamera(
+            world, self._spec, light=light, appearance=self._appearance, weather=weather
+        )
         key = SeatKey(next(self._keys))
         self._cameras[key] = camera.__enter__()
         return key

@@ -16,9 +16,11 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.core.state import RobotState, Street
 from cosim.spec.robot import Robot
+from physics.cameras.gl.air import AirDrawing, LinearTarget
 from physics.cameras.gl.backdrop import Backdrop
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.instances import Forms
+from physics.cameras.gl.lamps import casting_people
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shading import Pass, SceneBlocks, camera_matrix
@@ -27,8 +29,9 @@ from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.splat_layers import Layers, splat_pictures
 from physics.cameras.gl.splats import SplatCloud
 from physics.cameras.gl.surfaces import surfaces
-from physics.cameras.gl.targets import Target
+from physics.cameras.gl.targets import Frame, Target
 from physics.cameras.gl.traffic import Driven, TrafficDrawing
+from physics.cameras.gl.weather import Look, WeatherBlocks
 from physics.cameras.view import Shot
 from physics.people.wardrobe import Season
 from physics.street.surface import Surface
@@ -44,6 +47,7 @@ class Stage(NamedTuple):
     cloud: splats of the place, None without
     season: of people's clothes
     rain: most people hold umbrellas
+    look: weather and night; None by a clear day
     """
 
     surface: Surface
@@ -55,6 +59,12 @@ class Stage(NamedTuple):
     cloud: SplatCloud | None = None
     season: Season = "mild"
     rain: bool = False
+    look: Look | None = None
+
+    @property
+    def variant(self) -> int:
+        """Return the variant of the programs."""
+        return int(self.shadows is not None) if self.look is None else self.look.variant
 
 
 class PictureOrder(NamedTuple):
@@ -83,6 +93,7 @@ class BatchDrawing:
         self._crowd, self._traffic = CrowdDrawing(context), TrafficDrawing(context, self.forms)
         self._blocks = SceneBlocks(context)
         self._pictures = splat_pictures(context)
+        self._weather, self._air = WeatherBlocks(context), AirDrawing(context)
 
     def draw(
         self, pictures: Sequence[PictureOrder], target: Target, drawn: Callable[[int], None]
@@ -140,7 +151,20 @@ class BatchDrawing:
                 2 * i, camera_matrix(one.taken, anchor), to_map, one.taken, anchor, one.light
             )
         self._blocks.upload()
+        self._arrange_weather(pictures, shots)
         return shots
+
+    def _arrange_weather(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
+        """Upload weather and lamps of the pictures that have these."""
+        if all(one.stage.look is None for one in pictures):
+            return
+        self._weather.room(len(pictures))
+        for i, (one, anchor) in enumerate(zip(pictures, shots.anchors, strict=True)):
+            if (look := one.stage.look) is not None:
+                lamps = one.stage.scene.lamps(one.taken.view, one.street.vehicles)
+                people = casting_people(one.street.people, one.stage.surface, one.taken.view)
+                self._weather.put(i, look, lamps, people, anchor, one.street.tick)
+        self._weather.upload()
 
     def _cast(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Update the shadow maps of all pictures."""
@@ -178,8 +202,12 @@ class BatchDrawing:
         """
         cloud = pictures[0].stage.cloud
         if cloud is None:
-            target.clear()
-            self._draw(start, pictures[0], target)
+            look = pictures[0].stage.look
+            drawn = target if look is None else self._air.target(target.size)
+            drawn.clear()
+            self._draw(start, pictures[0], drawn)
+            if isinstance(drawn, LinearTarget) and look is not None:
+                self._air.draw(look.variant, drawn, pictures[0].stage.backdrop.sky, target)
             yield start
             return
         stack = self._pictures.stack(target.size, len(pictures))
@@ -202,8 +230,11 @@ class BatchDrawing:
         if picture.stage.shadows is not None:
             picture.stage.shadows.bind()
         self._blocks.bind(2 * i)
+        if picture.stage.look is not None:
+            self._weather.bind(i)
+            picture.stage.scene.bind_lamps()
 
-    def _draw(self, i: int, picture: PictureOrder, target: Target) -> None:
+    def _draw(self, i: int, picture: PictureOrder, target: Frame) -> None:
         """Draw a picture without splats."""
         gl = self._context
         stage = picture.stage
@@ -249,10 +280,9 @@ class BatchDrawing:
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
     def _draw_pass(self, i: int, stage: Stage, which: Pass) -> None:
-        shaded = stage.shadows is not None
-        self._crowd.draw(which, shaded, i)
+        self._crowd.draw(which, stage.variant, i)
         stage.scene.draw(which)
-        self._traffic.draw(which, shaded, i)
+        self._traffic.draw(which, stage.variant, i)
 
 
 @lru_cache(maxsize=1)

@@ -16,6 +16,7 @@ from cosim.core.state import Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
 from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Light
+from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.camera_base import WorldCamera
 from physics.cameras.gl.backdrop import Backdrop
 from physics.cameras.gl.batch import PictureOrder, Stage, batch_drawing
@@ -25,7 +26,7 @@ from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shadows import ShadowMaps
 from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
 from physics.cameras.gl.targets import Target
-from physics.cameras.sky import sky_of
+from physics.cameras.gl.weather import SNOW_EXPOSURE, Look, look_of, weathered_sky
 from physics.cameras.view import Shot, View
 from physics.dynamics.world import BulletWorld
 from physics.people.wardrobe import season_of
@@ -38,6 +39,7 @@ class GlCamera(WorldCamera):
     """Robot camera with OpenGL. Use it in a `with` block; the world need not be running.
 
     appearance: of a scanned place; splats are drawn where the scan has them
+    weather: changes sky, surfaces and air; not in a scanned place, whose colours contain its light
     """
 
     def __init__(
@@ -47,14 +49,23 @@ class GlCamera(WorldCamera):
         depth: bool = False,
         light: Light = NOON,
         appearance: Appearance = "splats",
+        weather: Weather = WEATHERS[CLEAR],
     ) -> None:
         super().__init__(world, spec, depth)
         scan = world.surface.scan
         self._splats = scan.splats if scan is not None and appearance == "splats" else None
         seed = world.surface.seed
-        self._sky = sky_of(light, seed) if scan is None else scan_sky(light, scan.facts, seed)
-        self._light = lighting_of(self._sky, haze=self._splats is None)
+        self._look: Look | None = None
+        if scan is None:
+            self._sky = weathered_sky(light, weather, seed)
+            self._look = look_of(weather, self._sky, seed, light.shadows)
+        else:
+            self._sky = scan_sky(light, scan.facts, seed)
+        contact = light.shadows and self._look is not None
+        bright = 1.0 if self._look is None else 1.0 + SNOW_EXPOSURE * weather.snow
+        self._light = lighting_of(self._sky, self._splats is None, contact, bright)
         self._season = season_of(light.day_of_year, light.latitude_deg)
+        self._rain = weather.rain_mm_h > 0.0
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
@@ -64,12 +75,15 @@ class GlCamera(WorldCamera):
             world, light = self._world, self._light
             with context() as gl:
                 splats = self._splats
-                scene = GlScene(gl, batch_drawing(gl).forms, world, light, splats is not None)
+                look = self._look
+                scene = GlScene(gl, batch_drawing(gl).forms, world, light, splats is not None, look)
                 shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
                 cloud = None if splats is None else splat_pictures(gl).cloud(splats)
-                sky = Backdrop(gl, self._sky)
+                sky = Backdrop(gl, self._sky, 0 if look is None else look.variant)
+                clothes = self._season, self._rain
                 self._stage = Stage(
-                    *(world.surface, world.robot, scene, shadows, sky, light, cloud, self._season)
+                    *(world.surface, world.robot, scene, shadows, sky, light, cloud),
+                    *(*clothes, look),
                 )
             self._context = gl
         return self

@@ -223,7 +223,7 @@ class CrowdDrawing:
             self._dressed = who
         return self._worn
 
-    def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
+    def draw(self, stage: Pass, shadows: int, picture: int = 0) -> None:
         """Draw the people of a picture; shadow maps of moving objects use the coarsest level.
 
         shadows: people are shaded by shadow maps

@@ -83,7 +83,7 @@ void main() {{
         vec4 seen = texture(surfaces, vec3(where, cover));
         colour *= decoded(seen.rgb);
     }} else if (shines < -0.5) {{
-        own = vec3({_LAMPLIGHT}) * side_light.w;
+        own = vec3({_LAMPLIGHT}) * colour * (1.6 * side_light.w);
     }}
     show_linear(colour, own, n, at, label);
 }}
@@ -169,11 +169,11 @@ class Forms:
         self,
         context: moderngl.Context,
         surfaces: Surfaces,
-        programs_of: dict[tuple[Material, bool], Programs] | None = None,
+        programs_of: dict[tuple[Material, int], Programs] | None = None,
     ) -> None:
         self._context = context
         self._surfaces = surfaces
-        self._programs: dict[tuple[Material, bool], Programs] = (
+        self._programs: dict[tuple[Material, int], Programs] = (
             {} if programs_of is None else programs_of
         )
         self._corners: list[NDArray[np.void]] = []
@@ -192,7 +192,7 @@ class Forms:
         """
         return Forms(self._context, self._surfaces, self._programs)
 
-    def programs(self, material: Material, shadows: bool) -> Programs:
+    def programs(self, material: Material, shadows: int) -> Programs:
         """Return the programs of a material. shadows: they apply shadow maps."""
         if (material, shadows) not in self._programs:
             vertex, fragment, cut_out = _SHADERS[material]
@@ -272,7 +272,7 @@ class Things:
         self._room = 0
         self._instances: moderngl.Buffer | None = None
         self._commands: moderngl.Buffer | None = None
-        self._arrays: dict[tuple[Material, bool], list[moderngl.VertexArray]] = {}
+        self._arrays: dict[tuple[Material, int], list[moderngl.VertexArray]] = {}
         self._ends: dict[Material, list[int]] = {material: [0, 0] for material in MATERIALS}
 
     def set(
@@ -310,16 +310,16 @@ class Things:
         self._instances.write(rows[order])
         self._commands.write(np.concatenate(runs))
 
-    def draw(self, stage: Pass, shadows: bool, part: int = 0) -> None:
+    def draw(self, stage: Pass, shadows: int, part: int = 0) -> None:
         """Draw solid and cut-out surfaces of one part. shadows: shaded by shadow maps."""
         self._draw("solid", stage != "colour", shadows, part)
         self._draw("cut-out", stage != "colour", shadows, part)
 
-    def draw_panes(self, labels: bool) -> None:
+    def draw_panes(self, labels: bool, shadows: int) -> None:
         """Draw the panes of the first part over the picture: their colours, or their labels."""
-        self._draw("pane", labels, False, 0)
+        self._draw("pane", labels, shadows, 0)
 
-    def _draw(self, material: Material, second: bool, shadows: bool, part: int) -> None:
+    def _draw(self, material: Material, second: bool, shadows: int, part: int) -> None:
         """Draw a material with its first or second program."""
         first = self._ends[material][part]
         count = self._ends[material][part + 1] - first
@@ -337,7 +337,7 @@ class Things:
         size = self._room * len(MATERIALS) * 20
         self._commands = self._context.buffer(reserve=size, dynamic=True)
 
-    def _bind(self, material: Material, shadows: bool) -> None:
+    def _bind(self, material: Material, shadows: int) -> None:
         at_corners, triangles = self._forms.buffers()
         if self._bound != self._forms.version:
             self._unbind()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from physics.cameras.sky import Sky
+from physics.cameras.sky import STREET_LAMPLIGHT, Sky
 
 HAZE_FROM_M: Final = 20.0
 HAZE_PER_M: Final = 1.0 / 110.0
@@ -20,6 +20,11 @@ HAZE_MOST: Final = 0.85
 
 It hides the edge of the drawn world, as in the bullet camera.
 """
+
+
+LAMPS_SPREAD: Final = 0.55
+"""Share of the lamplight of `physics.cameras.sky` that comes from single lamps."""
+_ABOVE: Final = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +73,24 @@ class Lighting:
         ]
 
 
-def lighting_of(sky: Sky, haze: bool = True) -> Lighting:
-    """Convert a sky to shader values. haze: of distant objects."""
+def lighting_of(
+    sky: Sky, haze: bool = True, contact: bool = False, bright: float = 1.0
+) -> Lighting:
+    """Convert a sky to shader values.
+
+    haze: of distant objects
+    contact: without sun, moving objects darken the ground right below them: the shadow maps are
+        then seen from straight above
+    bright: factor of the exposure
+    """
     up, side, down = sky.ambient
+    if sky.lamps > 0.0:
+        # Lamps light the street one by one; this is what its walls and ground reflect of them.
+        spread = LAMPS_SPREAD * sky.lamps * STREET_LAMPLIGHT
+        up, side = (np.maximum(one - spread, 0.05 * one) for one in (up, side))
+    contact = contact and not sky.shadows
     return Lighting(
-        sky.sun,
+        _ABOVE if contact else sky.sun,
         sky.sun_colour,
         up,
         side,
@@ -80,9 +98,9 @@ def lighting_of(sky: Sky, haze: bool = True) -> Lighting:
         sky.fog_colour,
         _horizon(sky),
         sky.fog_per_m,
-        sky.exposure,
+        sky.exposure * bright * (1.0 + 0.7 * sky.lamps),
         sky.lamps,
-        sky.shadows,
+        sky.shadows or contact,
         haze,
     )
 

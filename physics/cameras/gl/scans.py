@@ -48,7 +48,7 @@ void main() { pixel = vec4(0.5 + 0.5 * normalize(normal), label / 255.0); }
 
 
 def scan_shaders(
-    context: moderngl.Context, surfaces: Surfaces, shadows: bool, normals: bool = False
+    context: moderngl.Context, surfaces: Surfaces, shadows: int, normals: bool = False
 ) -> SurfaceShaders:
     """Create the program of all scanned triangles. normals: draw these in place of colours."""
     fragment = _NORMALS if normals else _FRAGMENT

@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 
 from cosim.core.cache import Arrays
 from cosim.core.geometry import Floats
-from cosim.core.state import LABELS, Street
+from cosim.core.state import LABELS, Street, Vehicles
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import Barrier
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.instances import INSTANCE, Forms, Things, instances
+from physics.cameras.gl.lamps import Lamps, WallMap, lamp_heads, lamps_of, nearest
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.scans import scan_layer, scan_rows, scan_shaders
 from physics.cameras.gl.shading import Pass
@@ -38,7 +39,9 @@ from physics.cameras.gl.tiles import (
     ground_rows,
     tile_shaders,
 )
+from physics.cameras.gl.variants import Variant
 from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
+from physics.cameras.gl.weather import Look
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.dynamics.world import BulletWorld
 from physics.ground.mesh import Detail, Part
@@ -76,6 +79,7 @@ class _Tile:
 
     middle: (2,) world metres
     far: (N,) forms of its objects at a distance
+    lamps: (N, 3) glasses of street lamps, world metres
     thing_xy: (N, 2) positions of its objects
     seen_m: (N,) drawing distances of its objects
     """
@@ -86,6 +90,7 @@ class _Tile:
     decals: TileRows | None
     walls: TileRows | None
     scan: TileRows | None
+    lamps: Floats
     things: _Placed
     far: NDArray[np.intp]
     thing_xy: Floats
@@ -104,6 +109,7 @@ class _Words(msgspec.Struct, array_like=True):
 class GlScene:
     """Static street around a view, as a function of view and signals alone.
 
+    look: weather and night; None by a clear day
     splats: the scan's mesh is not in the picture, but drawn apart by `draw_mesh`
     """
 
@@ -114,14 +120,17 @@ class GlScene:
         world: BulletWorld,
         light: Lighting,
         splats: bool = False,
+        look: Look | None = None,
     ) -> None:
         self._splats = splats
+        self._look = look
         self._surface = world.surface
         self._forms = forms
         self._shadows = light.shadows
+        self._variant = Variant(light.shadows) if look is None else look.variant
         self._surfaces = surfaces(context)
-        ground = tile_shaders(context, self._surfaces, light.shadows)
-        walls = wall_shaders(context, self._surfaces, light.shadows, light.lamps > 0.0)
+        ground = tile_shaders(context, self._surfaces, self._variant)
+        walls = wall_shaders(context, self._surfaces, self._variant, light.lamps > 0.0)
         self._ground = ground_layer(context, ground)
         self._paint = ground_layer(context, ground)
         self._decals = ground_layer(context, decal_shaders(context, self._surfaces))
@@ -133,6 +142,7 @@ class GlScene:
         self._standing = Things(context, forms)
         self._fence_forms = forms.apart()  # the number of sizes is unlimited
         self._fenced = Things(context, self._fence_forms)
+        self._walls_map = WallMap(context, world.surface)
         self._tiles: dict[Key, _Tile] = {}
         self._keys: list[Key] = []
         self._cell: tuple[int, int] | None = None
@@ -166,12 +176,24 @@ class GlScene:
         if self._shadows:
             self._stand(middle, anchor)
 
+    def lamps(self, view: View, vehicles: Vehicles) -> Lamps | None:
+        """Return the lamps of a view after `arrange`, and prepare their wall map; None by day."""
+        if self._look is None or not self._look.variant & Variant.LAMPS:
+            return None
+        heads = self._heads[nearest(self._heads, view.eye_m, view.heading_rad)]
+        self._walls_map.set(heads)
+        return lamps_of(heads, vehicles, self._surface, view.eye_m)
+
+    def bind_lamps(self) -> None:
+        """Bind the wall map of the last view's lamps."""
+        self._walls_map.bind()
+
     def draw(self, stage: Pass) -> None:
         """Draw the arranged street: small objects first, then walls and ground from near to far."""
         if stage == "moving":
             return
-        (self._seen if stage == "colour" else self._standing).draw(stage, self._shadows)
-        self._fenced.draw(stage, self._shadows)
+        (self._seen if stage == "colour" else self._standing).draw(stage, self._variant)
+        self._fenced.draw(stage, self._variant)
         self._walls.draw(stage)
         self._ground.draw(stage)
         if not self._splats:
@@ -186,12 +208,13 @@ class GlScene:
         self._paint.draw("colour")
 
     def draw_decals(self) -> None:
-        """Draw pictures on the ground; the blending multiplies colours."""
-        self._decals.draw("colour")
+        """Draw pictures on the ground, unless snow covers it; the blending multiplies colours."""
+        if not self._variant & Variant.SNOW:
+            self._decals.draw("colour")
 
     def draw_panes(self, labels: bool) -> None:
         """Draw clear glass over the finished picture: its colours, or its labels and depth."""
-        self._seen.draw_panes(labels)
+        self._seen.draw_panes(labels, self._variant & ~Variant.SHADOWS)
 
     def release(self) -> None:
         for held in (
@@ -206,6 +229,7 @@ class GlScene:
         ):
             held.release()
         self._fence_forms.release()
+        self._walls_map.release()
         self._tiles.clear()
 
     def _stream(self, cell: tuple[int, int]) -> None:
@@ -230,6 +254,7 @@ class GlScene:
             (self._scan, [tile.scan for tile in tiles]),
         ):
             layer.hold(rows, self._middles)
+        self._heads = np.concatenate([tile.lamps for tile in tiles])
         self._stands_xy = np.concatenate([*(tile.thing_xy for tile in tiles), self._obstacle_xy])
         always = np.full(len(self._obstacle_xy), math.inf)
         self._stands_seen_m = np.minimum(
@@ -306,6 +331,7 @@ class GlScene:
             decals,
             walls,
             scan,
+            lamp_heads(words.forms, held["things"], _middle(key)),
             (near, held["things"]),
             far,
             held["thing_xy"],

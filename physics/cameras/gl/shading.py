@@ -61,6 +61,8 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from physics.cameras.gl.lighting import Lighting
+from physics.cameras.gl.variants import Variant
+from physics.cameras.gl.weather_shaders import BLOCK, FOG_GLOW, LAMPS, PATTERNS
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
 
 Pass = Literal["colour", "still", "moving"]
@@ -123,6 +125,9 @@ out vec4 pixel;
 layout(binding = 6) uniform sampler2DShadow still_shadow;
 layout(binding = 7) uniform sampler2DShadow moving_shadow;
 
+#ifdef WEATHER
+WEATHER_CODE
+#endif
 float sunlit(vec3 at, vec3 normal) {
 #ifdef SHADOWS
     vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
@@ -135,18 +140,55 @@ float sunlit(vec3 at, vec3 normal) {
 #endif
 }
 
+#ifdef WEATHER
+vec3 on_screen(vec3 light) { return light; }
+#else
 vec3 on_screen(vec3 light) {
     // The ACES curve (Narkowicz's fit) in sRGB, which reaches white at 1.96, as a polynomial of
     // the root of light: to two levels below 0.8, without a division.
     vec3 s = min(sqrt(light * sun_light.w), 1.4);
     return s * (0.1725 + s * (6.1673 + s * (-11.3129 + s * (7.7517 - s * 1.8716))));
 }
+#endif
 
 float fogged() {
     float far = 1.0 / gl_FragCoord.w;
     return max(1.0 - exp(-fog.w * far), clamp((far - haze.x) * haze.y, 0.0, haze.z));
 }
 
+#ifdef WEATHER
+void glow(vec3 colour, float label) {
+    pixel = vec4(mix(decoded(colour) * 1.3 / sun_light.w, fog.rgb, fogged()), label / 255.0);
+}
+
+void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
+    float raised = smoothstep(0.35, 0.75, normal.z);
+    float facing = max(dot(normal, sun.xyz), 0.0);
+    vec3 light = side_light.rgb + normal.z * tilt_light.rgb + abs(normal.z) * flat_light.rgb;
+    light += sun_light.rgb * (facing * sunlit(at, normal));
+    float gloss = 0.0, lit = in_contact(at, normal);
+#ifdef WET
+    float pool = puddle(at, label);
+    albedo *= mix(1.0, mix(0.78, 0.55, raised), surface.x) * mix(1.0, 0.55, pool);
+    if (is_ground(label)) gloss = mix(24.0, 90.0, pool) * surface.x;
+#endif
+#ifdef SNOW
+    float lies = snow_on(at, raised, label);
+    vec2 on_snow = ground_at(at);
+    float heaped = 0.35 * noise(on_snow, 0.5) + 0.3 * noise(on_snow, 0.125) + 0.2 * noise(on_snow, 0.03125) + 0.15 * noise(on_snow, 2.0);
+    albedo = mix(albedo, vec3(0.86, 0.88, 0.92) * (is_ground(label) ? 0.70 + 0.42 * heaped : 1.0), lies);
+#endif
+#ifdef LAMPS
+    vec3 mirrored_lamps;
+    vec3 lamps = lamplight(at, normal, gloss, mirrored_lamps);
+    light += lamps;
+    own += lit * mirrored_lamps;
+#endif
+    light *= lit;
+    vec3 ray = normalize(at - eye.xyz);
+    pixel = vec4(mix(albedo * light + own, fog_towards(ray), fogged()), label / 255.0);
+}
+#else
 void glow(vec3 colour, float label) {
     pixel = vec4(mix(colour, on_screen(fog.rgb), fogged()), label / 255.0);
 }
@@ -157,32 +199,78 @@ void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
     light += sun_light.rgb * (facing * sunlit(at, normal));
     pixel = vec4(on_screen(mix(albedo * light + own, fog.rgb, fogged())), label / 255.0);
 }
+#endif
 
 void show(vec3 albedo, vec3 normal, vec3 at, float label) {
     show_linear(decoded(albedo), vec3(0.0), normal, at, label);
 }
 """
 
+_WEATHER: Final = (
+    PATTERNS
+    + FOG_GLOW
+    + "#ifdef LAMPS\n"
+    + LAMPS
+    + "#endif\n"
+    + """
+float in_contact(vec3 at, vec3 normal) {
+    // Light that is left right under people and vehicles without sun.
+#ifdef SHADOWS
+    if (normal.z < 0.3 || sun.w == 0.0 || sun_light.r > 0.0) return 1.0;
+    vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
+    vec2 off = abs(in_map.xy - 0.5);
+    if (max(off.x, off.y) > 0.49) return 1.0;
+    const float r = 0.004;
+    float lit = 0.25 * (texture(moving_shadow, in_map + vec3(r, 0.0, 0.0)) + texture(moving_shadow, in_map - vec3(r, 0.0, 0.0))
+        + texture(moving_shadow, in_map + vec3(0.0, r, 0.0)) + texture(moving_shadow, in_map - vec3(0.0, r, 0.0)));
+    lit = mix(0.42, 1.0, lit);
+    int count = int(night.w);
+    for (int k = 0; k < count; k++) {
+        vec3 off = at - person[k].xyz;
+        lit *= 1.0 - 0.62 * exp(-dot(off.xy, off.xy) / 0.075) * fading(0.35, 0.1, abs(off.z));
+    }
+    return lit;
+#else
+    return 1.0;
+#endif
+}
+#ifdef SNOW
+float snow_on(vec3 at, float raised, float label) {
+    vec2 here = ground_at(at);
+    float patchy = 0.6 * noise(here, 1.3) + 0.4 * noise(here, 0.35);
+    // Least on people, who move, and where wheels and feet do.
+    float cover = label < 1.5 ? 0.50 : label < 3.5 ? 0.66 : label > 9.5 && label < 10.5 ? 0.05 : 1.1;
+    return surface.z * raised * smoothstep(0.28, 0.62, patchy + cover - 0.5);
+}
+#endif
+"""
+)
+"""Code of the variants with `Variant.WEATHER`."""
+
 _NOTHING = "#version 430\nvoid main() {}\n"
 
 
 @lru_cache(maxsize=64)
 def programs(
-    context: moderngl.Context, vertex: str, fragment: str, shadows: bool, cut_out: str = ""
+    context: moderngl.Context, vertex: str, fragment: str, shadows: int, cut_out: str = ""
 ) -> Programs:
     """Create a drawable's programs, for the picture and for shadow maps.
 
     vertex, fragment: GLSL without a version line
-    shadows: `show` reads the shadow maps
+    shadows: flags of a `Variant`; as a bool, whether `show` reads the shadow maps
     cut_out: fragment shader of the shadow maps, where parts of the surface are discarded
 
     Equal programs are shared during the context's lifetime, so set their uniforms before each draw.
     """
-    head = _BLOCK + ("#define SHADOWS\n" if shadows else "")
+    variant = Variant(shadows)
+    head = _BLOCK + variant.defines + (BLOCK if variant & Variant.WEATHER else "")
     return Programs(
         context.program(
             vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex,
-            fragment_shader=head + _DECODED + _FRAGMENT + fragment,
+            fragment_shader=head
+            + _DECODED
+            + _FRAGMENT.replace("WEATHER_CODE", _WEATHER)
+            + fragment,
         ),
         context.program(
             vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex,

@@ -148,7 +148,7 @@ class Skins:
         self,
         context: moderngl.Context,
         made: Callable[[int, int], SkinnedBody | FarBody],
-        drawn: Callable[[bool], Programs],
+        drawn: Callable[[int], Programs],
         layout: tuple[str, ...],
     ) -> None:
         self._context = context
@@ -158,7 +158,7 @@ class Skins:
         self._rows: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._buffers: list[moderngl.Buffer] = []
-        self._arrays: dict[bool, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
+        self._arrays: dict[int, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
 
     def start(self, outfit: int, level: int) -> tuple[int, int, int]:
         """Load a body, and return its count of indices, first index and first vertex."""
@@ -172,7 +172,7 @@ class Skins:
     def draw(
         self,
         stage: Pass,
-        shadows: bool,
+        shadows: int,
         instances: moderngl.Buffer,
         commands: moderngl.Buffer,
         count: int,
@@ -195,7 +195,7 @@ class Skins:
         self._buffers = []
         self._arrays = {}
 
-    def _bind(self, shadows: bool, instances: moderngl.Buffer) -> None:
+    def _bind(self, shadows: int, instances: moderngl.Buffer) -> None:
         if not self._buffers:
             rows, indices = np.concatenate(self._rows), np.concatenate(self._indices)
             self._buffers = [self._context.buffer(held.tobytes()) for held in (rows, indices)]
@@ -214,7 +214,7 @@ class Skins:
 def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody]) -> Skins:
     """Create skins of meshes with four joints per corner."""
 
-    def drawn(shadows: bool) -> Programs:
+    def drawn(shadows: int) -> Programs:
         return programs(context, _SKIN + _MESH, FRAGMENT, shadows)
 
     return Skins(context, made, lru_cache(drawn), _MESH_LAYOUT)
@@ -223,7 +223,7 @@ def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody
 def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -> Skins:
     """Create skins of tubes with two joints per turned ring and four per fixed ring."""
 
-    def drawn(shadows: bool) -> Programs:
+    def drawn(shadows: int) -> Programs:
         seen, cast = (
             programs(
                 context,

@@ -71,7 +71,7 @@ class SurfaceShaders:
         surfaces: Surfaces,
         vertex: str,
         fragment: str,
-        shadows: bool,
+        shadows: int,
     ) -> None:
         self.surfaces = surfaces
         self.programs = programs(context, KNOWN + vertex, LOOKED_UP + fragment, shadows)

@@ -25,22 +25,10 @@ _UNIT: Final = 8
 """Texture unit of the picture to be reordered."""
 
 
-class Target:
-    """Framebuffer of one size.
+class Frame:
+    """Framebuffer whose fourth channel is the label."""
 
-    size: width, height in pixels
-    parts_on_card: separate colours and labels before the readback; default on a graphics card
-    """
-
-    def __init__(
-        self, context: moderngl.Context, size: tuple[int, int], parts_on_card: bool | None = None
-    ) -> None:
-        self.size = size
-        self._colour = context.texture(size, 4)
-        self._depth = context.depth_renderbuffer(size)
-        self.frame = context.framebuffer([self._colour], self._depth)
-        on_card = is_card(context) if parts_on_card is None else parts_on_card
-        self._parting = _Parting(context, size) if on_card else None
+    frame: moderngl.Framebuffer
 
     def clear(self) -> None:
         """Clear the target to an empty picture."""
@@ -67,6 +55,24 @@ class Target:
             self.frame.color_mask = (True, True, True, True)
             self.frame.depth_mask = True
             self.frame.use()
+
+
+class Target(Frame):
+    """Framebuffer of one size.
+
+    size: width, height in pixels
+    parts_on_card: separate colours and labels before the readback; default on a graphics card
+    """
+
+    def __init__(
+        self, context: moderngl.Context, size: tuple[int, int], parts_on_card: bool | None = None
+    ) -> None:
+        self.size = size
+        self._colour = context.texture(size, 4)
+        self._depth = context.depth_renderbuffer(size)
+        self.frame = context.framebuffer([self._colour], self._depth)
+        on_card = is_card(context) if parts_on_card is None else parts_on_card
+        self._parting = _Parting(context, size) if on_card else None
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Read colours (H, W, 3) and labels (H, W), the top row first."""

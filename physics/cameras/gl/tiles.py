@@ -70,7 +70,7 @@ void main() {{
 """Shader of decals, which multiply the colours of the lit ground by twice their own."""
 
 
-def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
+def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: int) -> SurfaceShaders:
     """Create the program of the ground of all tiles."""
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 

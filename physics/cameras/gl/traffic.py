@@ -66,7 +66,7 @@ class TrafficDrawing:
         form, rows, part = (np.concatenate(column) for column in zip(*placed, strict=True))
         self._things.set(form, rows, part, 2 * len(driven))
 
-    def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
+    def draw(self, stage: Pass, shadows: int, picture: int = 0) -> None:
         if stage != "still":
             self._things.draw(stage, shadows, 2 * picture + _PARTS[stage])
 
@@ -114,9 +114,7 @@ class TrafficDrawing:
     def _form(self, name: str, length_m: float, width_m: float) -> int:
         size = tuple(np.array([length_m, width_m]).round(1).tolist())
         shape = vehicles.vehicle_shape(name, size[0])
-        return self._forms.id(
-            ("vehicle", shape, *size), partial(vehicles.vehicle_parts, shape, *size)
-        )
+        return self._forms.id(("vehicle", shape, *size), partial(_vehicle_parts, shape, *size))
 
     def _robots(self, driven: Sequence[Driven], shots: Shots) -> list[_Placed]:
         """Return the robots in their postures."""
@@ -160,6 +158,15 @@ class TrafficDrawing:
                 form = self._forms.id(("robot", model.name, link), partial(tuple, parts))
                 at = base @ shift + (x, y, z)
                 yield form, (*at.tolist(), *angles_of(base @ turn))
+
+
+def _vehicle_parts(shape: vehicles.Shape, length_m: float, width_m: float) -> Sequence[Part]:
+    """Return the parts of a vehicle whose lamps shine at night, unlike those of parked ones."""
+    shining = vehicles.LAMP, vehicles.REAR_LAMP
+    return [
+        part._replace(cover="lamp") if part.colour in shining else part
+        for part in vehicles.vehicle_parts(shape, length_m, width_m)
+    ]
 
 
 def _robot_parts(model: Robot) -> Sequence[Part]:

@@ -57,10 +57,15 @@ _LAYOUT: Final = (
     "in_fronts",
 )
 _LIT_SHARE: Final = 0.35
+_OPEN_SHARE: Final = 0.6
+"""Share of the ground floors, from door to door, that are lit at night."""
 _LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
 """Radiance of a lit window, in the units of physics.cameras.sky, about 60 candela per square
 metre.
 """
+
+_COOL_LIGHT: Final = "1.1e-3, 1.2e-3, 1.3e-3"
+"""Radiance of a window that is lit by a fluorescent or LED lamp."""
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
@@ -105,9 +110,12 @@ void main() {{
     albedo = none ? albedo : decoded(bay.rgb) + bay.a * albedo;
     vec3 own = vec3(0.0);
 #ifdef NIGHT
-    float lit = ground_floor || fract(drawn * 29.0) < {_LIT_SHARE} ? side_light.w : 0.0;
+    float shop = chance(vec2(floor(cell.x / max(every, 1.0)), 3.0), kind.w + fronts.w);
+    float lit = (ground_floor ? shop < {_OPEN_SHARE} : fract(drawn * 29.0) < {_LIT_SHARE}) ? side_light.w : 0.0;
     vec3 room = vec3(0.25) + 2.5 * decoded(bay.rgb);
-    own = none ? own : vec3({_LAMPLIGHT}) * room * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
+    vec3 lamp = mix(vec3({_LAMPLIGHT}), vec3({_COOL_LIGHT}), step(0.75, fract((ground_floor ? shop : drawn) * 53.0)));
+    lamp *= ground_floor ? 0.7 + 0.6 * fract(shop * 31.0) : 0.25 + fract(drawn * 71.0);
+    own = none ? own : lamp * room * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
 #endif
     show_linear(albedo, own, normal, at, {LABELS["building"]}.0);
 }}
@@ -115,7 +123,7 @@ void main() {{
 
 
 def wall_shaders(
-    context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool
+    context: moderngl.Context, surfaces: Surfaces, shadows: int, night: bool
 ) -> SurfaceShaders:
     """Create the program of all buildings. night: some of their windows are lit."""
     return SurfaceShaders(

@@ -17,6 +17,7 @@ from cosim.core.progress import Progress, ignore
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import City, CityMap, Light, Place, Scenario, Suite
 from cosim.spec.spec_file import join_faults
+from cosim.spec.weather import CLEAR
 from scenarios.places.nets import place
 from scenarios.suites.obstacles import with_obstacles
 from scenarios.suites.reactive import NO_CROWD
@@ -71,6 +72,7 @@ def made_one(variant: Variant, suite: str) -> Made:
         "goal_protocol": None,
         "crowd": OwnCrowd(),
         "light": Light(),
+        "weather": CLEAR,
         "limits": OwnLimits(),
     }
     street, faults = _street(msgspec.structs.replace(own, **alike))
@@ -85,6 +87,7 @@ def made_one(variant: Variant, suite: str) -> Made:
             suite=suite,
             crowd=own.crowd.spec,
             light=own.light,
+            weather=own.weather,
             goal_radius_m=limits.goal_radius_m,
             time_limit_s=time_s,
             ends_on_failure=limits.ends_on_failure,

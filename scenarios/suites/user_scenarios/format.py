@@ -26,6 +26,7 @@ from cosim.spec.validation import (
     Text,
     Within,
 )
+from cosim.spec.weather import CLEAR, weather_fault
 
 STRAIGHT_M: Final = (10.0, 100.0)
 _MOST_SEEDS: Final = 1000
@@ -266,6 +267,7 @@ class OwnScenario(Ranged, frozen=True, kw_only=True):
 
     seed: of everything that is drawn.
     seeds: number of repetitions, each with the next seed.
+    weather: name of a row of `cosim.spec.weather.WEATHERS`.
     goal_protocol: form of the goal for the policy; by default that of its manifest.
     """
 
@@ -281,7 +283,11 @@ class OwnScenario(Ranged, frozen=True, kw_only=True):
     obstacles: OwnObstacles = OwnObstacles()
     crowd: OwnCrowd = OwnCrowd()
     light: Light = Light()
+    weather: str = CLEAR
     limits: OwnLimits = OwnLimits()
+
+    def contradictions(self) -> Iterator[str]:
+        yield weather_fault(self.weather)
 
     @property
     def called(self) -> str:

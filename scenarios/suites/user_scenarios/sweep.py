@@ -12,13 +12,12 @@ import pandas as pd
 
 from cosim.core.errors import unwritable
 from cosim.core.files import write_atomic
-from cosim.report.curves import draw_curves
+from cosim.report.curves import DRAWN, draw_curves
 from cosim.results.table import crashed_in, summary_of
 from scenarios.suites.user_scenarios.read import OwnFile, label
 
 SWEPT: Final = ("success", "spl", "route_completion", "failures_per_100m")
 """Metrics that are printed; the file has every metric."""
-_DRAWN: Final = (*SWEPT, "pedestrian_distance_min_m", "time_to_goal_s")
 
 
 def summary_of_sweep(own: OwnFile, table: pd.DataFrame) -> pd.DataFrame:
@@ -51,7 +50,7 @@ def write_sweep(summary: pd.DataFrame, own: OwnFile, folder: Path) -> list[Path]
     try:
         files.append(folder / "sweep.csv")
         write_atomic(files[-1], summary.to_csv(index=False).encode())
-        picture = draw_curves(summary, fields, _DRAWN, own.name)
+        picture = draw_curves(summary, fields, DRAWN, own.name)
         files.append(folder / "sweep.png")
         write_atomic(files[-1], picture)
     except OSError as error:

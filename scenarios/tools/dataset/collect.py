@@ -42,7 +42,7 @@ from scenarios.runs.local import LocalProcesses
 from scenarios.runs.planning import run_spec
 from scenarios.runs.policy_host import settled_host
 from scenarios.runs.pool import run_all
-from scenarios.suites.catalog import with_robot
+from scenarios.suites.catalog import with_robot, with_weather
 from scenarios.suites.fits import check_places
 from scenarios.suites.new_scenarios import Fresh
 from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
@@ -72,6 +72,7 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy: str
     policy_source: str
     robot: str = ""
+    weather: str = ""
     goal: str
     seed: int
     collecting: DemoOptions
@@ -150,7 +151,7 @@ def collect(
     source: scenarios, in order.
     expert: driver of the robot.
     policy: name of the expert.
-    options: seed, robot, goal, own_camera and camera are used.
+    options: seed, robot, weather, goal, own_camera and camera are used.
     episodes: number of episodes in the data set; by default all that are solved.
     host: where the expert is queried.
     showing, progress: display of the run.
@@ -256,6 +257,7 @@ class _Rounds:
             policy=self.policy,
             policy_source=expert.source_hash,
             robot=self.options.robot,
+            weather=self.options.weather,
             goal=self.demonstrator.manifest.goal,
             seed=self.options.seed or 0,
             collecting=self.options.collecting or DemoOptions(),
@@ -293,7 +295,7 @@ class _Rounds:
         else:
             chosen = self.all[taken : taken + count]
             made = msgspec.structs.replace(self.source, scenarios=chosen)
-        return with_robot(made, self.options.robot)
+        return with_weather(with_robot(made, self.options.robot), self.options.weather)
 
     def run(
         self, held: RunFolder, scenarios: Sequence[Scenario], hello: Hello, showing: _Showing
@@ -418,6 +420,7 @@ def _written(
         "imu": demonstrator.manifest.imu,
         "people": demonstrator.manifest.people,
         "robot": robot,
+        "weather": spec.weather,
         "policy": demonstrator.manifest.name,
         "policy_source": spec.policy_source,
         "noise": spec.collecting.noise,

@@ -131,7 +131,14 @@ def _drive(
         world = stack.enter_context(BulletWorld(surface, robot=robot))
         cameras = {
             name: stack.enter_context(
-                camera_of(camera, world, spec, light=scenario.light, depth=spec.depth)
+                camera_of(
+                    camera,
+                    world,
+                    spec,
+                    light=scenario.light,
+                    weather=scenario.conditions,
+                    depth=spec.depth,
+                )
             )
             for name, spec in {"": manifest.camera, **manifest.cameras}.items()
             if spec is not None

@@ -250,7 +250,7 @@ def _entry(run: ReportedRun, pick: FailureToShow, showing: ShownAgain | str) -> 
         kind=scenario_kind(scenario),
         event=pick.event,
         place=pick.place,
-        light=light_in_words(scenario.light),
+        light=light_in_words(scenario),
         cause=pick.mishap.cause,
         reason=reason_of(scenario, record, pick.mishap, run.log(pick.scenario), other),
         at_s=Clock().time_s(pick.mishap.tick + 1),
