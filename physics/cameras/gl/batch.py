@@ -248,7 +248,7 @@ class BatchDrawing:
             gl.enable(moderngl.BLEND)
             gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
             stage.scene.draw_decals()
-            gl.blend_func = moderngl.DEFAULT_BLENDING
+            gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
             gl.disable(moderngl.BLEND)
             self._crowd.draw_contact(i)
         gl.polygon_offset = 0.0, 0.0
