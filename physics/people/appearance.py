@@ -75,16 +75,22 @@ def family_of(name: str, age: int) -> Family:
 
 @lru_cache(maxsize=65536)
 def look_of(
-    name: str, age: int, seed: int = 0, season: Season = "mild", rain: bool = False
+    name: str,
+    age: int,
+    seed: int = 0,
+    season: Season = "mild",
+    rain: bool = False,
+    crowd: bool = True,
 ) -> Look:
     """Return the look of the person of this `Age` called `name`.
 
     seed: changes clothes and colours, but not stature
     season: of the clothes
     rain: most people hold an umbrella
+    crowd: some people push or lead something; else their hands are free for gestures
     """
     family = family_of(name, age)
-    beside = object_of(name, seed, rain)
+    beside = object_of(name, seed, rain, crowd)
     choices = [one for one in CLOTHES if season in one.seasons and _fits(one, family, name)]
     choices = [one for one in choices if with_object(one.body, beside)] or choices
     clothes = choices[_draw(name, seed, "outfit") % len(choices)]
@@ -98,13 +104,14 @@ def look_of(
     return Look(ALL.index(outfit), table, patterns, girth_m)
 
 
-def object_of(name: str, seed: int = 0, rain: bool = False) -> Beside:
+def object_of(name: str, seed: int = 0, rain: bool = False, crowd: bool = True) -> Beside:
     """Return the object that a person pushes, leads or holds, or "" for none.
 
-    rain: most of those with free hands hold an umbrella
+    rain: most of those with free hands hold an umbrella, in the left hand
+    crowd: people may push or lead something, too
     """
     draw = _draw(name, seed, "beside") // 7 % 1000
-    for beside, share in _BESIDE:
+    for beside, share in _BESIDE if crowd else ():
         if draw < share:
             return beside
         draw -= share

@@ -94,7 +94,7 @@ def _holding(
         (tuple(low), 0.036),
         (wrist_m, 0.026),
     ]
-    skin = bar("skin", [at for at, _ in keys], 0.030 * f, chest)
+    skin = bar("skin", [at for at, _ in keys[1:]], 0.031 * f, chest)
     bent = bar("top", [at for at, _ in keys], 1.0, chest)
     rings = tuple(
         replace(ring, ahead=_times(ring.ahead, r * f + more), side=_times(ring.side, r * f + more))
@@ -106,7 +106,7 @@ def _holding(
         ball("skin", wrist_m, (0.045, 0.036, 0.040), chest, (10, 8, 6, 4)),
     ]
     if sleeve == "short":
-        pieces.append(replace(skin, sides=LIMB, rings_kept=(8, 5, 4, 3)))
+        pieces.append(replace(skin, sides=LIMB, rings_kept=(7, 4, 3, 3)))
     return pieces
 
 

@@ -25,7 +25,7 @@ _Point = tuple[float, float, float]
 HANDLES: Final[dict[Beside, tuple[_Point, _Point]]] = {
     "pram": ((0.36, 0.16, 1.00), (0.36, -0.16, 1.00)),
     "bicycle": ((0.34, 0.16, 1.00), (0.18, -0.30, 0.98)),
-    "umbrella": ((0.24, 0.30, 0.86), (0.20, -0.17, 1.20)),
+    "umbrella": ((0.20, 0.17, 1.20), (0.16, -0.28, 0.86)),
     "dog": ((0.02, 0.33, 0.86), (0.16, -0.28, 0.86)),
     "wheelchair": ((0.10, 0.29, 0.98), (0.10, -0.29, 0.98)),
 }
@@ -33,7 +33,7 @@ HANDLES: Final[dict[Beside, tuple[_Point, _Point]]] = {
 FREE: Final[dict[Beside, tuple[str, ...]]] = {
     "pram": (),
     "bicycle": (),
-    "umbrella": ("left",),
+    "umbrella": ("right",),
     "dog": ("left", "right"),
     "wheelchair": ("left", "right"),
 }
@@ -224,7 +224,7 @@ def _dog() -> list[Piece]:
 
 
 def _umbrella() -> list[Piece]:
-    x, y, _ = HANDLES["umbrella"][1]
+    x, y, _ = HANDLES["umbrella"][0]
     top = 2.03
     canopy = [
         upright_loft((x, y, z), wide, 1.0, wide, _CHEST)

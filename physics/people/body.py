@@ -104,7 +104,7 @@ class FarBody:
     unshaded: NDArray[np.float32]
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=256)
 def body(outfit: Outfit, level: int) -> SkinnedBody:
     """Build the body at a mesh level of detail; 0 is full detail."""
     if not 0 <= level < MESH_LEVELS:
@@ -137,7 +137,7 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
     )
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=256)
 def far_body(outfit: Outfit, level: int) -> FarBody:
     """Build the body at a level of tubes or ribbons, MESH_LEVELS to LEVELS - 1."""
     if not MESH_LEVELS <= level < LEVELS:
@@ -174,7 +174,7 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
     )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=128)
 def pieces(outfit: Outfit) -> tuple[Piece, ...]:
     """Return the closed surfaces of a body."""
     build = outfit.build

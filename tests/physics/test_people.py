@@ -216,6 +216,7 @@ def test_rain_opens_umbrellas() -> None:
     dry, wet = ([object_of(name, 3, rain) for name in names] for rain in (False, True))
     assert "umbrella" not in dry and 0.5 < wet.count("umbrella") / len(names) < 0.8
     assert {"dog", "pram", "bicycle", "wheelchair"} < set(dry)
+    assert {object_of(name, 3, True, crowd=False) for name in names} == {"", "umbrella"}
     assert all(b in (a, "umbrella") and (b == a or not a) for a, b in zip(dry, wet, strict=True))
 
 

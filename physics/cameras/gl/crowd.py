@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import People
+from cosim.core.state import People, PersonKind
 from physics.cameras.gl.cloth import MAPS_UNIT, map_texture
 from physics.cameras.gl.contact import ContactShadows
 from physics.cameras.gl.instances import runs_of
@@ -51,7 +51,7 @@ _SIT: Final = list(GESTURES).index("sit")
 _SEAT_AHEAD_M: Final = SEATED_BACK_M - 0.1
 """Shift of people in wheelchairs, so that their hips are nearly at their place, metres."""
 _TALL: Final = np.array([1.75 / skeleton(outfit.family).height_m for outfit in ALL])
-_Dress = tuple[tuple[str, ...], bytes, int, Season, bool]
+_Dress = tuple[tuple[str, ...], bytes, bytes, int, Season, bool]
 _ROW: Final = 3 * len(ROWS)
 _CROWD_MIN: Final = 64
 _KEYS: Final = (LEVELS + 1) * len(ALL)
@@ -109,7 +109,8 @@ class PeopleSeen(NamedTuple):
     def dressed(self) -> _Dress:
         """Return all that their appearance depends on."""
         people = self.people
-        return people.ids, people.age.tobytes(), self.seed, self.season, self.rain
+        crowd = (people.kind == PersonKind.CROWD.value).tobytes()
+        return people.ids, people.age.tobytes(), crowd, self.seed, self.season, self.rain
 
 
 class _Worn(NamedTuple):
@@ -341,8 +342,13 @@ def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats)
 
 
 @lru_cache(maxsize=256)
-def _worn(ids: tuple[str, ...], ages: bytes, seed: int, season: Season, rain: bool) -> _Worn:
-    looks = [look_of(name, age, seed, season, rain) for name, age in zip(ids, ages, strict=True)]
+def _worn(
+    ids: tuple[str, ...], ages: bytes, crowd: bytes, seed: int, season: Season, rain: bool
+) -> _Worn:
+    looks = [
+        look_of(name, age, seed, season, rain, bool(one))
+        for name, age, one in zip(ids, ages, crowd, strict=True)
+    ]
     return _Worn(
         np.array([who.outfit for who in looks], dtype=np.intp),
         np.array([who.girth_m for who in looks], dtype=np.float32),
