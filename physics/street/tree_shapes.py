@@ -31,7 +31,7 @@ _CORE: Final = 0.70
 """Size of the core behind the twigs, as a fraction of the crown."""
 Distance = Literal["near", "far"]
 """Distance at which a crown is drawn with its own number of twigs."""
-TREE_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (88, 0.50), "far": (32, 0.72)}
+TREE_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (80, 0.50), "far": (24, 0.76)}
 """Number of twigs of a crown, and their size as a fraction of the crown's radius."""
 SHRUB_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (60, 0.42), "far": (16, 0.8)}
 """The same of a shrub."""

@@ -60,7 +60,7 @@ _CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
 _SLACK_M: Final = _CELL_M * math.sqrt(0.5)
 """Maximum distance of an eye from the middle of its cell, metres."""
-_NEAR_M: Final = 16.0
+_NEAR_M: Final = 12.0
 """Distance within which objects have all their details, metres."""
 _DETAILS: Final[tuple[Detail, ...]] = ("near", "far")
 _TILE_REACH_M: Final = 34.0

@@ -38,7 +38,7 @@ void main() {
 _FRAGMENT: Final = """
 in vec3 at; in vec3 normal; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
 void main() {
-    vec4 seen = texture(surfaces, vec3(spot, layer_label.x), -0.6);
+    vec4 seen = texture(surfaces, vec3(spot, layer_label.x), -0.5);
     vec3 albedo = decoded(seen.rgb) * mix(vec3(1.0), tint, seen.a);
     show_linear(albedo, vec3(0.0), normal, at, layer_label.y);
 }

@@ -71,7 +71,7 @@ _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
 in vec2 middle;
 out vec3 at; out vec3 normal; out vec2 spot; out vec2 cells;
-flat out vec4 tint; flat out vec4 kind; flat out vec4 fronts;
+flat out vec4 tint; flat out vec4 kind; flat out vec4 fronts; flat out vec3 doors;
 void main() {
     int layer = int(in_normal.w * 255.0 + 0.5);
     at = in_at + vec3(middle, 0.0);
@@ -81,6 +81,8 @@ void main() {
     cells = in_spot.zw;
     kind = in_kind * 255.0;
     fronts = in_fronts * 255.0;
+    float every = floor((fronts.z + 0.5) / 16.0);
+    doors = vec3(every, 1.0 / every, fronts.z - 16.0 * every);
     gl_Position = project(at);
 }
 """
@@ -89,7 +91,7 @@ _FRAGMENT: Final = f"""
 layout(binding = {FACADES_UNIT}) uniform sampler2DArray facades;
 layout(binding = {FINISH_UNIT}) uniform sampler2DArray finish;
 in vec3 at; in vec3 normal; in vec2 spot; in vec2 cells;
-flat in vec4 tint; flat in vec4 kind; flat in vec4 fronts;
+flat in vec4 tint; flat in vec4 kind; flat in vec4 fronts; flat in vec3 doors;
 float chance(vec2 cell, float of) {{
     vec2 p = fract((cell + of) * vec2(0.1031, 0.1030));
     p += dot(p, p.yx + 33.33);
@@ -101,8 +103,8 @@ void main() {{
     vec2 cell = floor(cells);
     float drawn = chance(cell, kind.w + 7.0 * fronts.w);
     bool ground_floor = cell.y < 0.5 && kind.z > 0.5;
-    float every = floor(fronts.z / 16.0);
-    float front = abs(mod(cell.x, every) - (fronts.z - 16.0 * every)) < 0.5 ? fronts.y : fronts.x;
+    float from_door = cell.x - doors.x * floor((cell.x + 0.5) * doors.y) - doors.z;
+    float front = abs(from_door) < 0.5 ? fronts.y : fronts.x;
     float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {BAY_VARIANTS}.0);
     float up = ground_floor ? clamp(cells.y, 0.006, 0.994) : cells.y;  // its plinth does not show over its top
     vec4 bay = texture(facades, vec3(cells.x, -up, layer), -0.4);
