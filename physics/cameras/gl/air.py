@@ -21,8 +21,6 @@ from physics.cameras.gl.weather_shaders import (
 )
 
 _SIZES_MAX: Final = 4
-_ALWAYS: Final = "1"
-"""Depth function of moderngl that passes every pixel."""
 
 
 class LinearTarget:
@@ -34,7 +32,7 @@ class LinearTarget:
         self.colour.repeat_x = self.colour.repeat_y = False
         self.depth = context.depth_texture(size)
         self.depth.compare_func = ""
-        self._frame, self._painted = (
+        self.frame, self._painted = (
             context.framebuffer([self.colour], self.depth) for _ in range(2)
         )
         self._painted.color_mask = (True, True, True, False)
@@ -42,19 +40,19 @@ class LinearTarget:
 
     def clear(self) -> None:
         """Clear the target to an empty picture."""
-        self._frame.use()
-        self._frame.clear(depth=1.0)
+        self.frame.use()
+        self.frame.clear(depth=1.0)
 
     def use(self) -> None:
         """Make it the target of later draws."""
-        self._frame.use()
+        self.frame.use()
 
     def use_colours(self) -> None:
         """Make it the target of later draws without changing labels and depth."""
         self._painted.use()
 
     def release(self) -> None:
-        for thing in (self._frame, self._painted, self.colour, self.depth):
+        for thing in (self.frame, self._painted, self.colour, self.depth):
             thing.release()
 
 
@@ -79,17 +77,19 @@ class AirDrawing:
     def draw(
         self, variant: Variant, seen: LinearTarget, sky: moderngl.Texture, target: Target
     ) -> None:
-        """Draw a linear picture into a target. Its scene and weather blocks must be bound."""
+        """Draw a linear picture into a target. Its scene and weather blocks must be bound.
+
+        The depth of the picture stays in the linear target, until its next use.
+        """
         gl = self._context
         seen.colour.build_mipmaps()
         seen.colour.use(AIR_COLOUR_UNIT)
         seen.depth.use(AIR_DEPTH_UNIT)
         sky.use(SKY_UNIT)
         target.use()
-        gl.enable_only(moderngl.DEPTH_TEST)
-        gl.depth_func = _ALWAYS
+        target.drawn_in = seen.frame
+        gl.enable_only(moderngl.NOTHING)
         self._array(variant).render(moderngl.TRIANGLES, vertices=3)
-        gl.depth_func = "<"
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
     def _array(self, variant: Variant) -> moderngl.VertexArray:

@@ -27,6 +27,7 @@ class Target:
     """Framebuffer of one size.
 
     size: width, height in pixels
+    drawn_in: framebuffer with the depth of the picture
     parts_on_card: separate colours and labels before the readback; default on a graphics card
     """
 
@@ -41,11 +42,13 @@ class Target:
         )
         self._painted.color_mask = (True, True, True, False)
         self._painted.depth_mask = False
+        self.drawn_in = self.frame
         on_card = is_card(context) if parts_on_card is None else parts_on_card
         self._parting = _Parting(context, size) if on_card else None
 
     def clear(self) -> None:
         """Clear the target to an empty picture."""
+        self.drawn_in = self.frame
         self.frame.use()
         self.frame.clear(depth=1.0)
 
@@ -89,7 +92,7 @@ class Target:
     def read_depth(self) -> NDArray[np.float32]:
         """Read depth along the view, (H, W) metres."""
         width, height = self.size
-        data = self.frame.read(components=1, attachment=-1, dtype="f4")
+        data = self.drawn_in.read(components=1, attachment=-1, dtype="f4")
         depth = np.frombuffer(data, dtype=np.float32).reshape(height, width)
         return (
             FAR_PLANE_M * NEAR_PLANE_M / (FAR_PLANE_M - (FAR_PLANE_M - NEAR_PLANE_M) * depth)
