@@ -21,8 +21,6 @@ from physics.cameras.gl.weather_shaders import (
 )
 
 _SIZES_MAX: Final = 4
-_ALWAYS: Final = "1"
-"""Depth function of moderngl that passes every pixel."""
 
 
 class LinearTarget(Frame):
@@ -62,17 +60,19 @@ class AirDrawing:
     def draw(
         self, variant: Variant, seen: LinearTarget, sky: moderngl.Texture, target: Target
     ) -> None:
-        """Draw a linear picture into a target. Its scene and weather blocks must be bound."""
+        """Draw a linear picture into a target. Its scene and weather blocks must be bound.
+
+        The depth of the picture stays in the linear target, until its next use.
+        """
         gl = self._context
         seen.colour.build_mipmaps()
         seen.colour.use(AIR_COLOUR_UNIT)
         seen.depth.use(AIR_DEPTH_UNIT)
         sky.use(SKY_UNIT)
         target.use()
-        gl.enable_only(moderngl.DEPTH_TEST)
-        gl.depth_func = _ALWAYS
+        target.drawn_in = seen.frame
+        gl.enable_only(moderngl.NOTHING)
         self._array(variant).render(moderngl.TRIANGLES, vertices=3)
-        gl.depth_func = "<"
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
     def _array(self, variant: Variant) -> moderngl.VertexArray:

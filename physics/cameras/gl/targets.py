@@ -61,6 +61,7 @@ class Target(Frame):
     """Framebuffer of one size.
 
     size: width, height in pixels
+    drawn_in: framebuffer with the depth of the picture
     parts_on_card: separate colours and labels before the readback; default on a graphics card
     """
 
@@ -71,8 +72,14 @@ class Target(Frame):
         self._colour = context.texture(size, 4)
         self._depth = context.depth_renderbuffer(size)
         self.frame = context.framebuffer([self._colour], self._depth)
+        self.drawn_in = self.frame
         on_card = is_card(context) if parts_on_card is None else parts_on_card
         self._parting = _Parting(context, size) if on_card else None
+
+    def clear(self) -> None:
+        """Clear the target to an empty picture."""
+        self.drawn_in = self.frame
+        super().clear()
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Read colours (H, W, 3) and labels (H, W), the top row first."""
@@ -106,7 +113,7 @@ class Target(Frame):
     def read_depth(self) -> NDArray[np.float32]:
         """Read depth along the view, (H, W) metres."""
         width, height = self.size
-        data = self.frame.read(components=1, attachment=-1, dtype="f4")
+        data = self.drawn_in.read(components=1, attachment=-1, dtype="f4")
         depth = np.frombuffer(data, dtype=np.float32).reshape(height, width)
         return (
             FAR_PLANE_M * NEAR_PLANE_M / (FAR_PLANE_M - (FAR_PLANE_M - NEAR_PLANE_M) * depth)

@@ -368,7 +368,6 @@ void main() {
         light = mix(light, bloom, falling.w);
     }
     pixel = vec4(toned(light, here), own.a);
-    gl_FragDepth = deep;
 }
 """
 )
