@@ -210,7 +210,7 @@ class BatchDrawing:
             gl.enable(moderngl.BLEND)
             gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
             stage.scene.draw_decals()
-            gl.blend_func = moderngl.DEFAULT_BLENDING
+            gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
             gl.disable(moderngl.BLEND)
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
