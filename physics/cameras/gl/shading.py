@@ -140,15 +140,17 @@ float sunlit(vec3 at, vec3 normal) {
 #endif
 }
 
+vec3 on_curve(vec3 light) {
+    // The ACES curve (Narkowicz's fit) in sRGB, which reaches white at 1.96, as a polynomial of
+    // the root of light: to two levels below 0.8, without a division.
+    vec3 s = min(sqrt(light), 1.4);
+    return s * (0.1725 + s * (6.1673 + s * (-11.3129 + s * (7.7517 - s * 1.8716))));
+}
+
 #ifdef WEATHER
 vec3 on_screen(vec3 light) { return light; }
 #else
-vec3 on_screen(vec3 light) {
-    // The ACES curve (Narkowicz's fit) in sRGB, which reaches white at 1.96, as a polynomial of
-    // the root of light: to two levels below 0.8, without a division.
-    vec3 s = min(sqrt(light * sun_light.w), 1.4);
-    return s * (0.1725 + s * (6.1673 + s * (-11.3129 + s * (7.7517 - s * 1.8716))));
-}
+vec3 on_screen(vec3 light) { return on_curve(light * sun_light.w); }
 #endif
 
 float fogged() {

@@ -112,7 +112,7 @@ void main() {{
     albedo = none ? albedo : decoded(bay.rgb) + bay.a * albedo;
     vec3 own = vec3(0.0);
 #ifdef NIGHT
-    float shop = chance(vec2(floor(cell.x / max(every, 1.0)), 3.0), kind.w + fronts.w);
+    float shop = chance(vec2(floor((cell.x + 0.5) / max(doors.x, 1.0)), 3.0), kind.w + fronts.w);
     float lit = (ground_floor ? shop < {_OPEN_SHARE} : fract(drawn * 29.0) < {_LIT_SHARE}) ? side_light.w : 0.0;
     vec3 room = vec3(0.25) + 2.5 * decoded(bay.rgb);
     vec3 lamp = mix(vec3({_LAMPLIGHT}), vec3({_COOL_LIGHT}), step(0.75, fract((ground_floor ? shop : drawn) * 53.0)));

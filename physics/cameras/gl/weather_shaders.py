@@ -307,12 +307,8 @@ vec3 sensed(vec3 x, ivec2 here) {
     return max(x + n * sqrt(moment.z * (max(x, 0.0) + 0.03)), 0.0);
 }
 vec3 toned(vec3 light, ivec2 here) {
-    // Narkowicz's fit of the ACES curve, then sRGB to a level or two, as `on_screen` by day.
     vec3 x = light * sun_light.w;
-    if (moment.z > 0.0) x = sensed(x, here);
-    x = min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0);
-    vec3 s = sqrt(x);
-    return s * (1.1366 - 0.1366 * s);
+    return on_curve(moment.z > 0.0 ? sensed(x, here) : x);
 }
 """
 
