@@ -40,7 +40,7 @@ class Right:
         speed = (
             self.speed(seen)
             * self.slower(seen.people)
-            * (1.0 - min(20.0 * self.yellow(frames[-1]), 1.0))
+            * (1.0 - min(40.0 * self.yellow(frames[-1]), 1.0))
         )
         return self.waypoints(turn, speed)
 
@@ -65,8 +65,8 @@ class Right:
     def yellow(self, frame: np.ndarray) -> float:
         wide = frame.shape[1]
         middle = frame[:, wide // 3 : 2 * wide // 3]
-        red_and_green = middle[..., :2].min(axis=2)
-        return float((red_and_green > np.maximum(2.0 * middle[..., 2], 0.15)).mean())
+        red, green, blue = np.moveaxis(middle, 2, 0)
+        return float(((red > green) & (green > np.maximum(1.7 * blue, 0.15))).mean())
 
     def clear_rad(self, scan: Scan) -> float:
         ranges = np.minimum(scan.ranges_m[0], 10.0)

@@ -52,9 +52,9 @@ SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
         "person": "along it, and somebody stands 3 m ahead",
     }
 )
+_PERSON: Final = "person-0"
+"""Name of the person ahead, whose shirt is yellow in this place and season: easy to see."""
 _SHOWN: Final = "straight-003"
-_PERSON: Final = "person-30"
-"""Name of the person ahead, whose clothes are yellow there and so easy to see."""
 """Scenario of the suite `unit` whose place is shown.
 
 The way is 18 m long and has lawns on both sides. No large object is close to the camera: a policy
