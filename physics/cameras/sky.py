@@ -78,6 +78,7 @@ class Sky:
     fog_per_m: extinction per metre
     lamps: 0 by day to 1 at night
     shadows: the sun casts shadows
+    scan_exposure: exposure of generated scans, whose colours belong to maps of a frozen suite
 
     Row 0 of `radiance` is the zenith, the middle column looks east, and right is clockwise:
     u = 0.5 - atan2(y, x) / 2 pi, v = 0.5 - asin(z) / pi.
@@ -92,6 +93,7 @@ class Sky:
     exposure: float
     lamps: float
     shadows: bool
+    scan_exposure: float
 
 
 @lru_cache(maxsize=8)
@@ -222,7 +224,8 @@ def _assembled(
     for array in (sun, beam, ambient, whole, horizon):
         array.flags.writeable = False
     shadows = light.shadows and float(beam @ LUMINANCE) > 0.02
-    return Sky(sun, beam, ambient, whole, horizon, fog_per_m, exposure, lamps, shadows)
+    seen = fog_per_m, exposure, lamps, shadows, 2.0**light.exposure_ev * metered[1]
+    return Sky(sun, beam, ambient, whole, horizon, *seen)
 
 
 def _on_walls(sun: Floats, beam: Floats) -> Floats:

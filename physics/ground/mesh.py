@@ -68,12 +68,13 @@ class Mesh:
         return Mesh((self.vertices - pivot) @ turn.T + pivot, self.normals @ turn.T, self.triangles)
 
 
-Detail = Literal["always", "plain", "near", "far"]
+Detail = Literal["always", "plain", "textured", "near", "far"]
 """Cameras and distances that show a part.
 
 always: every camera at every distance
 plain: cameras without textures, and exports
-near, far: cameras with textures, at short or long distance
+textured: cameras with textures
+near, far: these, at short or long distance
 """
 
 
@@ -100,7 +101,8 @@ class Part(NamedTuple):
 
 def parts_seen(parts: Sequence[Part], detail: Detail) -> tuple[Part, ...]:
     """Return the parts that one kind of camera or distance shows."""
-    return tuple(part for part in parts if part.detail in ("always", detail))
+    shown = ("always", detail) if detail == "plain" else ("always", "textured", detail)
+    return tuple(part for part in parts if part.detail in shown)
 
 
 _idle_rows: list[list[float]] = []

@@ -34,7 +34,7 @@ from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, footprints, parts_of
 from physics.street.street_surface import StreetSurface
 from physics.street.surface import Patch
-from physics.textures.ground import ground_layers
+from physics.textures.ground import scan_layers
 from physics.textures.layers import Layers, linear_to_srgb, srgb_to_linear
 
 Box = tuple[float, float, float, float]
@@ -214,7 +214,7 @@ def _without_covered(whole: SurfaceSplats, parts: Sequence[SurfaceSplats]) -> Su
 
 def _pieces(surface: StreetSurface, box: Box) -> Iterator[_Piece]:
     """Yield everything that stands and lies in a box."""
-    layers = ground_layers(_TEXELS)
+    layers = scan_layers(_TEXELS)
     for key in tiles_touching(shapely.box(*box)):
         chunk, finish = surface.chunk(key), surface.finish(key)
         for patch in (*chunk.ground, *finish.laid):
@@ -261,7 +261,7 @@ def _lit(piece: _Piece, at: Floats, normals: Floats, sky: Sky, size_m: float) ->
     light = side + rise * (0.5 * (up - down)) + np.abs(rise) * (0.5 * (up + down) - side)
     facing = sum(normals[:, k] * sky.sun[k] for k in range(3))
     light = light + np.maximum(facing, 0.0)[:, None] * sky.sun_colour
-    x = albedo * light * sky.exposure
+    x = albedo * light * sky.scan_exposure
     shown = np.minimum(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0)
     return np.asarray(linear_to_srgb(shown))
 
@@ -270,7 +270,7 @@ def _albedo(piece: _Piece, at: Floats, size_m: float) -> Floats:
     tint = srgb_to_linear(piece.colour)
     if piece.layer < 0:
         return np.tile(tint, (len(at), 1))
-    layers = ground_layers(_TEXELS)
+    layers = scan_layers(_TEXELS)
     side = float(layers.metres[piece.layer, 0])
     texels = _coarse(layers.rgba[piece.layer], max(int(size_m / side * _TEXELS), 1))
     rows = np.floor(at[:, 1] / side % 1.0 * len(texels)).astype(int) % len(texels)

@@ -288,7 +288,7 @@ def shelter(size: Size) -> tuple[Part, ...]:
     rail = box((length, 0.05, 0.05), (0.0, back, 0.22), skip=("front", "back", "bottom"))
     return (
         Part(join([roof, seat]), None),
-        Part(join([*frame, rail]), METAL),
+        Part(join([*frame, rail]), METAL, detail="textured"),
         Part(join(panes), PANE, GLASS),
     )
 

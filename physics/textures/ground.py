@@ -46,6 +46,15 @@ def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
     return stack_layers("ground", crisp, size_px, seed)
 
 
+@lru_cache(maxsize=1)
+def scan_layers(size_px: int) -> Layers:
+    """Return the ground layers of generated scans.
+
+    Hashes of maps, to which a frozen suite refers, cover their colours: do not change them.
+    """
+    return stack_layers("scan-ground", _SCAN_RECIPES, size_px, 0)
+
+
 def _crisp(make: Generator) -> Generator:
     """Return a generator with more contrast in fine detail, which filters of pictures lose."""
 
@@ -415,3 +424,12 @@ def layer_of(surface: str, seed: int = 0) -> str:
     if kind == "road" and material == "brick":
         choice = ("setts", "brick-running", "brick-herringbone")
     return choice[zlib.crc32(f"{surface}:{seed}".encode()) % len(choice)]
+
+
+_SCAN_RECIPES: Final[Mapping[str, Recipe]] = {
+    **GROUND_RECIPES,
+    "asphalt": Recipe(3.0, _asphalt(0.050)),
+    "asphalt-worn": Recipe(4.0, _asphalt(0.055, 0.37, worn=1.0)),
+    "asphalt-patched": Recipe(6.0, _asphalt(0.050, 0.35, worn=0.6, patches=True)),
+    "asphalt-fine": Recipe(2.0, _asphalt(0.035, 0.40)),
+}

@@ -47,6 +47,7 @@ def episodes() -> pd.DataFrame:
         "reason": "",
         "camera": "none",
         "nonstandard": "",
+        "weather": "clear",
     }
     words |= {
         "policy": "p",
