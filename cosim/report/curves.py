@@ -112,7 +112,7 @@ def draw_curves(
         if metric in _SHARES:
             panel.set_ylim(-0.03, 1.03)
         else:
-            panel.set_ylim(bottom=0.0)
+            panel.set_ylim(0.0, top_of(whole[whole["metric"] == metric]))
     if others and len(lines) <= _MAX_NAMED:
         handles, names = figure.axes[0].get_legend_handles_labels()
         columns = min(len(names), 4, max(1, _LEGEND_LETTERS // (6 + max(map(len, names)))))
@@ -126,6 +126,15 @@ def draw_curves(
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     return picture.getvalue()
+
+
+def top_of(rows: pd.DataFrame) -> float:
+    """Return the upper end of an axis from 0, with room above all means and intervals.
+
+    rows: columns mean, high; NaN where unknown
+    """
+    highest = float(np.nan_to_num(rows[["mean", "high"]].to_numpy(float)).max(initial=0.0))
+    return 1.08 * highest or 1.0
 
 
 def _name_ticks(panel: Axes, names: Sequence[str]) -> None:

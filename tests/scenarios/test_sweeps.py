@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from cosim.core.errors import MachineError
-from cosim.report.curves import draw_curves
+from cosim.report.curves import draw_curves, top_of
 from cosim.results.metrics import METRICS
 from cosim.results.table import summary_of
 from scenarios.suites.user_scenarios.read import OwnFile, read_own
@@ -219,3 +219,11 @@ def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, co
     )
     refused = cosim("run", "told.toml", cwd=tmp_path)
     assert refused.returncode == 2 and "goal_protocol 'route_point' is of a run" in refused.stderr
+
+
+def test_an_axis_has_room_above_means_without_intervals() -> None:
+    """Also where some or all values are unknown."""
+    rows = pd.DataFrame({"mean": [10.3, 10.7, np.nan], "high": [np.nan, np.nan, np.nan]})
+    assert top_of(rows) > 11.0
+    assert top_of(rows.assign(high=14.0)) > 15.0
+    assert top_of(rows[2:]) == top_of(rows[:0]) == 1.0
