@@ -133,7 +133,7 @@ def print_table(
     columns = [*tables.names("episode"), *tables.labels("ended"), *tables.figures(*heads)]
     tables.show(out, columns, rows)
     print_terms(out, table, folder)
-    if words := _conditions_in_words(folder):
+    if words := _robots_in_words(folder):
         out.print(words, highlight=False, markup=False)
     counted = "/".join(name for _, name in COUNTS)
     shown = [letter for letter in LETTERS if letter != "D" or has_decoys(table)]
@@ -143,12 +143,11 @@ def print_table(
     print_statuses(out, table, scheduled)
 
 
-def _conditions_in_words(folder: Path | None) -> str:
-    """Return robots, gait and weather of a run; "" for the defaults, and without a run's
-    folder."""
+def _robots_in_words(folder: Path | None) -> str:
+    """Return robots and gait of a run; "" for the defaults, and without a run's folder."""
     if folder is None or not (folder / "run.json").is_file():
         return ""
-    return read_spec(folder).conditions_in_words
+    return read_spec(folder).robots_in_words
 
 
 def print_means(out: Console, table: pd.DataFrame) -> None:

@@ -111,14 +111,18 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     schema: int = SCHEMA
 
     @property
-    def conditions_in_words(self) -> str:
-        """Names and short hashes of robots and gait, and the weather; "" for the defaults."""
+    def robots_in_words(self) -> str:
+        """Names and short hashes of robots and gait; "" for the defaults."""
         robots = [f"robot {n} ({h[:8]})" for n, h in self.robots.items() if n != COURIER.name]
         if self.setup.gait:
             robots.append(gait_in_words(self.setup.gait, self.setup.gait_hash))
-        if self.weather:
-            robots.append(f"weather {self.weather}")
         return ", ".join(robots)
+
+    @property
+    def conditions_in_words(self) -> str:
+        """Robots and gait as in `robots_in_words`, and the weather; "" for the defaults."""
+        weather = f"weather {self.weather}" if self.weather else ""
+        return ", ".join(filter(None, (self.robots_in_words, weather)))
 
     def apart(
         self, other: RunSpec, but: str = "", whole: Suite | None = None
@@ -176,7 +180,7 @@ def names_by_conditions(specs: Sequence[RunSpec]) -> list[str]:
     robots = {spec.manifest.name: set[str]() for spec in specs}
     weathers = {spec.manifest.name: set[str]() for spec in specs}
     for spec in specs:
-        robots[spec.manifest.name].add(_robots_in_words(spec))
+        robots[spec.manifest.name].add(_robot_names(spec))
         weathers[spec.manifest.name].add(spec.weather)
     return [
         _varied_in_words(spec, robots[name], weathers[name])
@@ -189,13 +193,13 @@ def _varied_in_words(spec: RunSpec, robots: set[str], weathers: set[str]) -> str
     """Return robots and weather of a run, as far as these differ between runs of its policy."""
     words = [spec.manifest.name]
     if len(robots) > 1:
-        words.append(_robots_in_words(spec))
+        words.append(_robot_names(spec))
     if len(weathers) > 1:
         words.append(spec.weather or "own weather")
     return ", ".join(words)
 
 
-def _robots_in_words(spec: RunSpec) -> str:
+def _robot_names(spec: RunSpec) -> str:
     return " and ".join(sorted(spec.robots))
 
 

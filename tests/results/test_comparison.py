@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -13,17 +14,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 
+from cosim.cli.run_table import print_table
 from cosim.report.compared import as_latex, as_markdown, flips_in_words, tables_of_comparison
 from cosim.results.compare import (
     RunComparison,
     compare_runs,
     groups_of,
 )
+from cosim.results.finished_run import read_whole_run
 from cosim.results.metrics import METRICS, WORST
 from cosim.results.record import Record, ScanLook
 from cosim.results.run_folder import RunFolder, read_records, read_spec
-from cosim.results.table import table_row
+from cosim.results.table import table_of, table_row
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario, read_suite
@@ -196,6 +200,10 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     assert said.returncode == 0, said.stderr
     assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", said.stdout)
     assert (tmp_path / "weather.png").read_bytes().startswith(b"\x89PNG")
+    printed = io.StringIO()
+    table = table_of(read_whole_run(rain).records.values())
+    print_table(Console(file=printed, width=200), table, 20, rain)
+    assert printed.getvalue().count("weather rain") == 1
 
 
 @pytest.mark.parametrize("track", ["lidar", "people"])
