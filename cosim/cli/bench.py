@@ -352,7 +352,7 @@ def bench(
         typer.Option(
             metavar="PATH",
             help="For `environment` and `camera`: a checkout, measured in turns, too, with the "
-            "ratios. For `realism`: realism.json of another run, shown beside this one.",
+            "ratios. For `realism`: realism.json of another run, shown next to this one.",
         ),
     ] = None,
     rounds: Annotated[

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final, Literal
 
 from physics.people.arms import on_arm
-from physics.people.beside import bar
+from physics.people.companions import bar
 from physics.people.figure import SMALL, upright_loft
 from physics.people.lofted_mesh import Joints, Piece, Ring, ball
 

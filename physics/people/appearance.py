@@ -15,14 +15,14 @@ from cosim.people.gait import is_woman
 from physics.people.body import COATS
 from physics.people.cloth_maps import BEARDS, layer
 from physics.people.families import Family
-from physics.people.figure import Beside
+from physics.people.figure import Companion
 from physics.people.wardrobe import (
     ALL,
     CLOTHES,
     PALETTES,
     Clothes,
     Season,
-    with_object,
+    with_companion,
 )
 
 _SKINS: Final = ("f0cdb6", "e6b898", "d9a582", "c99270", "b07c5a", "96674a", "7c5340", "64432f")
@@ -37,7 +37,7 @@ _BAGS: Final = ("4a3a2f", "3a3d42", "84483e", "3f5f63", "a88f66", "5a5074", "c8b
 _Colour = tuple[int, int, int]
 
 
-_BESIDE: Final[tuple[tuple[Beside, int], ...]] = (
+_COMPANIONS: Final[tuple[tuple[Companion, int], ...]] = (
     ("dog", 15),
     ("pram", 10),
     ("bicycle", 10),
@@ -90,11 +90,11 @@ def look_of(
     crowd: some people push or lead something; else their hands are free for gestures
     """
     family = family_of(name, age)
-    beside = object_of(name, seed, rain, crowd)
+    companion = companion_of(name, seed, rain, crowd)
     choices = [one for one in CLOTHES if season in one.seasons and _fits(one, family, name)]
-    choices = [one for one in choices if with_object(one.body, beside)] or choices
+    choices = [one for one in choices if with_companion(one.body, companion)] or choices
     clothes = choices[_draw(name, seed, "outfit") % len(choices)]
-    outfit = with_object(clothes.body, beside) or clothes.outfit
+    outfit = with_companion(clothes.body, companion) or clothes.outfit
     colours = _colours(name, seed, family, clothes)
     table = np.array([colours[coat] for coat in COATS], dtype=np.uint8)
     patterns = _patterns(name, seed, clothes)
@@ -104,16 +104,16 @@ def look_of(
     return Look(ALL.index(outfit), table, patterns, girth_m)
 
 
-def object_of(name: str, seed: int = 0, rain: bool = False, crowd: bool = True) -> Beside:
+def companion_of(name: str, seed: int = 0, rain: bool = False, crowd: bool = True) -> Companion:
     """Return the object that a person pushes, leads or holds, or "" for none.
 
     rain: most of those with free hands hold an umbrella, in the left hand
     crowd: people may push or lead something, too
     """
     draw = _draw(name, seed, "beside") // 7 % 1000
-    for beside, share in _BESIDE if crowd else ():
+    for companion, share in _COMPANIONS if crowd else ():
         if draw < share:
-            return beside
+            return companion
         draw -= share
     if rain and _draw(name, seed, "umbrella") // 7 % 1000 < _UMBRELLAS:
         return "umbrella"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from physics.people.beside import bar, elbow_of
+from physics.people.companions import bar, elbow_of
 from physics.people.families import man_rest_m
 from physics.people.figure import LIMB, SMALL, Build, Sleeve
 from physics.people.lofted_mesh import Joints, Piece, Ring, ball

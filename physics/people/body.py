@@ -14,15 +14,15 @@ from physics.ground.mesh import smooth_normals
 from physics.people.accessories import Cap, Carried, Hair, carried, hair, headgear
 from physics.people.ambient import unshaded
 from physics.people.arms import arms
-from physics.people.beside import beside, reach
 from physics.people.clips import bind_of
+from physics.people.companions import companion_pieces, reach
 from physics.people.families import Family, man_rest_m, skeleton
 from physics.people.figure import (
     LEVELS,
     MESH_LEVELS,
     RIBBONS,
-    Beside,
     Build,
+    Companion,
     Legs,
     Sleeve,
     legs,
@@ -52,7 +52,7 @@ class Outfit:
     carried: Carried = ""
     bare: bool = False
     loose_m: float = 0.0
-    beside: Beside = ""
+    companion: Companion = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,12 +183,12 @@ def pieces(outfit: Outfit) -> tuple[Piece, ...]:
         parts = parts[:1]
     parts += neck_and_head(build)
     parts += legs(build, outfit.legs, outfit.bare, outfit.loose_m)
-    holds = {side: reach(outfit.beside, side) for side in ("left", "right")}
+    holds = {side: reach(outfit.companion, side) for side in ("left", "right")}
     parts += arms(build, outfit.sleeve, outfit.loose_m, holds)
     parts += [about_head(piece, build.head) for piece in hair(outfit.hair)]
     if outfit.cap:
         parts += [about_head(piece, build.head) for piece in headgear(outfit.cap)]
-    return (*parts, *carried(outfit.carried, outfit.loose_m), *beside(outfit.beside))
+    return (*parts, *carried(outfit.carried, outfit.loose_m), *companion_pieces(outfit.companion))
 
 
 def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -18,7 +18,7 @@ RIBBONS: Final = LEVELS - 1
 """Level of ribbons, drawn as the outlines of the tubes of the previous level."""
 Sleeve = Literal["long", "short"]
 Legs = Literal["trousers", "shorts", "skirt", "coat"]
-Beside = Literal["", "dog", "pram", "bicycle", "wheelchair", "umbrella"]
+Companion = Literal["", "dog", "pram", "bicycle", "wheelchair", "umbrella"]
 """Object that a person leads, pushes, sits in or holds up."""
 
 TORSO: Final = (28, 18, 6, 4)

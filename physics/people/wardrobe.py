@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from physics.people.body import Outfit
-from physics.people.figure import Beside, Build
+from physics.people.figure import Build, Companion
 
 Season = Literal["summer", "mild", "winter"]
 SEASONS: Final[tuple[Season, ...]] = ("summer", "mild", "winter")
@@ -186,7 +186,7 @@ def _read(row: str) -> Clothes:
 CLOTHES: Final = tuple(map(_read, _ROWS.strip().splitlines()))
 """Outfits that people wear."""
 
-_VARIANTS: Final[dict[Beside, tuple[str, ...]]] = {
+_VARIANTS: Final[dict[Companion, tuple[str, ...]]] = {
     "dog": ("m tee", "m jacket", "w tee", "w jacket", "e jacket", "e skirt", "w coat", "m coat"),
     "pram": ("m tee", "m jacket", "w blouse", "w tee", "w jacket", "w coat"),
     "bicycle": ("m tee", "m jacket", "m padded", "w tee", "w jacket", "w padded"),
@@ -200,21 +200,21 @@ _VARIANTS: Final[dict[Beside, tuple[str, ...]]] = {
 """Bodies that also exist with an object pushed, led or held."""
 
 
-def with_object(name: str, beside: Beside) -> Outfit | None:
+def with_companion(name: str, companion: Companion) -> Outfit | None:
     """Return a body with an object, or None where there is none."""
-    if not beside:
+    if not companion:
         return BODIES[name]
-    if name not in _VARIANTS[beside]:
+    if name not in _VARIANTS[companion]:
         return None
-    return replace(BODIES[name], beside=beside, carried="")
+    return replace(BODIES[name], companion=companion, carried="")
 
 
 ALL: Final[tuple[Outfit, ...]] = (
     *BODIES.values(),
     *(
         outfit
-        for beside, names in _VARIANTS.items()
-        for outfit in (with_object(name, beside) for name in names)
+        for companion, names in _VARIANTS.items()
+        for outfit in (with_companion(name, companion) for name in names)
         if outfit is not None
     ),
 )

@@ -138,13 +138,13 @@ def test_objects_are_drawn_and_labelled(
     plain = mask(crowd, near_people(), taken)
     crowds._worn.cache_clear()
     look = crowds.look_of
-    variants = {o.family: k for k, o in enumerate(ALL) if o.beside == what}
+    variants = {o.family: k for k, o in enumerate(ALL) if o.companion == what}
 
-    def with_object(name: str, age: int, *more: Any) -> Look:
+    def with_companion(name: str, age: int, *more: Any) -> Look:
         own = look(name, age, *more)
         return dataclasses.replace(own, outfit=variants[ALL[own.outfit].family])
 
-    monkeypatch.setattr(crowds, "look_of", with_object)
+    monkeypatch.setattr(crowds, "look_of", with_companion)
     other = CrowdDrawing(context())
     shown = mask(other, near_people(), taken)
     other.release()

@@ -13,7 +13,7 @@ from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, Age, People
 from cosim.people.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
-from physics.people.appearance import family_of, look_of, object_of
+from physics.people.appearance import companion_of, family_of, look_of
 from physics.people.body import COATS, SkinnedBody, body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
@@ -196,7 +196,7 @@ def test_sixty_outfits_follow_the_season() -> None:
         allowed = {one.outfit for one in CLOTHES if season in one.seasons}
         for age in (Age.ADULT, Age.CHILD, Age.ELDERLY):
             worn = {ALL[look_of(name, age, 0, season).outfit] for name in names}
-            plain = {outfit for outfit in worn if not outfit.beside}
+            plain = {outfit for outfit in worn if not outfit.companion}
             assert plain <= allowed and len(plain) >= (8 if age == Age.ADULT else 2)
     coats = [
         sum(o.legs == "coat" for o in map(ALL.__getitem__, rows))
@@ -213,10 +213,10 @@ def test_sixty_outfits_follow_the_season() -> None:
 def test_rain_opens_umbrellas() -> None:
     """In rain most people hold an umbrella, without rain none; the others keep what they push."""
     names = [f"c{i}" for i in range(2000)]
-    dry, wet = ([object_of(name, 3, rain) for name in names] for rain in (False, True))
+    dry, wet = ([companion_of(name, 3, rain) for name in names] for rain in (False, True))
     assert "umbrella" not in dry and 0.5 < wet.count("umbrella") / len(names) < 0.8
     assert {"dog", "pram", "bicycle", "wheelchair"} < set(dry)
-    assert {object_of(name, 3, True, crowd=False) for name in names} == {"", "umbrella"}
+    assert {companion_of(name, 3, True, crowd=False) for name in names} == {"", "umbrella"}
     assert all(b in (a, "umbrella") and (b == a or not a) for a, b in zip(dry, wet, strict=True))
 
 

@@ -356,7 +356,7 @@ def _worn(
             [np.column_stack([who.colours, who.patterns]) for who in looks], dtype=np.uint8
         ).reshape(-1, len(COATS), 4),
         bodies_of(ids, ages),
-        np.array([ALL[who.outfit].beside == "wheelchair" for who in looks], dtype=bool),
+        np.array([ALL[who.outfit].companion == "wheelchair" for who in looks], dtype=bool),
     )
 
 

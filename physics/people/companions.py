@@ -1,7 +1,7 @@
 """Lofts of wheelchairs, prams, dogs on leads, pushed bicycles and umbrellas.
 
-They are modelled beside the man of 1.75 m. All but umbrellas follow the joint `GROUND`, which moves
-with the person's place and heading alone.
+They are modelled next to the man of 1.75 m. All but umbrellas follow the joint `GROUND`, which
+moves with the person's place and heading alone.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from physics.people.figure import Beside, upright_loft
+from physics.people.figure import Companion, upright_loft
 from physics.people.gestures import SEAT_M, SEATED_BACK_M
 from physics.people.lofted_mesh import GROUND, Joints, Piece, Ring, ball
 
@@ -22,7 +22,7 @@ _CHEST: Final[Joints] = {"spine3": 1.0}
 _BAR: Final = (6, 4, 4, 4)
 _Point = tuple[float, float, float]
 
-HANDLES: Final[dict[Beside, tuple[_Point, _Point]]] = {
+HANDLES: Final[dict[Companion, tuple[_Point, _Point]]] = {
     "pram": ((0.36, 0.16, 1.00), (0.36, -0.16, 1.00)),
     "bicycle": ((0.34, 0.16, 1.00), (0.18, -0.30, 0.98)),
     "umbrella": ((0.20, 0.17, 1.20), (0.16, -0.28, 0.86)),
@@ -30,7 +30,7 @@ HANDLES: Final[dict[Beside, tuple[_Point, _Point]]] = {
     "wheelchair": ((0.10, 0.29, 0.98), (0.10, -0.29, 0.98)),
 }
 """Places of the left and right wrist, for the arms in `arms.holding`."""
-FREE: Final[dict[Beside, tuple[str, ...]]] = {
+FREE: Final[dict[Companion, tuple[str, ...]]] = {
     "pram": (),
     "bicycle": (),
     "umbrella": ("right",),
@@ -40,7 +40,7 @@ FREE: Final[dict[Beside, tuple[str, ...]]] = {
 """Arms that swing as in the gait."""
 
 
-def beside(what: Beside) -> list[Piece]:
+def companion_pieces(what: Companion) -> list[Piece]:
     """Return the surfaces of an object."""
     return {
         "": list,
@@ -58,8 +58,8 @@ def bar(coat: str, points: Sequence[_Point], radius_m: float, joints: Joints = _
     ways = np.gradient(places, axis=0)
     rings = []
     for at, way in zip(places, ways / np.linalg.norm(ways, axis=1, keepdims=True), strict=True):
-        help_ = np.array((0.0, 1.0, 0.0) if abs(way[1]) < 0.8 else (1.0, 0.0, 0.0))
-        first = np.cross(help_, way)
+        aside = np.array((0.0, 1.0, 0.0) if abs(way[1]) < 0.8 else (1.0, 0.0, 0.0))
+        first = np.cross(aside, way)
         first *= radius_m / np.linalg.norm(first)
         second = np.cross(way, first)
         rings.append(Ring(tuple(at), tuple(first), tuple(second), joints))
@@ -242,7 +242,7 @@ def _umbrella() -> list[Piece]:
     ]
 
 
-def reach(what: Beside, side: str) -> _Point | None:
+def reach(what: Companion, side: str) -> _Point | None:
     """Return the place of a hand that holds an object, or None where the arm swings."""
     if not what or side in FREE[what]:
         return None
