@@ -85,6 +85,8 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
         try:
             job = decode_job(wire.receive())
         except EOFError:
+            if drivers is not None:
+                drivers.close()  # an open session would keep this process alive
             return
         with suppress(OSError):  # the policy may have deleted it
             os.chdir(home)

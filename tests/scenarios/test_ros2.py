@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +25,8 @@ from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.ros2 import CMD_VEL, Ros2Settings
+from scenarios.ipc.child_process import ENDING_S
+from scenarios.ipc.messages import Done, Message
 from scenarios.runs.run import run
 from scenarios.tools.viewing.bag import write_bag
 from tests.conftest import ROOT
@@ -74,14 +77,20 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_node_drives_as_the_same_rule_in_this_process(here: Path, tmp_path: Path) -> None:
     """Two runs of a node in its own process have the state hash and the commands of the rule as a
-    policy of this process, and say how they waited."""
+    policy of this process, say how they waited, and end soon after their last episode."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     at = Connection(role="coordinator", listen=endpoint, guests=("ros2",))
     host = PolicyHost(ros2=Ros2Settings(connection=at, camera="none", odometry="exact"))
     chosen = {"scenarios": [NAME], "options": SEEDED}
     with node_at(endpoint):
         for name in ("one", "two"):
-            table = run("unit", "ros2:", host=host, out=tmp_path / name, **chosen)  # type: ignore[arg-type]
+            done_s: list[float] = []
+
+            def tell(message: Message, done_s: list[float] = done_s) -> None:
+                done_s += [time.monotonic()] * isinstance(message, Done)
+
+            table = run("unit", "ros2:", host=host, out=tmp_path / name, tell=tell, **chosen)  # type: ignore[arg-type]
+            assert time.monotonic() - done_s[0] < 0.9 * ENDING_S, "its process was killed"
             assert table["policy_runs"].tolist() == ["ros2, next"]
             assert table["status"].tolist() == ["done"], table["reason"].tolist()
     folders = [run / "episodes" / NAME for run in (here, tmp_path / "one", tmp_path / "two")]
