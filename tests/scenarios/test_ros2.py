@@ -84,13 +84,14 @@ def test_a_node_drives_as_the_same_rule_in_this_process(here: Path, tmp_path: Pa
     chosen = {"scenarios": [NAME], "options": SEEDED}
     with node_at(endpoint):
         for name in ("one", "two"):
-            done_s: list[float] = []
+            told: list[tuple[Message, float]] = []
 
-            def tell(message: Message, done_s: list[float] = done_s) -> None:
-                done_s += [time.monotonic()] * isinstance(message, Done)
+            def tell(message: Message, told: list[tuple[Message, float]] = told) -> None:
+                told.append((message, time.monotonic()))
 
             table = run("unit", "ros2:", host=host, out=tmp_path / name, tell=tell, **chosen)  # type: ignore[arg-type]
-            assert time.monotonic() - done_s[0] < 0.9 * ENDING_S, "its process was killed"
+            (done_s,) = [at_s for message, at_s in told if isinstance(message, Done)]
+            assert time.monotonic() - done_s < 0.9 * ENDING_S, "its process was killed"
             assert table["policy_runs"].tolist() == ["ros2, next"]
             assert table["status"].tolist() == ["done"], table["reason"].tolist()
     folders = [run / "episodes" / NAME for run in (here, tmp_path / "one", tmp_path / "two")]
