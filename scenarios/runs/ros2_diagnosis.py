@@ -34,9 +34,9 @@ def diagnosis(node: Ros2Node, settings: Ros2Settings, faults: Iterable[str]) -> 
         return "; ".join(dict.fromkeys(found))
     if not others:
         return (
-            f"no ROS 2 node is at {settings.where} in any domain: nodes of rmw_zenoh and pyzeros "
-            "connect there in the mode client with this endpoint, and those on DDS need "
-            "zenoh-bridge-ros2dds and --ros2-dialect ros2dds"
+            f"no ROS 2 node is at {settings.where} in any domain: nodes of rmw_zenoh connect "
+            "there, a pyzeros node needs a configuration with the mode client and this endpoint, "
+            "and those on DDS need zenoh-bridge-ros2dds and --ros2-dialect ros2dds"
         )
     publishers = node.publishers_of(CMD_VEL).values()
     here = full_topic(settings.namespace, CMD_VEL)

@@ -246,7 +246,7 @@ def test_without_a_node_the_crash_says_how_they_connect(at: str) -> None:
     with (
         driven(at, start_s=1.0) as driver,
         pytest.raises(
-            PolicyError, match=f"no ROS 2 node is at {at}.*mode client with this endpoint.*ros2dds"
+            PolicyError, match=f"no ROS 2 node is at {at}.*mode client and this endpoint.*ros2dds"
         ),
     ):
         driver.reset("k1", 7)
