@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from typing import Final
 
 from bridge.ros2 import messages
 from bridge.ros2.commands import COMMAND_TYPES, hash_fault
 from bridge.ros2.node import Ros2Node
 from bridge.ros2.wire import Endpoint, full_topic, type_hash
-from cosim.spec.ros2 import CMD_VEL, SENT, Ros2Distro, Ros2Settings
+from cosim.spec.ros2 import CMD_VEL, SENT, SENT_WITH, Ros2Distro, Ros2Settings
 
 _MOST_NAMED: Final = 8
 """Largest number of nodes or topics that a message names."""
 
 
-def diagnosis(node: Ros2Node, settings: Ros2Settings, faults: Iterable[str]) -> str:
+def diagnosis(
+    node: Ros2Node, settings: Ros2Settings, faults: Iterable[str], sent: Set[str] = frozenset()
+) -> str:
     """Return why there is no command, "" if nothing is wrong with the nodes around.
 
     faults: Of messages, in words.
+    sent: Topics of the messages of the episode.
     """
     there = node.others
     runs = {
@@ -29,6 +32,7 @@ def diagnosis(node: Ros2Node, settings: Ros2Settings, faults: Iterable[str]) -> 
         *faults,
         *_faults_of_publishers(others, settings),
         *_faults_of_subscriptions(node, settings.distro),
+        *_silent_topics(node, sent),
     ]
     if found:
         return "; ".join(dict.fromkeys(found))
@@ -80,6 +84,16 @@ def _faults_of_subscriptions(node: Ros2Node, distro: Ros2Distro) -> Iterator[str
             yield f"{end.in_words} subscribes to {end.topic} as {end.type}, it is {SENT[topic]}"
         elif words := _fault_of_hash(end, distro):
             yield words
+
+
+def _silent_topics(node: Ros2Node, sent: Set[str]) -> Iterator[str]:
+    """Yield the subscriptions to topics without messages, if nothing else is read."""
+    read = node.subscriptions()
+    if sent and not any(topic in sent for topic, _ in read):
+        for topic, end in read:
+            if topic in SENT_WITH:
+                nothing = f"subscribes to {end.topic}, and this run sends nothing there"
+                yield f"{end.in_words} {nothing}: see {SENT_WITH[topic]}"
 
 
 def _fault_of_hash(end: Endpoint, distro: Ros2Distro) -> str:

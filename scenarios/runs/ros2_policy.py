@@ -102,6 +102,7 @@ class Ros2Policy:
         self._plan: Received | None = None
         self._remarks = Remarks()
         self._hints: set[str] = set()
+        self._sent: set[str] = set()
         self._controller: _Controller | None = None
         self._present: Mapping[bytes, Endpoint] = {}
         self._stream: messages.EpisodeStream | None = None
@@ -117,12 +118,13 @@ class Ros2Policy:
         self._controller = None
         self._last = self._absent_s = None
         self._hints.clear()
+        self._sent.clear()
         self.took_ms = []
         self._report_repeated()
         self._await_controller(node)
         self._present = self._drivers(node)
         for topic, sent in self._stream.begun():
-            node.publish(topic, sent)
+            self._publish(node, topic, sent)
         time.sleep(SETTLE_S)
         self._inbox.take_all()
         self._plan = None
@@ -137,7 +139,7 @@ class Ros2Policy:
         if self.settings.wait != "rate":
             self._refuse_another(node, self._inbox.take_all())
         for topic, sent in stream.observed(seen, node.has_subscriber):
-            node.publish(topic, sent)
+            self._publish(node, topic, sent)
         now_ns = stream.time_ns(seen.tick)
         if first:
             self._waits_s = time.monotonic()
@@ -174,6 +176,10 @@ class Ros2Policy:
                 raise
             self._session, self._node = session, node
         return self._node
+
+    def _publish(self, node: Ros2Node, topic: str, sent: Any) -> None:
+        node.publish(topic, sent)
+        self._sent.add(topic)
 
     def _take_plan(self, got: Received) -> None:
         """Hold a plan until the next answer; one that is too long does not replace another."""
@@ -405,7 +411,7 @@ class Ros2Policy:
         return f"no message came on {full_topic(self.settings.namespace, CMD_VEL)}"
 
     def _diagnosis(self, node: Ros2Node, faults: Iterable[str]) -> str:
-        return diagnosis(node, self.settings, faults)
+        return diagnosis(node, self.settings, faults, self._sent)
 
     def _hint(self, node: Ros2Node, waited_s: float, waits_for: str, otherwise: str = "") -> None:
         """Report why the run waits, once it has waited for a while, and each reason once.

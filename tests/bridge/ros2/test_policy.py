@@ -268,14 +268,18 @@ ODOM_AS_TWIST = (
             "/driver publishes /cmd_vel and subscribes only to /plan, and the run publishes none",
         ),
         ({}, "/driver publishes /cmd_vel and subscribes to no topic"),
+        (
+            {"/scan": "sensor_msgs/msg/LaserScan"},
+            "/driver subscribes to /scan, and this run sends nothing there: see --ros2-scan",
+        ),
     ],
-    ids=["type", "one of two", "silent", "other topic", "none"],
+    ids=["type", "one of two", "silent", "other topic", "none", "no scan"],
 )
 def test_a_node_without_commands_is_described(
     at: str, reads: dict[str, str], words: str, monkeypatch: Any
 ) -> None:
-    """A subscription of a wrong type, or none, is in the message of the crash, and is shown while
-    the run waits."""
+    """A subscription of a wrong type, to a topic without messages, or none, is in the message of
+    the crash, and is shown while the run waits."""
     monkeypatch.setattr(ros2_policy, "SETTLED_S", 0.6)
     shown: list[str] = []
     with driven(at, start_s=1.6) as driver, Peer(at, reads=False) as peer:
