@@ -77,6 +77,11 @@ def test_legs_gain_a_cheat_nothing(robot: str, request: pytest.FixtureRequest) -
     if robot == "walker":
         request.getfixturevalue("walker_weights")
     options = EpisodeOptions(seed=0, robot=robot)
-    for policy, kinds in (("straight", ("obstructing", "gesturing")), ("stop", ("frontal",))):
-        table = cosim.run("reactive", policy, scenarios=scenarios_of(kinds, 1), options=options)
+    for policy, kinds, time_s in (
+        ("straight", ("obstructing", "gesturing"), 45.0),
+        ("stop", ("frontal",), 10.0),
+    ):
+        ways = [event_way(kind, kind, at_m=11.0, time_s=time_s) for kind in kinds]
+        suite = Suite(name="legs", version="1", scenarios=tuple(ways))
+        table = cosim.run(suite, policy, options=options)
         assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0

@@ -235,17 +235,15 @@ def test_cheats_are_driven_on_a_redraw(
     assert all(one.route != shipped[one.id].route for one in suite.scenarios)
     for claim in ("decoys", "exclusive", "limits", "proofs", "obstacles"):
         assert list(CLAIMS[claim](Read(suite, read_proofs(out), out))) == []
-    cheats = {name: CHEATS[name] for name in ("swerve-left", "stop-every-2-m")}
-    monkeypatch.setattr(measure, "CHEATS", cheats)
+    monkeypatch.setattr(measure, "CHEATS", {"swerve-left": CHEATS["swerve-left"]})
     said = cosim("bench", "exploit", "--cheats", "--suite", str(out), "--out", str(tmp_path / "e"))
     assert said.returncode == 0 and "swerve-left" in said.stdout, said.stderr
-    assert len((tmp_path / "e" / "evaluations.jsonl").read_text().splitlines()) == 4
+    assert len((tmp_path / "e" / "evaluations.jsonl").read_text().splitlines()) == 2
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize(
-    ("number", "cheat"),
-    [("7007", "swerve-fast-left"), ("7010", "swerve-wide-left"), ("7012", "swerve-right")],
+    ("number", "cheat"), [("7007", "swerve-fast-left"), ("7012", "swerve-right")]
 )
 def test_a_swerve_away_from_who_cuts_in_solves_the_decoy_alone(number: str, cheat: str) -> None:
     """It reaches both goals without a failure, but did not give way in the event."""
