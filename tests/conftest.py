@@ -46,18 +46,21 @@ settings.load_profile("tests")
 LONGEST = (
     "scenarios/test_hostile.py",
     "cli/test_cli.py",
+    "scenarios/test_reactive_suite.py",
+    "scenarios/test_scan_import.py",
     "scenarios/test_chaos.py",
     "report/test_page_in_chromium.py",
-    "policies/test_orca_policy.py",
     "sumo_nets/test_importer.py",
+    "scenarios/test_exploit.py",
     "scenarios/test_collect.py",
+    "policies/test_orca_policy.py",
     "scenarios/test_setup.py",
     "scenarios/test_remote.py",
     "sumo_nets/test_crossings.py",
+    "cli/test_run_command.py",
     "scenarios/test_cheats.py",
     "sumo_nets/test_crowd.py",
     "scenarios/test_verify.py",
-    "scenarios/test_exploit.py",
 )
 """Files of engine tests that take longest. They are the first of these, so that no worker of
 pytest-xdist is left alone with one of them in the end."""
