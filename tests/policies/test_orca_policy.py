@@ -259,7 +259,9 @@ def test_the_oracle_solves_every_event(kind: str, seed: int) -> None:
 
     _, street_map = place(CITY)
     whole = build_reactive(EVENT_KINDS[kind], CITY, street_map, WalkGraph(street_map), seed, kind)
-    scenario = msgspec.structs.replace(whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4))
+    scenario = msgspec.structs.replace(
+        whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4)
+    )
     record = run_episode(scenario, Orca()).record
     assert (record.status, record.failures) == ("done", ())
     assert record.measures["success"] == 1.0
