@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
@@ -22,6 +23,7 @@ from physics.people.families import FAMILIES, skeleton
 from physics.people.figure import MESH_LEVELS
 from physics.people.gaits import CYCLE_FRAMES
 from physics.people.gestures import SEAT_M, SEATED_BACK_M
+from physics.people.parts import _quaternions
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, forward, rodrigues
 from physics.people.wardrobe import ALL, CLOTHES, SEASONS, season_of
@@ -164,6 +166,21 @@ def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
         )
         assert -PERSON_RADIUS_M < at["left_ankle"][0] < PERSON_RADIUS_M
         assert at["left_ankle"][2] == pytest.approx(rest[INDEX["left_ankle"], 2], abs=0.02)
+
+
+def test_parts_turn_by_the_quaternions_of_scipy() -> None:
+    """Random rotations, half turns and no turn give the same bits; nobody gives no rows."""
+    exact = [np.eye(3), *(np.diag(signs) for signs in np.eye(3) * 2.0 - 1.0)]
+    drawn = Rotation.random(2000, random_state=np.random.default_rng(0)).as_matrix()
+    turns = np.concatenate([exact, drawn])
+    x = turns[..., 0] / np.linalg.norm(turns[..., 0], axis=-1, keepdims=True)
+    z = np.cross(x, turns[..., 1])
+    z /= np.linalg.norm(z, axis=-1, keepdims=True)
+    rigid = np.stack([x, np.cross(z, x), z], axis=-1)
+    wanted = Rotation.from_matrix(rigid, assume_valid=True).as_quat()
+    assert {*np.abs(wanted).argmax(axis=1).tolist()} == {0, 1, 2, 3}
+    assert np.array_equal(_quaternions(turns), wanted)
+    assert _quaternions(np.zeros((0, 13, 3, 3))).shape == (0, 13, 4)
 
 
 def test_looks_hang_on_name_and_age_alone() -> None:

@@ -81,6 +81,14 @@ def test_legs_gain_a_cheat_nothing(robot: str, request: pytest.FixtureRequest) -
     if robot == "walker":
         request.getfixturevalue("walker_weights")
     options = EpisodeOptions(seed=0, robot=robot)
-    for policy, kinds in (("straight", ("obstructing", "gesturing")), ("stop", ("frontal",))):
-        table = cosim.run("reactive", policy, scenarios=scenarios_of(kinds, 1), options=options)
+    for policy, places_m, time_s in (
+        ("straight", {"obstructing": 11.0, "gesturing": 11.0}, 45.0),
+        ("stop", {"frontal": 21.0}, 10.0),
+    ):
+        ways = [
+            event_way(kind, kind, at_m=at_m, length_m=at_m + 9.0, time_s=time_s)
+            for kind, at_m in places_m.items()
+        ]
+        suite = Suite(name="legs", version="1", scenarios=tuple(ways))
+        table = cosim.run(suite, policy, options=options)
         assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0
