@@ -46,6 +46,11 @@ libsumo.simulationStep = libsumo.simulation.step
 _native: Final = libsumo._libsumo
 """libsumo without its Python wrappers, for functions that are called hundreds of times a tick."""
 
+for _name in ("moveToXY", "getRoadID", "getNextEdge", "getLanePosition", "getAngle", "setSpeed"):
+    setattr(libsumo.person, _name, getattr(_native, f"person_{_name}"))
+for _name in ("getLaneID", "getLanePosition", "setSpeed"):
+    setattr(libsumo.vehicle, _name, getattr(_native, f"vehicle_{_name}"))
+
 _ERRORS: Final = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 

@@ -21,6 +21,55 @@ if TYPE_CHECKING:
     from sumo_nets.engine import Sumo
 
 
+class _Segment(NamedTuple):
+    """A straight line: its start, its direction, and its length in metres."""
+
+    x_m: float
+    y_m: float
+    along_x: float
+    along_y: float
+    length_m: float
+
+    def distance_m(self, x_m: float, y_m: float) -> float:
+        """Return the distance of a point, metres."""
+        dx, dy = x_m - self.x_m, y_m - self.y_m
+        along_m = dx * self.along_x + dy * self.along_y
+        if along_m > self.length_m:
+            return math.hypot(along_m - self.length_m, dy * self.along_x - dx * self.along_y)
+        return math.hypot(min(along_m, 0.0), dy * self.along_x - dx * self.along_y)
+
+
+class Lead(NamedTuple):
+    """Comparison of a sidewalk with other lanes at a point.
+
+    metres: by how much the sidewalk is nearer.
+    others_m: distance of the other lanes.
+    line, width_m: the sidewalk's middle line, None for a bent one, and its width.
+    """
+
+    x_m: float
+    y_m: float
+    metres: float
+    others_m: float
+    line: _Segment | None
+    width_m: float
+
+    def exceeds(self, least_m: float, x_m: float, y_m: float) -> bool | None:
+        """Return whether the lead at another point exceeds `least_m`; None where that is
+        unknown."""
+        moved_m = math.hypot(x_m - self.x_m, y_m - self.y_m) + _ROUNDING_M
+        if self.line is None:
+            low_m, high_m = self.metres - 2.0 * moved_m, self.metres + 2.0 * moved_m
+        else:
+            own_m = self.line.distance_m(x_m, y_m)
+            inside_m = self.width_m - 2.0 * own_m
+            low_m = min(self.others_m - moved_m - own_m, inside_m - _ROUNDING_M)
+            high_m = min(self.others_m + moved_m - own_m, inside_m + _ROUNDING_M)
+        if low_m > least_m:
+            return True
+        return None if high_m > least_m else False
+
+
 class SidewalkLead:
     """Distances by which a sidewalk is nearer than other lanes. internal: edges inside each
     junction."""
@@ -28,29 +77,40 @@ class SidewalkLead:
     def __init__(self, engine: Sumo, internal: Mapping[str, Iterable[str]]) -> None:
         self._engine = engine
         self._internal = internal
-        self._lines: dict[tuple[str, str], tuple[shapely.Geometry, shapely.Geometry]] = {}
+        self._lines: dict[
+            tuple[str, str], tuple[shapely.Geometry, shapely.Geometry, _Segment | None, float]
+        ] = {}
 
-    def metres(self, first: str, second: str, x_m: float, y_m: float) -> float:
+    def at(self, first: str, second: str, x_m: float, y_m: float) -> Lead:
         """Return by how much `first` is nearer to a point on it than any other lane that SUMO
-        compares, metres.
+        compares.
 
         The walk is `first`, then `second`. The result is at most twice the distance to the
         sidewalk's sides, and negative where another lane is nearer. It changes by at most 2 m per
         metre.
         """
         if (first, second) not in self._lines:
-            inside = self._internal.get(self._engine.edge.getToJunction(first), ())
-            own, *others = [line for edge in (first, second, *inside) for line in self._of(edge)]
-            self._lines[first, second] = own, shapely.multilinestrings(others)
-        at = shapely.Point(x_m, y_m)
-        sidewalk, rest = self._lines[first, second]
-        own_m = shapely.distance(sidewalk, at)
-        return float(
-            min(
-                shapely.distance(rest, at) - own_m,
-                self._engine.lane.getWidth(f"{first}_0") - 2.0 * own_m,
-            )
-        )
+            self._lines[first, second] = self._compared(first, second)
+        sidewalk, rest, line, width_m = self._lines[first, second]
+        at = shapely.points(x_m, y_m)
+        own_m = float(shapely.distance(sidewalk, at))
+        others_m = float(shapely.distance(rest, at))
+        metres = min(others_m - own_m, width_m - 2.0 * own_m)
+        return Lead(x_m, y_m, metres, others_m, line, width_m)
+
+    def _compared(
+        self, first: str, second: str
+    ) -> tuple[shapely.Geometry, shapely.Geometry, _Segment | None, float]:
+        """Return the sidewalk's line, the lines of other lanes, and the former's `Lead` columns."""
+        inside = self._internal.get(self._engine.edge.getToJunction(first), ())
+        own, *others = [line for edge in (first, second, *inside) for line in self._of(edge)]
+        segment = None
+        if len(own.coords) == 2:
+            (x0, y0), (x1, y1) = own.coords
+            length_m = math.hypot(x1 - x0, y1 - y0)
+            segment = _Segment(x0, y0, (x1 - x0) / length_m, (y1 - y0) / length_m, length_m)
+        width_m = self._engine.lane.getWidth(f"{first}_0")
+        return own, shapely.multilinestrings(others), segment, width_m
 
     def _of(self, edge: str) -> list[LineString]:
         """Return the lines of an edge's lanes, the sidewalk first."""
@@ -164,10 +224,10 @@ class Walks:
         if lines is None:
             return x_m, y_m
         own, others = lines
-        to_own = shapely.get_coordinates(shapely.shortest_line(shapely.Point(x_m, y_m), own))
+        to_own = shapely.get_coordinates(shapely.shortest_line(shapely.points(x_m, y_m), own))
         for share in NUDGES:
             x, y = (to_own[0] + share * (to_own[1] - to_own[0])).tolist()
-            if shapely.distance(own, at := shapely.Point(x, y)) + LEAD_MIN_M < shapely.distance(
+            if shapely.distance(own, at := shapely.points(x, y)) + LEAD_MIN_M < shapely.distance(
                 others, at
             ):
                 return x, y
@@ -267,8 +327,8 @@ class Proxy:
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
         self._outline: shapely.Geometry | None = None
-        self._inside = self._compared = Circle()
-        self._leads = False
+        self._inside = Circle()
+        self._lead: Lead | None = None
 
     def update(self, pose: Pose, *, let_past: bool = False) -> None:
         """Move the proxy to a pose. Required before every simulation step; otherwise SUMO lets
@@ -320,11 +380,12 @@ class Proxy:
         """Return whether SUMO will assign the proxy to the first sidewalk of its walk."""
         if place.edge != walk.first or self._inside.radius_m == 0.0:
             return False
-        if walk != self._walk or not self._compared.holds(x_m, y_m):
-            lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - LEAD_MIN_M
-            self._leads = lead_m > 0.0
-            self._compared = Circle(x_m, y_m, abs(lead_m) / 2.0)
-        return self._leads
+        if self._lead is not None and walk is self._walk:
+            leads = self._lead.exceeds(LEAD_MIN_M, x_m, y_m)
+            if leads is not None:
+                return leads
+        self._lead = self._walks.lead.at(walk.first, walk.second, x_m, y_m)
+        return self._lead.metres > LEAD_MIN_M
 
     def _locate(self, x_m: float, y_m: float) -> Located:
         """Locate a position on the map; cached while the body is on the same walkable piece."""
@@ -344,7 +405,7 @@ class Proxy:
         room_m = 0.0
         if inside:
             room_m = max(
-                float(shapely.distance(self._outline, shapely.Point(x_m, y_m))) - _ROUNDING_M, 0.0
+                float(shapely.distance(self._outline, shapely.points(x_m, y_m))) - _ROUNDING_M, 0.0
             )
         self._inside = Circle(x_m, y_m, room_m)
         return self._place
