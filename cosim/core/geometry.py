@@ -54,9 +54,20 @@ def wrap_angles(angles_rad: ArrayLike) -> Floats:
     return np.pi - (np.pi - np.asarray(angles_rad, dtype=float)) % (2.0 * np.pi)
 
 
+def hypot(x: float, y: float) -> float:
+    """Return the length of a vector with the bits of `np.hypot`; `math.hypot` rounds
+    differently."""
+    return abs(complex(x, y))
+
+
+def heading_from_sumo(angle_deg: float) -> float:
+    """Convert one angle with the bits of `headings_from_sumo`."""
+    return math.pi - (math.pi - math.radians(90.0 - angle_deg)) % (2.0 * math.pi)
+
+
 def headings_from_sumo(angles_deg: ArrayLike) -> Floats:
     """Convert SUMO's navigational degrees (0 north, clockwise) to headings in radians."""
-    return wrap_angles(np.radians(90.0 - np.asarray(angles_deg, dtype=float)))
+    return wrap_angles(np.radians(np.subtract(90.0, angles_deg)))
 
 
 def heading_to_sumo(heading_rad: float) -> float:

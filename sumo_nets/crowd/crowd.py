@@ -223,7 +223,7 @@ class SumoCrowd(Crowd):
         self._actors: dict[str, Proxy] = {}
         self._poses = PoseFilter(TICK_MS / 1000, self._standing)
         self._shown = ShownPeople(TICK_MS / 1000)
-        self._sized = NO_VEHICLES.ids, NO_VEHICLES.size
+        self._sized = NO_VEHICLES.ids, NO_VEHICLES.size, NO_VEHICLES.speed
         if self._spec.vehicles:
             self._drivers.fill(x_m, y_m)
             for _ in range(round(_WARM_UP_S * 1000 / TICK_MS)):
@@ -268,9 +268,9 @@ class SumoCrowd(Crowd):
     def _read(
         self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None
     ) -> Street:
-        persons = self._reader.persons_near(x_m, y_m, self._spec.radius_m + LEAVE_MARGIN_M)
-        vehicles = self._reader.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
-        self._found = persons, vehicles
+        reach_m = self._spec.radius_m + LEAVE_MARGIN_M
+        self._found = self._reader.near(x_m, y_m, reach_m, VEHICLE_REACH_M)
+        persons, vehicles = self._found
         people = self._people(persons, cast, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
@@ -291,11 +291,13 @@ class SumoCrowd(Crowd):
         boxes."""
         if near.names != self._sized[0]:
             sizes = [self._drivers.size_m(name) for name in near.names]
-            self._sized = near.names, write_protected_copy(sizes, shape=(len(sizes), 2))
-        size = self._sized[1]
+            size = write_protected_copy(sizes, shape=(len(sizes), 2))
+            self._sized = near.names, size, 0.5 * size[:, 0]
+        _, size, half_m = self._sized
         heading = headings_from_sumo(near.angle_deg)
-        ahead = np.column_stack([np.cos(heading), np.sin(heading)])
-        xy = near.xy - 0.5 * size[:, :1] * ahead
+        xy = near.xy.copy()
+        xy[:, 0] -= half_m * np.cos(heading)
+        xy[:, 1] -= half_m * np.sin(heading)
         return Vehicles(
             near.names, write_protect(xy), write_protect(heading), write_protect(near.mps), size
         )

@@ -71,11 +71,8 @@ def reference_hashes() -> dict[str, str]:
         try:
             for _ in range(2 * _SECONDS):
                 sumo.simulationStep()
-                traffic = (
-                    reader.vehicles_near(0.0, 0.0, 1e3),
-                    reader.persons_near(0.0, 0.0, 1e3),
-                )
-                for one in traffic:
+                persons, vehicles = reader.near(0.0, 0.0, 1e3, 1e3)
+                for one in (vehicles, persons):
                     seen.update(
                         "".join(one.names).encode() + np.column_stack([one.xy, one.mps]).tobytes()
                     )

@@ -50,7 +50,7 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
     ours = set(sumo.person.getIDList()[::2])
     reader = NearReader(ours)
     for reach_m in (60.0, 75.0, 500.0):
-        near = reader.persons_near(x_m, y_m, reach_m)
+        near, _ = reader.near(x_m, y_m, reach_m, 100.0)
         away_m = {name: math.dist(sumo.person.getPosition(name), (x_m, y_m)) for name in ours}
         assert list(near.names) == sorted(
             name for name, far_m in away_m.items() if far_m <= reach_m
@@ -60,12 +60,12 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
                 k
             ] == sumo.person.getSpeed(name)
             assert near.ahead[k] == sumo.person.getNextEdge(name)
-    assert 0 < len(reader.persons_near(x_m, y_m, 60.0).names) < len(near.names) == len(ours)
-    cars = reader.vehicles_near(x_m, y_m, 100.0)
+    assert 0 < len(reader.near(x_m, y_m, 60.0, 100.0)[0].names) < len(near.names) == len(ours)
+    _, cars = reader.near(x_m, y_m, 60.0, 100.0)
     assert (
         0
         < len(cars.names)
-        <= len(reader.vehicles_near(x_m, y_m, 1000.0).names)
+        <= len(reader.near(x_m, y_m, 60.0, 1000.0)[1].names)
         == len(sumo.vehicle.getIDList())
     )
     assert np.hypot(*(cars.xy - (x_m, y_m)).T).max() <= 100.0
