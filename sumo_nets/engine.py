@@ -51,7 +51,6 @@ for _name in ("getLaneID", "getLanePosition", "setSpeed"):
     setattr(libsumo.vehicle, _name, getattr(_native, f"vehicle_{_name}"))
 
 
-
 class _Entries:
     """Adds persons to SUMO, and counts them."""
 
@@ -245,14 +244,24 @@ class NearVehicles(NamedTuple):
     away_m: Floats
 
 
-def persons_waiting_s(names: Sequence[str]) -> list[float]:
+_HALTING_MPS: Final = 0.2
+"""Speed from which nothing is standing for SUMO, with a margin, m/s."""
+
+
+def persons_waiting_s(near: NearPersons) -> list[float]:
     """Return for how long each of these persons has been standing, seconds."""
-    return [*map(_native.person_getWaitingTime, names)]
+    return _waiting_s(_native.person_getWaitingTime, near)
 
 
-def vehicles_waiting_s(names: Sequence[str]) -> list[float]:
+def vehicles_waiting_s(near: NearVehicles) -> list[float]:
     """Return for how long each of these vehicles has been standing, seconds."""
-    return [*map(_native.vehicle_getWaitingTime, names)]
+    return _waiting_s(_native.vehicle_getWaitingTime, near)
+
+
+def _waiting_s(query: Callable[[str], float], near: NearPersons | NearVehicles) -> list[float]:
+    """Return waiting times, which are 0 for all that move."""
+    paces = zip(near.names, near.mps.tolist(), strict=True)
+    return [query(name) if mps < _HALTING_MPS else 0.0 for name, mps in paces]
 
 
 class NearReader:
@@ -287,7 +296,9 @@ class NearReader:
             map(_native.person_getPosition, persons), map(_native.vehicle_getPosition, vehicles)
         )
         xy = np.fromiter(chain.from_iterable(places), dtype=float, count=2 * n).reshape(n, 2)
-        speeds = chain(map(_native.person_getSpeed, persons), map(_native.vehicle_getSpeed, vehicles))
+        speeds = chain(
+            map(_native.person_getSpeed, persons), map(_native.vehicle_getSpeed, vehicles)
+        )
         mps = np.fromiter(speeds, dtype=float, count=n)
         dx, dy = xy[:, 0] - x_m, xy[:, 1] - y_m
         away_m = np.sqrt(dx * dx + dy * dy)

@@ -173,9 +173,9 @@ class SumoCrowd(Crowd):
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
                 self._gaps.keep(persons)
-                seen = _seen(persons, engine.persons_waiting_s(persons.names))
+                seen = _seen(persons, engine.persons_waiting_s(persons))
                 self._pedestrians.roll(x_m, y_m, seen, self._waits_at_red)
-                seen = _seen(vehicles, engine.vehicles_waiting_s(vehicles.names))
+                seen = _seen(vehicles, engine.vehicles_waiting_s(vehicles))
                 self._drivers.roll(x_m, y_m, seen)
             stands = outline_mps(robot.v_mps, robot.w_radps, self._half_m) < ROBOT_STANDS_MPS
             self._stood_ticks = self._stood_ticks + 1 if stands else 0
