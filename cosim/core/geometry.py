@@ -51,7 +51,10 @@ def wrap_angle(angle_rad: float) -> float:
 
 def wrap_angles(angles_rad: ArrayLike) -> Floats:
     """Return every angle of an array wrapped into (-pi, pi]."""
-    return np.pi - (np.pi - np.asarray(angles_rad, dtype=float)) % (2.0 * np.pi)
+    wrapped = np.subtract(np.pi, angles_rad, dtype=float)
+    wrapped = np.remainder(wrapped, 2.0 * np.pi)
+    wrapped_rad: Floats = np.subtract(np.pi, wrapped)
+    return wrapped_rad
 
 
 def hypot(x: float, y: float) -> float:
@@ -67,7 +70,7 @@ def heading_from_sumo(angle_deg: float) -> float:
 
 def headings_from_sumo(angles_deg: ArrayLike) -> Floats:
     """Convert SUMO's navigational degrees (0 north, clockwise) to headings in radians."""
-    return wrap_angles(np.radians(np.subtract(90.0, angles_deg)))
+    return wrap_angles(np.radians(np.subtract(90.0, angles_deg, dtype=float)))
 
 
 def heading_to_sumo(heading_rad: float) -> float:
