@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import shapely
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class _Segment(NamedTuple):
-    """A straight line: its start, its direction, and its length in metres."""
+    """A straight piece of a line: its start, its direction, and its length in metres."""
 
     x_m: float
     y_m: float
@@ -30,13 +31,19 @@ class _Segment(NamedTuple):
     along_y: float
     length_m: float
 
-    def distance_m(self, x_m: float, y_m: float) -> float:
-        """Return the distance of a point, metres."""
-        dx, dy = x_m - self.x_m, y_m - self.y_m
-        along_m = dx * self.along_x + dy * self.along_y
-        if along_m > self.length_m:
-            return math.hypot(along_m - self.length_m, dy * self.along_x - dx * self.along_y)
-        return math.hypot(min(along_m, 0.0), dy * self.along_x - dx * self.along_y)
+
+def _distance_m(line: tuple[_Segment, ...], x_m: float, y_m: float) -> float:
+    """Return the distance of a point from a line, metres."""
+    least_m2 = math.inf
+    for start_x, start_y, along_x, along_y, length_m in line:
+        dx, dy = x_m - start_x, y_m - start_y
+        along_m = dx * along_x + dy * along_y
+        beyond_m = along_m if along_m < 0.0 else along_m - length_m if along_m > length_m else 0.0
+        aside_m = dy * along_x - dx * along_y
+        far_m2 = beyond_m * beyond_m + aside_m * aside_m
+        if far_m2 < least_m2:
+            least_m2 = far_m2
+    return math.sqrt(least_m2)
 
 
 class Lead(NamedTuple):
@@ -44,30 +51,27 @@ class Lead(NamedTuple):
 
     metres: by how much the sidewalk is nearer.
     others_m: distance of the other lanes.
-    line, width_m: the sidewalk's middle line, None for a bent one, and its width.
+    line, width_m: the sidewalk's middle line, and its width.
     """
 
     x_m: float
     y_m: float
     metres: float
     others_m: float
-    line: _Segment | None
+    line: tuple[_Segment, ...]
     width_m: float
 
     def exceeds(self, least_m: float, x_m: float, y_m: float) -> bool | None:
         """Return whether the lead at another point exceeds `least_m`; None where that is
         unknown."""
         moved_m = math.hypot(x_m - self.x_m, y_m - self.y_m) + _ROUNDING_M
-        if self.line is None:
-            low_m, high_m = self.metres - 2.0 * moved_m, self.metres + 2.0 * moved_m
-        else:
-            own_m = self.line.distance_m(x_m, y_m)
-            inside_m = self.width_m - 2.0 * own_m
-            low_m = min(self.others_m - moved_m - own_m, inside_m - _ROUNDING_M)
-            high_m = min(self.others_m + moved_m - own_m, inside_m + _ROUNDING_M)
-        if low_m > least_m:
+        own_m = _distance_m(self.line, x_m, y_m)
+        inside_m = self.width_m - 2.0 * own_m
+        if min(self.others_m - moved_m - own_m, inside_m - _ROUNDING_M) > least_m:
             return True
-        return None if high_m > least_m else False
+        if min(self.others_m + moved_m - own_m, inside_m + _ROUNDING_M) <= least_m:
+            return False
+        return None
 
 
 class SidewalkLead:
@@ -78,7 +82,7 @@ class SidewalkLead:
         self._engine = engine
         self._internal = internal
         self._lines: dict[
-            tuple[str, str], tuple[shapely.Geometry, shapely.Geometry, _Segment | None, float]
+            tuple[str, str], tuple[shapely.Geometry, shapely.Geometry, tuple[_Segment, ...], float]
         ] = {}
 
     def at(self, first: str, second: str, x_m: float, y_m: float) -> Lead:
@@ -100,17 +104,17 @@ class SidewalkLead:
 
     def _compared(
         self, first: str, second: str
-    ) -> tuple[shapely.Geometry, shapely.Geometry, _Segment | None, float]:
+    ) -> tuple[shapely.Geometry, shapely.Geometry, tuple[_Segment, ...], float]:
         """Return the sidewalk's line, the lines of other lanes, and the former's `Lead` columns."""
         inside = self._internal.get(self._engine.edge.getToJunction(first), ())
         own, *others = [line for edge in (first, second, *inside) for line in self._of(edge)]
-        segment = None
-        if len(own.coords) == 2:
-            (x0, y0), (x1, y1) = own.coords
-            length_m = math.hypot(x1 - x0, y1 - y0)
-            segment = _Segment(x0, y0, (x1 - x0) / length_m, (y1 - y0) / length_m, length_m)
+        line = []
+        for (x0, y0), (x1, y1) in pairwise(own.coords):
+            if length_m := math.hypot(x1 - x0, y1 - y0):
+                along = (x1 - x0) / length_m, (y1 - y0) / length_m
+                line.append(_Segment(x0, y0, *along, length_m))
         width_m = self._engine.lane.getWidth(f"{first}_0")
-        return own, shapely.multilinestrings(others), segment, width_m
+        return own, shapely.multilinestrings(others), tuple(line), width_m
 
     def _of(self, edge: str) -> list[LineString]:
         """Return the lines of an edge's lanes, the sidewalk first."""
