@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain, compress
+from types import TracebackType
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -204,13 +205,23 @@ def close() -> None:
     libsumo.simulation.close()
 
 
-@contextmanager
-def sumo_errors(doing: str) -> Iterator[None]:
-    """Raise SUMO's exceptions as EngineError. doing: the action, for the message."""
-    try:
-        yield
-    except _ERRORS as error:
-        raise EngineError(f"SUMO failed while {doing}: {error}") from error
+class sumo_errors:
+    """Context that raises SUMO's exceptions as EngineError. doing: the action, for the message."""
+
+    def __init__(self, doing: str) -> None:
+        self._doing = doing
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        if isinstance(error, _ERRORS):
+            raise EngineError(f"SUMO failed while {self._doing}: {error}") from error
 
 
 class NearPersons(NamedTuple):
