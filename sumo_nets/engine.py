@@ -278,7 +278,8 @@ def _waiting_s(query: Callable[[str], float], near: NearPersons | NearVehicles) 
 class NearReader:
     """Reads persons and vehicles near a point, once after every step.
 
-    Names are sorted again only where SUMO's list of them has changed.
+    Names are sorted again only where SUMO's list of them may have changed. Persons must enter by
+    `person.add` alone.
 
     crowd: names of the persons to read; those of persons that are in SUMO already never change.
     """

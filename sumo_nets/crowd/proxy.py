@@ -9,33 +9,27 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
 import shapely
 from shapely.geometry import LineString
 
-from cosim.core.geometry import Circle, Pose, heading_to_sumo
+from cosim.core.geometry import Circle, Floats, Pose, heading_to_sumo
 from cosim.place.street_map import Located, StreetMap
 
 if TYPE_CHECKING:
     from sumo_nets.engine import Sumo
 
 
-class _Segment(NamedTuple):
-    """A straight piece of a line: its start, its direction, and its length in metres."""
-
-    x_m: float
-    y_m: float
-    along_x: float
-    along_y: float
-    length_m: float
+_Segments = tuple[tuple[float, float, float, float, float], ...]
+"""Straight pieces of lines: start x, y; direction x, y; length, in metres."""
 
 
-def _distance_m(line: tuple[_Segment, ...], x_m: float, y_m: float) -> float:
-    """Return the distance of a point from a line, metres."""
+def _distance_m(pieces: _Segments, x_m: float, y_m: float) -> float:
+    """Return the distance of a point from the nearest of these pieces, metres."""
     least_m2 = math.inf
-    for start_x, start_y, along_x, along_y, length_m in line:
+    for start_x, start_y, along_x, along_y, length_m in pieces:
         dx, dy = x_m - start_x, y_m - start_y
         along_m = dx * along_x + dy * along_y
         beyond_m = along_m if along_m < 0.0 else along_m - length_m if along_m > length_m else 0.0
@@ -46,32 +40,22 @@ def _distance_m(line: tuple[_Segment, ...], x_m: float, y_m: float) -> float:
     return math.sqrt(least_m2)
 
 
-class Lead(NamedTuple):
-    """Comparison of a sidewalk with other lanes at a point.
+class LocalLead(NamedTuple):
+    """What `SidewalkLead.metres` compares within LOCAL_M of a point.
 
-    metres: by how much the sidewalk is nearer.
-    others_m: distance of the other lanes.
-    line, width_m: the sidewalk's middle line, and its width.
+    own, others: pieces of the sidewalk's and of the other lanes' lines that are near.
+    width_m: width of the sidewalk.
     """
 
-    x_m: float
-    y_m: float
-    metres: float
-    others_m: float
-    line: tuple[_Segment, ...]
+    around: Circle
+    own: _Segments
+    others: _Segments
     width_m: float
 
-    def exceeds(self, least_m: float, x_m: float, y_m: float) -> bool | None:
-        """Return whether the lead at another point exceeds `least_m`; None where that is
-        unknown."""
-        moved_m = math.hypot(x_m - self.x_m, y_m - self.y_m) + _ROUNDING_M
-        own_m = _distance_m(self.line, x_m, y_m)
-        inside_m = self.width_m - 2.0 * own_m
-        if min(self.others_m - moved_m - own_m, inside_m - _ROUNDING_M) > least_m:
-            return True
-        if min(self.others_m + moved_m - own_m, inside_m + _ROUNDING_M) <= least_m:
-            return False
-        return None
+    def metres(self, x_m: float, y_m: float) -> float:
+        """Return the lead at a point, accurate to rounding."""
+        own_m = _distance_m(self.own, x_m, y_m)
+        return min(_distance_m(self.others, x_m, y_m) - own_m, self.width_m - 2.0 * own_m)
 
 
 class SidewalkLead:
@@ -81,40 +65,45 @@ class SidewalkLead:
     def __init__(self, engine: Sumo, internal: Mapping[str, Iterable[str]]) -> None:
         self._engine = engine
         self._internal = internal
-        self._lines: dict[
-            tuple[str, str], tuple[shapely.Geometry, shapely.Geometry, tuple[_Segment, ...], float]
-        ] = {}
+        self._lines: dict[tuple[str, str], tuple[shapely.Geometry, shapely.Geometry]] = {}
+        self._pieces: dict[tuple[str, str], tuple[Floats, Floats]] = {}
 
-    def at(self, first: str, second: str, x_m: float, y_m: float) -> Lead:
+    def metres(self, first: str, second: str, x_m: float, y_m: float) -> float:
         """Return by how much `first` is nearer to a point on it than any other lane that SUMO
-        compares.
+        compares, metres.
 
         The walk is `first`, then `second`. The result is at most twice the distance to the
         sidewalk's sides, and negative where another lane is nearer. It changes by at most 2 m per
         metre.
         """
-        if (first, second) not in self._lines:
-            self._lines[first, second] = self._compared(first, second)
-        sidewalk, rest, line, width_m = self._lines[first, second]
         at = shapely.points(x_m, y_m)
+        sidewalk, rest = self._compared(first, second)
         own_m = float(shapely.distance(sidewalk, at))
-        others_m = float(shapely.distance(rest, at))
-        metres = min(others_m - own_m, width_m - 2.0 * own_m)
-        return Lead(x_m, y_m, metres, others_m, line, width_m)
+        return min(float(shapely.distance(rest, at)) - own_m, self._width_m(first) - 2.0 * own_m)
 
-    def _compared(
-        self, first: str, second: str
-    ) -> tuple[shapely.Geometry, shapely.Geometry, tuple[_Segment, ...], float]:
-        """Return the sidewalk's line, the lines of other lanes, and the former's `Lead` columns."""
-        inside = self._internal.get(self._engine.edge.getToJunction(first), ())
-        own, *others = [line for edge in (first, second, *inside) for line in self._of(edge)]
-        line = []
-        for (x0, y0), (x1, y1) in pairwise(own.coords):
-            if length_m := math.hypot(x1 - x0, y1 - y0):
-                along = (x1 - x0) / length_m, (y1 - y0) / length_m
-                line.append(_Segment(x0, y0, *along, length_m))
-        width_m = self._engine.lane.getWidth(f"{first}_0")
-        return own, shapely.multilinestrings(others), tuple(line), width_m
+    def around(self, first: str, second: str, x_m: float, y_m: float) -> LocalLead:
+        """Return what is compared within LOCAL_M of a point."""
+        if (first, second) not in self._pieces:
+            own, rest = self._compared(first, second)
+            self._pieces[first, second] = _pieces(own), _pieces(rest)
+        own_pieces, others = self._pieces[first, second]
+        return LocalLead(
+            Circle(x_m, y_m, LOCAL_M),
+            _pieces_near(own_pieces, x_m, y_m),
+            _pieces_near(others, x_m, y_m),
+            self._width_m(first),
+        )
+
+    def _compared(self, first: str, second: str) -> tuple[shapely.Geometry, shapely.Geometry]:
+        """Return the line of the sidewalk, and those of the other lanes."""
+        if (first, second) not in self._lines:
+            inside = self._internal.get(self._engine.edge.getToJunction(first), ())
+            own, *others = [line for edge in (first, second, *inside) for line in self._of(edge)]
+            self._lines[first, second] = own, shapely.multilinestrings(others)
+        return self._lines[first, second]
+
+    def _width_m(self, sidewalk: str) -> float:
+        return self._engine.lane.getWidth(f"{sidewalk}_0")
 
     def _of(self, edge: str) -> list[LineString]:
         """Return the lines of an edge's lanes, the sidewalk first."""
@@ -122,6 +111,30 @@ class SidewalkLead:
         return [
             LineString([point[:2] for point in self._engine.lane.getShape(lane)]) for lane in lanes
         ]
+
+
+LOCAL_M: Final = 5.0
+"""Distance from a point within which the lines near it are compared without a search, metres."""
+
+
+def _pieces(lines: shapely.Geometry) -> Floats:
+    """Return the straight pieces of lines, (N, 5); see `_Segments`."""
+    parts = [shapely.get_coordinates(line) for line in shapely.get_parts(lines)]
+    starts = np.concatenate([points[:-1] for points in parts])
+    steps = np.concatenate([np.diff(points, axis=0) for points in parts])
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    long = lengths > 0.0
+    return np.column_stack([starts, steps / np.maximum(lengths, 1e-9)[:, None], lengths])[long]
+
+
+def _pieces_near(pieces: Floats, x_m: float, y_m: float) -> _Segments:
+    """Return the pieces that can be the nearest ones within LOCAL_M of a point."""
+    dx, dy = x_m - pieces[:, 0], y_m - pieces[:, 1]
+    along = dx * pieces[:, 2] + dy * pieces[:, 3]
+    beyond = along - np.clip(along, 0.0, pieces[:, 4])
+    far_m = np.hypot(beyond, dy * pieces[:, 2] - dx * pieces[:, 3])
+    near = far_m <= far_m.min(initial=np.inf) + 2.0 * LOCAL_M + _ROUNDING_M
+    return tuple(map(tuple, pieces[near].tolist()))
 
 
 KEEP_ROUTE = 3
@@ -140,6 +153,8 @@ metres."""
 LEAD_MIN_M = 0.01
 """The lines of a proxy's own place must be nearer than others by this distance, metres."""
 
+_TIE_M: Final = 1e-6
+"""A lead this close to LEAD_MIN_M is computed by GEOS, metres."""
 _ROUNDING_M: Final = 0.001
 """Tolerance of distances, metres."""
 
@@ -331,8 +346,10 @@ class Proxy:
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
         self._outline: shapely.Geometry | None = None
-        self._inside = Circle()
-        self._lead: Lead | None = None
+        self._inside = self._compared = Circle()
+        self._compared_walk: Walk | None = None
+        self._lead: LocalLead | None = None
+        self._leads = False
 
     def update(self, pose: Pose, *, let_past: bool = False) -> None:
         """Move the proxy to a pose. Required before every simulation step; otherwise SUMO lets
@@ -384,12 +401,17 @@ class Proxy:
         """Return whether SUMO will assign the proxy to the first sidewalk of its walk."""
         if place.edge != walk.first or self._inside.radius_m == 0.0:
             return False
-        if self._lead is not None and walk is self._walk:
-            leads = self._lead.exceeds(LEAD_MIN_M, x_m, y_m)
-            if leads is not None:
-                return leads
-        self._lead = self._walks.lead.at(walk.first, walk.second, x_m, y_m)
-        return self._lead.metres > LEAD_MIN_M
+        if walk != self._compared_walk:
+            self._compared_walk, self._compared, self._lead = walk, Circle(), None
+        if not self._compared.holds(x_m, y_m):
+            if self._lead is None or not self._lead.around.holds(x_m, y_m):
+                self._lead = self._walks.lead.around(walk.first, walk.second, x_m, y_m)
+            lead_m = self._lead.metres(x_m, y_m) - LEAD_MIN_M
+            if abs(lead_m) < _TIE_M:
+                lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - LEAD_MIN_M
+            self._leads = lead_m > 0.0
+            self._compared = Circle(x_m, y_m, max(abs(lead_m) - _TIE_M, 0.0) / 2.0)
+        return self._leads
 
     def _locate(self, x_m: float, y_m: float) -> Located:
         """Locate a position on the map; cached while the body is on the same walkable piece."""

@@ -67,10 +67,10 @@ def reference_hashes() -> dict[str, str]:
             "--no-warnings",
         ]
         engine.start([*arguments, "--seed", "7", "--no-step-log"])
-        reader = engine.NearReader(_WALKERS)
         try:
             for _ in range(2 * _SECONDS):
                 sumo.simulationStep()
+                reader = engine.NearReader(_WALKERS)  # these persons enter on their own
                 persons, vehicles = reader.near(0.0, 0.0, 1e3, 1e3)
                 for one in (vehicles, persons):
                     seen.update(

@@ -91,9 +91,7 @@ def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
         if walk is None:
             continue
         inside = shapely.contains_xy(strip.polygon, x_m, y_m)
-        leads = (
-            bool(inside) and walks.lead.at(walk.first, walk.second, x_m, y_m).metres > LEAD_MIN_M
-        )
+        leads = bool(inside) and walks.lead.metres(walk.first, walk.second, x_m, y_m) > LEAD_MIN_M
         names = {mode: f"p{k}.{mode}" for mode in (KEEP_ROUTE, KEEP_ROUTE_ON_ROAD)}
         for name in names.values():
             sumo.person.add(name, walk.first, 1.0)
