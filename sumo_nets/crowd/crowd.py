@@ -221,6 +221,7 @@ class SumoCrowd(Crowd):
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
+        self._mirrored: list[str] = []
         self._poses = PoseFilter(TICK_MS / 1000, self._standing)
         self._shown = ShownPeople(TICK_MS / 1000)
         self._sized = NO_VEHICLES.ids, NO_VEHICLES.size, NO_VEHICLES.speed
@@ -255,14 +256,17 @@ class SumoCrowd(Crowd):
         return people, Drivers(*logged, rng_vehicles)
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
-        present = {actor.id for actor in actors}
-        for name in sorted(self._actors.keys() - present):
-            self._actors.pop(name).remove()
+        names = [actor.id for actor in actors]
+        if names != self._mirrored:
+            self._mirrored = names
+            for name in sorted(self._actors.keys() - set(names)):
+                self._actors.pop(name).remove()
+            for name in names:
+                if name not in self._actors:
+                    self._actors[name] = Proxy(
+                        sumo, self._walks, base=name, kind="event", serial=self._serial
+                    )
         for actor in actors:
-            if actor.id not in self._actors:
-                self._actors[actor.id] = Proxy(
-                    sumo, self._walks, base=actor.id, kind="event", serial=self._serial
-                )
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
     def _read(

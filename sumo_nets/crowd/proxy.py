@@ -346,6 +346,8 @@ class Proxy:
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
         self._outline: shapely.Geometry | None = None
+        self._border: Floats | None = None
+        self._near_border: tuple[Circle, _Segments] = Circle(), ()
         self._inside = self._compared = Circle()
         self._compared_walk: Walk | None = None
         self._lead: LocalLead | None = None
@@ -415,7 +417,7 @@ class Proxy:
 
     def _locate(self, x_m: float, y_m: float) -> Located:
         """Locate a position on the map; cached while the body is on the same walkable piece."""
-        if self._inside.holds(x_m, y_m):
+        if self._inside.holds(x_m, y_m) or self._is_still_inside(x_m, y_m):
             return self._place
         inside = self._piece is not None and shapely.contains_xy(self._piece, x_m, y_m)
         if not inside:
@@ -426,6 +428,7 @@ class Proxy:
                 piece = street_map.strips.get(place.edge) or street_map.corners[place.edge]
                 self._piece = piece.polygon
                 self._outline = shapely.boundary(piece.polygon)
+                self._border = None
                 shapely.prepare(self._piece)
                 inside = shapely.contains_xy(self._piece, x_m, y_m)
         room_m = 0.0
@@ -435,6 +438,27 @@ class Proxy:
             )
         self._inside = Circle(x_m, y_m, room_m)
         return self._place
+
+    def _is_still_inside(self, x_m: float, y_m: float) -> bool:
+        """Return whether a position is surely on the present piece, and update the disk inside.
+
+        It is where its distance from the outline and the disk's radius exceed the way from the
+        disk's centre.
+        """
+        if self._piece is None or self._inside.radius_m == 0.0:
+            return False
+        if self._border is None:
+            self._border = _pieces(self._outline)
+            self._near_border = Circle(), ()
+        if not self._near_border[0].holds(x_m, y_m):
+            near = _pieces_near(self._border, x_m, y_m)
+            self._near_border = Circle(x_m, y_m, LOCAL_M), near
+        room_m = _distance_m(self._near_border[1], x_m, y_m) - _ROUNDING_M
+        way_m = math.hypot(x_m - self._inside.x_m, y_m - self._inside.y_m)
+        if room_m < _TIE_M or way_m >= self._inside.radius_m + room_m:
+            return False
+        self._inside = Circle(x_m, y_m, room_m)
+        return True
 
 
 def junction_of(internal: str) -> str:
