@@ -97,6 +97,8 @@ class Polyline:
         self._lengths = np.hypot(steps[:, 0], steps[:, 1])
         self._directions = steps / self._lengths[:, None]
         self.s_m: Floats = np.concatenate([[0.0], np.cumsum(self._lengths)])
+        self._rows: list[list[float]] | None = None
+        self._starts_m: list[float] = []
         for array in (self.points, self.s_m):
             array.flags.writeable = False
 
@@ -106,13 +108,15 @@ class Polyline:
 
     def at(self, s_m: float) -> Pose:
         """Return the pose at arc length `s_m`, clamped to the ends, heading along the polyline."""
-        i = min(
-            max(int(np.searchsorted(self.s_m, s_m, side="right")) - 1, 0), len(self._lengths) - 1
-        )
-        along = min(max(s_m - self.s_m[i], 0.0), self._lengths[i])
-        x, y = self.points[i] + along * self._directions[i]
-        dx, dy = self._directions[i]
-        return Pose(float(x), float(y), math.atan2(dy, dx))
+        if self._rows is None:
+            columns = (self.points[:-1], self._directions, self._lengths[:, None])
+            self._starts_m = self.s_m.tolist()
+            self._rows = np.column_stack(columns).tolist()
+        s_m = float(s_m)
+        i = min(max(bisect_right(self._starts_m, s_m) - 1, 0), len(self._rows) - 1)
+        x, y, dx, dy, length_m = self._rows[i]
+        along = min(max(s_m - self._starts_m[i], 0.0), length_m)
+        return Pose(x + along * dx, y + along * dy, math.atan2(dy, dx))
 
     def project(
         self, x_m: float, y_m: float, near_s_m: tuple[float, float] | None = None
