@@ -72,6 +72,41 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
 
 
 @pytest.mark.engine
+def test_the_people_shown_are_those_that_sumo_lists(crowd: SumoCrowd) -> None:
+    """At each of 60 ticks, in which people arrive and enter, exactly SUMO's persons are shown."""
+    at = Pose(*crowd.street.people.xy.mean(axis=0).tolist(), 0.0)
+    shown = []
+    for _ in range(60):
+        reply = EventReply(episode="", tick=crowd.street.tick, states=(), actors=())
+        street = crowd.step(RobotState(at), reply, absent=True)
+        listed = [name for name in sumo.person.getIDList() if name[0] == "c"]
+        assert list(street.people.ids) == sorted(
+            name for name in listed if math.dist(sumo.person.getPosition(name), at[:2]) <= 100.0
+        )
+        shown.append(street.people.ids)
+    assert len(set(shown)) > 1
+
+
+@pytest.mark.engine
+def test_a_lead_computed_from_near_lines_is_the_lead(
+    crowd: SumoCrowd, street_map: StreetMap
+) -> None:
+    """Within LOCAL_M of a point, the lines near it give the same lead as all lines."""
+    walks = Walks(sumo, street_map)
+    rng = np.random.default_rng(6)
+    sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
+    for strip in sidewalks[:40]:
+        middle = Polyline(strip.line).at(rng.uniform(0.0, strip.length_m))
+        walk = walks.choose(strip.id, middle)
+        if walk is not None:
+            lead = walks.lead.around(walk.first, walk.second, *middle[:2])
+            for _ in range(5):
+                x_m, y_m = (np.array(middle[:2]) + rng.uniform(-3.5, 3.5, 2)).tolist()
+                whole_m = walks.lead.metres(walk.first, walk.second, x_m, y_m)
+                assert lead.metres(x_m, y_m) == pytest.approx(whole_m, abs=1e-9)
+
+
+@pytest.mark.engine
 def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
     crowd: SumoCrowd, street_map: StreetMap
 ) -> None:
