@@ -15,7 +15,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from physics.cameras.gl.cloth import FRAGMENT
+from physics.cameras.gl.cloth import FRAGMENT, TEXELS_PER_M
 from physics.cameras.gl.shading import Pass, Programs, programs
 from physics.people.body import COATS, FarBody, SkinnedBody
 
@@ -62,14 +62,14 @@ _TUBE_LAYOUT: Final = (
     *("in_middle", "in_ahead", "in_side", "in_ring", "in_joints", "in_weights", "in_coat"),
 )
 _SKIN: Final = (
-    f"const int TRIM = {COATS.index('trim')};\n"
+    f"const int TRIM = {COATS.index('trim')};\nconst float TEXELS_PER_M = {TEXELS_PER_M};\n"
     + """
 layout(binding = 0) uniform sampler2D posed;
 layout(binding = 1) uniform sampler2D dyed;
 in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
 in int person; in int dress; in float girth; in float tall;
 // packed, because triangles are small: each output costs as much as a pixel
-out vec4 at_unshaded; out vec4 normal_ahead; out vec2 own; flat out vec4 albedo_coat; flat out vec4 trim_map;
+out vec4 at_unshaded; out vec4 normal_ahead; out vec4 own; flat out vec4 albedo_coat; flat out vec4 trim_map;
 vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
 void pose(int bones) {
     for (int k = 0; k < bones; k++) {
@@ -87,8 +87,8 @@ vec3 placed(vec3 v) { return vec3(x.w, y.w, z.w) + moved(v); }
 void finish(vec3 at, vec3 normal, vec3 modelled, float unshaded) {
     at_unshaded = vec4(at, unshaded);
     normal_ahead = vec4(normal, modelled.x * tall);
-    own = modelled.yz * tall;
     gl_Position = project(at);
+    own = vec4(modelled.yz * tall, sunlit(at, normal), log2(max(gl_Position.w * ahead.w * TEXELS_PER_M, 1.0)));
 }
 """
 )
