@@ -114,6 +114,7 @@ layout(std140, binding = 0) uniform Scene {
 """
 
 _VERTEX = """
+invariant gl_Position;  // the same depth in all programs
 vec3 unpacked(vec4 normal) { return normal.xyz * (255.0 / 127.0) - 1.0; }
 vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
 """
