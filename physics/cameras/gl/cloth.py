@@ -3,8 +3,9 @@
 Inputs from the vertex shaders of `skins`:
 
 at_unshaded    `at` of shading; share of the sky's light that the body itself leaves, baked
-normal_ahead   as for `show_linear` of shading; x of the point on the body of 1.75 m as modelled, metres
-own            y and z of that point; maps move with the body; share of sunlight; level of the map
+normal_ahead   as for `show_linear` of shading; x of the point below
+own            y and z of the point on the body of 1.75 m as modelled, metres; share of sunlight;
+               level of the map. Maps move with the body.
 albedo_coat    sRGB of the surface; row of COATS
 trim_map       second colour of the clothes; row of the map
 """

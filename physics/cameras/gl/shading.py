@@ -12,9 +12,10 @@ fragment shader   Calls `show(albedo, normal, at, label)` once, or `glow(colour,
                   normal: vec3, approximately unit length
                   at: as in the vertex shader
                   label: float, an id of cosim.core.state.LABELS
-                  `show_linear` takes a linear albedo and a radiance emitted by the surface, and
-                  optionally the share of sunlight, `sunlit_on` where `on_map` of the vertex shader
-                  is. Both save time: a software renderer reads and multiplies per pixel.
+                  `show_linear` takes a linear albedo and a radiance emitted by the surface.
+                  Its optional sixth argument is the share of sunlight. It saves time where the
+                  vertex shader computes it (`sunlit`), or its point on the shadow maps (`on_map`,
+                  for `sunlit_on` in the fragment shader).
                   sRGB textures are decoded when they are read.
                   The shadow pass skips it: do not write depth. Code that discards has a shadow
                   shader that discards, too.
@@ -37,8 +38,8 @@ Uniform block `Scene` (binding SCENE_BINDING, one per pass and picture, from `Sc
     vec4 fog               rgb linear; w extinction per metre
     vec4 haze              start in metres, share per metre, maximum share
     vec4 anchor            xy in world metres (float32: for patterns, not for geometry)
-    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half width and height;
-                           w of ahead: width of a pixel at a distance of 1
+    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half width and
+                           height; w of ahead: width of a pixel at a distance of 1 m, metres
 
 Textures: the shadow maps are bound to units STILL_UNIT (static) and MOVING_UNIT (moving objects).
 SKY_UNIT holds the sky; SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT those of ground and walls.
@@ -140,7 +141,7 @@ float sunlit_on(vec3 on_map) {
 }
 float sunlit(vec3 at, vec3 normal) { return sunlit_on(on_map(at, normal)); }
 """
-"""Share of sunlight at a point, in both shaders: `on_map` is linear, so vertex shaders may pass it."""
+"""Share of sunlight at a point, for both shaders. `on_map` is linear, so it can be interpolated."""
 
 _FRAGMENT = """
 out vec4 pixel;

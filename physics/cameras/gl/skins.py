@@ -68,7 +68,7 @@ layout(binding = 0) uniform sampler2D posed;
 layout(binding = 1) uniform sampler2D dyed;
 in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
 in int person; in int dress; in float girth; in float tall;
-// packed, because triangles are small: each output costs as much as a pixel
+// packed, because triangles are small: setting up outputs costs as much as pixels
 out vec4 at_unshaded; out vec4 normal_ahead; out vec4 own; flat out vec4 albedo_coat; flat out vec4 trim_map;
 vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
 void pose(int bones) {
