@@ -194,7 +194,10 @@ class GlScene:
             return
         (self._seen if stage == "colour" else self._standing).draw(stage, self._variant)
         self._fenced.draw(stage, self._variant)
-        self._walls.draw(stage)
+        if stage == "colour":
+            self._walls.draw_seen()
+        else:
+            self._walls.draw(stage)
         self._ground.draw(stage)
         if not self._splats:
             self._scan.draw(stage)

@@ -147,11 +147,33 @@ class TileLayer:
             self._counts[stage] = len(draws)
 
     def draw(self, stage: Pass) -> None:
-        count = self._counts.get(stage, 0)
-        if count:
-            self._arrays[stage != "colour"].render_indirect(
-                self._commands[stage], moderngl.TRIANGLES, count=count
-            )
+        if self._counts.get(stage, 0):
+            self._render(stage, self._arrays[stage != "colour"])
+
+    def _render(self, stage: Pass, array: moderngl.VertexArray) -> None:
+        count = self._counts[stage]
+        array.render_indirect(self._commands[stage], moderngl.TRIANGLES, count=count)
+
+    def draw_seen(self) -> None:
+        """Draw the picture of surfaces that hide one another, and shade only what is seen.
+
+        The depth comes first on a software renderer, which spends its time on shading.
+        """
+        gl = self._context
+        if not self._counts["colour"]:
+            return
+        if is_card(gl):
+            self.draw("colour")
+            return
+        frame = gl.fbo
+        frame.color_mask = False, False, False, False
+        frame.use()
+        self._render("colour", self._arrays[1])
+        frame.color_mask = True, True, True, True
+        frame.use()
+        gl.depth_func = "<="
+        self.draw("colour")
+        gl.depth_func = "<"
 
     def release(self) -> None:
         for array in self._arrays:

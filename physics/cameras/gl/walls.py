@@ -70,12 +70,13 @@ _COOL_LIGHT: Final = "1.1e-3, 1.2e-3, 1.3e-3"
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
 in vec2 middle;
-out vec3 at; out vec3 normal; out vec2 spot; out vec2 cells;
+out vec3 at; flat out vec3 normal; out vec3 in_map; out vec2 spot; out vec2 cells;
 flat out vec4 tint; flat out vec4 kind; flat out vec4 fronts; flat out vec3 doors;
 void main() {
     int layer = int(in_normal.w * 255.0 + 0.5);
     at = in_at + vec3(middle, 0.0);
     normal = unpacked(in_normal);
+    in_map = on_map(at, normal);
     tint = vec4(in_colour.a > 0.5 ? tint_of(in_colour.rgb, layer) : vec3(1.0), layer);
     spot = in_spot.xy / layers[layer].w;
     cells = in_spot.zw;
@@ -90,7 +91,7 @@ void main() {
 _FRAGMENT: Final = f"""
 layout(binding = {FACADES_UNIT}) uniform sampler2DArray facades;
 layout(binding = {FINISH_UNIT}) uniform sampler2DArray finish;
-in vec3 at; in vec3 normal; in vec2 spot; in vec2 cells;
+in vec3 at; flat in vec3 normal; in vec3 in_map; in vec2 spot; in vec2 cells;
 flat in vec4 tint; flat in vec4 kind; flat in vec4 fronts; flat in vec3 doors;
 float chance(vec2 cell, float of) {{
     vec2 p = fract((cell + of) * vec2(0.1031, 0.1030));
@@ -119,7 +120,7 @@ void main() {{
     lamp *= ground_floor ? 0.7 + 0.6 * fract(shop * 31.0) : 0.25 + fract(drawn * 71.0);
     own = none ? own : lamp * room * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
 #endif
-    show_linear(albedo, own, normal, at, {LABELS["building"]}.0);
+    show_linear(albedo, own, normal, at, {LABELS["building"]}.0, sunlit_on(in_map));
 }}
 """
 
