@@ -225,7 +225,7 @@ def _dog() -> list[Piece]:
 
 def _umbrella() -> list[Piece]:
     x, y, _ = HANDLES["umbrella"][0]
-    top = 2.03
+    top = 2.08
     canopy = [
         upright_loft((x, y, z), wide, 1.0, wide, _CHEST)
         for z, wide in (

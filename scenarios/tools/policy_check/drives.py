@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Final, Literal
 
 import msgspec
+import numpy as np
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
@@ -49,11 +50,13 @@ SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
         "straight": "along a straight sidewalk, nobody there",
         "left": "askew on it, to the right: the way leads to the left",
         "right": "askew on it, to the left: the way leads to the right",
-        "person": "along it, and somebody stands 3 m ahead",
+        "person": "along it, and three people stand 3 m ahead",
     }
 )
-_PERSON: Final = "person-0"
-"""Name of the person ahead, whose shirt is yellow in this place and season: easy to see."""
+_PERSONS: Final = tuple(f"person-{k}" for k in range(3))
+"""Names of the people ahead. Several, as the clothes of one may be hard to see."""
+_APART_M: Final = 0.65
+"""Distance between their middles in metres."""
 _SHOWN: Final = "straight-003"
 """Scenario of the suite `unit` whose place is shown.
 
@@ -159,7 +162,7 @@ def _drive(
             rays,
         )
         people = (
-            _standing_person(route, 0.5 * route.length_m + _PERSON_M)
+            _standing_people(route, 0.5 * route.length_m + _PERSON_M)
             if scene == "person"
             else NO_PEOPLE
         )
@@ -180,14 +183,17 @@ def _drive(
     return Drive(scene, tuple(seen))
 
 
-def _standing_person(route: Polyline, s_m: float) -> People:
-    """Return one adult in the middle of the way, facing the robot."""
+def _standing_people(route: Polyline, s_m: float) -> People:
+    """Return adults side by side around the middle of the way, facing the robot."""
     pose = route.at(s_m)
+    across = np.array([-math.sin(pose.heading_rad), math.cos(pose.heading_rad)])
+    aside = _APART_M * (np.arange(len(_PERSONS)) - 0.5 * (len(_PERSONS) - 1))
+    heading = wrap_angle(pose.heading_rad + math.pi)
     return People.of(
-        (_PERSON,),
-        [pose.xy],
-        [wrap_angle(pose.heading_rad + math.pi)],
-        [0.0],
-        ("stand",),
+        _PERSONS,
+        np.array(pose.xy) + aside[:, None] * across,
+        [heading] * len(_PERSONS),
+        [0.0] * len(_PERSONS),
+        ("stand",) * len(_PERSONS),
         kind=PersonKind.EVENT,
     )
