@@ -332,7 +332,12 @@ def fence(size: Size) -> tuple[Part, ...]:
         box((0.06, 0.06, h), (s * (0.5 * length - 0.3), 0.0, 0.5 * h), skip=("bottom", "top"))
         for s in (-1, 1)
     ]
-    return Part(join(mesh), None, "wood-upright"), Part(join([*feet, *posts]), WHITE)
+    # Detectors of people take a bright panel between white posts for a person.
+    return (
+        Part(join(mesh), None, "wood-upright"),
+        Part(join([*feet, *posts]), WHITE, detail="plain"),
+        Part(join([*feet, *posts]), ZINC, "metal-brushed", detail="textured"),
+    )
 
 
 def car(size: Size) -> tuple[Part, ...]:

@@ -16,6 +16,7 @@ from physics.street.furniture_shapes import METAL, WHITE, Size
 
 _RUBBER: Final = (0.07, 0.07, 0.08)
 _RED: Final = (0.82, 0.10, 0.09)
+_CONCRETE: Final = (0.50, 0.50, 0.48)
 _FRAME: Final = (0.33, 0.24, 0.16)
 _PAPER: Final = (0.90, 0.88, 0.80)
 _WHEEL_SIDES: Final = 10
@@ -116,10 +117,10 @@ def construction_fence(size: Size) -> tuple[Part, ...]:
         for s in (-1, 1)
     ]
     return (
-        Part(join(fields[::2]), _RED),
-        Part(join(fields[1::2]), WHITE),
+        Part(join(fields[1::2]), _RED),
+        Part(join(fields[::2]), WHITE),
         Part(join(bars), None),
-        Part(join(feet), _RUBBER),
+        Part(join(feet), _CONCRETE),
     )
 
 

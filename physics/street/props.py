@@ -16,7 +16,7 @@ from physics.ground.tiles import Key, grown_box, tile_at, tile_bounds
 
 PROP_RED: Final = (0.82, 0.10, 0.09)
 PROP_WHITE: Final = (0.93, 0.93, 0.91)
-_STEEL: Final = (0.45, 0.46, 0.47)
+_STEEL: Final = (0.78, 0.79, 0.80)
 POLE: Final = (0.22, 0.24, 0.25)
 LAMPS: Final = {True: (0.10, 0.85, 0.35), False: (0.95, 0.12, 0.08)}
 """sRGB colour of the lit lamp: True is walk, False is stop."""
@@ -32,7 +32,9 @@ def barrier_parts(barrier: Barrier) -> tuple[Part, ...]:
     red: list[Mesh] = []
     white: list[Mesh] = []
     posts: list[Mesh] = []
-    for low, high in ((0.45, 0.68), (0.77, 1.0)):
+    # Red above white, and posts away from the ends: detectors take an end of equal fields on a post
+    # for a person.
+    for first, (low, high) in enumerate(((0.45, 0.68), (0.77, 1.0))):
         height = (high - low) * barrier.height_m
         for k in range(count):
             centre = (
@@ -41,9 +43,9 @@ def barrier_parts(barrier: Barrier) -> tuple[Part, ...]:
                 0.5 * (low + high) * barrier.height_m,
             )
             board = box((0.5 * barrier.thickness_m, step, height), centre, skip=("left", "right"))
-            (red if k % 2 == 0 else white).append(board)
+            (red if (k + first) % 2 == 0 else white).append(board)
     for side in (-1, 1):
-        y = side * (0.5 * barrier.length_m - 0.15)
+        y = side * (0.5 * barrier.length_m - min(0.45, 0.2 * barrier.length_m))
         posts.append(box((0.05, 0.05, 0.9 * barrier.height_m), (0.0, y, 0.45 * barrier.height_m)))
         posts.append(box((4.0 * barrier.thickness_m, 0.10, 0.06), (0.0, y, 0.03)))
     return tuple(

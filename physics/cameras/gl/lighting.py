@@ -24,7 +24,7 @@ It hides the edge of the drawn world, as in the bullet camera.
 
 LAMPS_SPREAD: Final = 0.55
 """Share of the lamplight of `physics.cameras.sky` that comes from single lamps."""
-NIGHT_EXPOSURE: Final = 0.7
+NIGHT_EXPOSURE: Final = 2.4
 """Relative increase of the exposure in a street with lamps."""
 _ABOVE: Final = np.array([0.0, 0.0, 1.0])
 

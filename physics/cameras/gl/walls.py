@@ -59,12 +59,12 @@ _LAYOUT: Final = (
 _LIT_SHARE: Final = 0.35
 _OPEN_SHARE: Final = 0.6
 """Share of the ground floors, from door to door, that are lit at night."""
-_LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
-"""Radiance of a lit window, in the units of physics.cameras.sky, about 60 candela per square
+_LAMPLIGHT: Final = "0.96e-3, 0.72e-3, 0.42e-3"
+"""Radiance of a lit window, in the units of physics.cameras.sky, about 36 candela per square
 metre.
 """
 
-_COOL_LIGHT: Final = "1.1e-3, 1.2e-3, 1.3e-3"
+_COOL_LIGHT: Final = "0.66e-3, 0.72e-3, 0.78e-3"
 """Radiance of a window that is lit by a fluorescent or LED lamp."""
 
 _VERTEX: Final = """

@@ -26,7 +26,7 @@ _ROWS: Final = 64
 _PEOPLE_ROW: Final = 4 + 3 * LAMPS_MAX
 _FULL_RAIN_MM_H: Final = 20.0
 _FULL_SNOW_MM_H: Final = 2.0
-_NIGHT_NOISE: Final = 5.0e-4
+_NIGHT_NOISE: Final = 2.0e-4
 """Sensor noise at night: variance of a pixel per light, where 1 is the white level."""
 SNOW_EXPOSURE: Final = 0.45
 """Relative increase of the exposure on snow, which would otherwise be grey."""

@@ -503,9 +503,7 @@ def _scenarios(place: str, split: Split) -> Iterator[Scenario]:
                 )
 
 
-def _driven(
-    scenario: Scenario, options: EpisodeOptions, progress: Progress
-) -> Iterator[Picture]:
+def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> Iterator[Picture]:
     driver = load_policy(_DRIVER)
     surface = surface_of_place(scenario.place)
     robot_model = robot_called(scenario.robot)
