@@ -28,8 +28,10 @@ _FULL_RAIN_MM_H: Final = 20.0
 _FULL_SNOW_MM_H: Final = 2.0
 _NIGHT_NOISE: Final = 2.0e-4
 """Sensor noise at night: variance of a pixel per light, where 1 is the white level."""
-SNOW_EXPOSURE: Final = 0.45
+_SNOW_EXPOSURE: Final = 0.45
 """Relative increase of the exposure on snow, which would otherwise be grey."""
+_WET_EXPOSURE: Final = 0.3
+"""The same on wet ground, which is darker than dry ground."""
 _GLOW_FROM_PER_M: Final = 0.004
 """Extinction from which fog glows around the sun, 1/m."""
 
@@ -68,6 +70,11 @@ def weathered_sky(light: Light, weather: Weather, seed: int) -> Sky:
         east, north, _ = sun_direction(light.hour, light.day_of_year, light.latitude_deg).tolist()
         to_sun = direction_at(weather.sun_deg, east, north)
     return sky_of(weathered(light, weather), seed, to_sun, weather.fog_top_m)
+
+
+def exposed(weather: Weather) -> float:
+    """Return the factor of the exposure on ground that is brighter or darker than dry ground."""
+    return 1.0 + _SNOW_EXPOSURE * weather.snow + _WET_EXPOSURE * weather.wetness
 
 
 def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None:
