@@ -44,7 +44,7 @@ _COMPANIONS: Final[tuple[tuple[Companion, int], ...]] = (
     ("wheelchair", 6),
 )
 """Objects that people push or lead, and how many of 1000 people do."""
-_UMBRELLAS: Final = 700
+_UMBRELLAS: Final = 600
 """How many of 1000 people hold an umbrella in rain."""
 
 

@@ -91,7 +91,7 @@ def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None
         return None
     variant |= Variant.WEATHER | (Variant.SHADOWS if shadows else Variant.NONE)
     rain = min(weather.rain_mm_h / _FULL_RAIN_MM_H, 1.0) ** 0.5
-    drops = max(0.0, 1.6 * rain - 0.5)
+    drops = max(0.0, 2.0 * rain - 1.0)
     bloom = 0.03 + 0.10 * sky.lamps * (1.0 + rain)
     # Air scatters the light of lamps towards the eye; rain and snow as the fog of their visibility.
     scattering = sky.lamps * min(0.6 * sky.fog_per_m, 0.02)

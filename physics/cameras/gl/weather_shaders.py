@@ -233,7 +233,7 @@ vec3 rained(vec3 light, vec2 flat_ray, float far, vec3 around) {
         float wide = max(0.0011, 0.55 * pixel_tan * away);
         float aside = (fract(at.x / 0.045) - 0.2 - 0.6 * fract(drawn * 37.0)) * 0.045;
         float body = fading(wide, 0.0, abs(aside)) * smoothstep(0.0, 0.05, along) * fading(length_m, length_m - 0.06, along);
-        float share = body * min(0.0011 / wide, 1.0) * 0.75;
+        float share = body * min(0.0011 / wide, 1.0) * 0.55;
         light = mix(light, around, share);
     }
     return light;
