@@ -58,7 +58,8 @@ class GlCamera(WorldCamera):
         self._look: Look | None = None
         if scan is None:
             self._sky = weathered_sky(light, weather, seed)
-            self._look = look_of(weather, self._sky, seed, light.shadows)
+            hour = light.hour if weather.sun_deg is None else None
+            self._look = look_of(weather, self._sky, seed, light.shadows, hour)
         else:
             self._sky = scan_sky(light, scan.facts, seed)
         contact = light.shadows and self._look is not None

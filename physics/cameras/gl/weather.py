@@ -16,6 +16,7 @@ from cosim.spec.scenario import Light
 from cosim.spec.weather import Weather, direction_at
 from physics.cameras.gl.lamps import Lamps
 from physics.cameras.gl.variants import Variant
+from physics.cameras.gl.walls import LIT_SHARE
 from physics.cameras.gl.weather_shaders import LAMPS_MAX, WEATHER_BINDING
 from physics.cameras.sky import Sky, sky_of
 from physics.cameras.sun import sun_direction
@@ -32,6 +33,11 @@ _SNOW_EXPOSURE: Final = 0.45
 """Relative increase of the exposure on snow, which would otherwise be grey."""
 _WET_EXPOSURE: Final = 0.3
 """The same on wet ground, which is darker than dry ground."""
+_LIT_BY_HOUR: Final = (
+    *((0.0, 0.14), (1.5, 0.06), (4.5, 0.04), (6.5, 0.28), (8.0, 0.35)),
+    *((16.0, 0.35), (18.0, 0.45), (21.0, 0.52), (22.5, 0.38), (24.0, 0.14)),
+)
+"""Share of lit windows by hour; an assumption."""
 _GLOW_FROM_PER_M: Final = 0.004
 """Extinction from which fog glows around the sun, 1/m."""
 
@@ -77,10 +83,19 @@ def exposed(weather: Weather) -> float:
     return 1.0 + _SNOW_EXPOSURE * weather.snow + _WET_EXPOSURE * weather.wetness
 
 
-def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None:
+def lit_share(hour: float) -> float:
+    """Return the share of windows that are lit at an hour of the night."""
+    hours, shares = zip(*_LIT_BY_HOUR, strict=True)
+    return float(np.interp(hour % 24.0, hours, shares))
+
+
+def look_of(
+    weather: Weather, sky: Sky, seed: int, shadows: bool, hour: float | None = None
+) -> Look | None:
     """Return what weather and night change in pictures besides the sky; None without a change.
 
     shadows: shadow maps are drawn
+    hour: of a night; None where the weather makes the night, at any hour
     """
     glows = sky.fog_per_m > _GLOW_FROM_PER_M and float(sky.sun_colour.max()) > 0.0
     variant = Variant.NONE
@@ -90,6 +105,7 @@ def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None
     if not (variant or weather.precipitates or glows):
         return None
     variant |= Variant.WEATHER | (Variant.SHADOWS if shadows else Variant.NONE)
+    share = LIT_SHARE if hour is None else lit_share(hour)
     rain = min(weather.rain_mm_h / _FULL_RAIN_MM_H, 1.0) ** 0.5
     drops = max(0.0, 2.0 * rain - 1.0)
     bloom = 0.03 + 0.10 * sky.lamps * (1.0 + rain)
@@ -98,7 +114,7 @@ def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None
     clear = 1.0 if weather.cloud_cover is None else 1.0 - weather.cloud_cover
     return Look(
         variant,
-        (weather.wetness, weather.puddles, weather.snow, 0.0),
+        (weather.wetness, weather.puddles, weather.snow, share),
         (rain, min(weather.snow_mm_h / _FULL_SNOW_MM_H, 1.0), drops, bloom),
         (scattering, sky.lamps * clear, float(glows), 0.0),
         _NIGHT_NOISE * sky.lamps,
