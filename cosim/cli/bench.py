@@ -505,10 +505,8 @@ def bench(
         bench_people(jobs)
         return
     if what == "realism":
-        bench_realism(
-            *(places or (), split or ("val",), weather or ("clear",)),
-            *(frames, appearance, weights, folder, compare),
-        )
+        skies, splits = weather or ("clear",), split or ("val",)
+        bench_realism(places or (), splits, skies, frames, appearance, weights, folder, compare)
         return
     if what == "exploit":
         named, sought, goals = (
