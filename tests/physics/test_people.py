@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, Age, People
 from cosim.people.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
-from physics.people.appearance import companion_of, family_of, look_of
+from physics.people.appearance import Look, companion_of, family_of, look_of
 from physics.people.body import COATS, SkinnedBody, body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
@@ -202,6 +204,37 @@ def test_looks_hang_on_name_and_age_alone() -> None:
     assert (
         sum(look_of(*n, 7).colours.tobytes() != look_of(*n).colours.tobytes() for n in names) == 60
     )
+
+
+def test_outfit_colours_patterns_and_girth_are_independent() -> None:
+    """Of 4,000 names, every pair of outfit, colours, beard and girth is spread as if drawn by two
+    dice (chi-squared test): wearers of an outfit have all its colours equally often."""
+    looks = [look_of(f"p{i}", Age.ADULT, 3, crowd=False) for i in range(4000)]
+    men = [one for one in looks if ALL[one.outfit].family == "man"]
+
+    def classes(values: Sequence[object]) -> np.ndarray:
+        return np.unique(np.array([str(one) for one in values]), return_inverse=True)[1]
+
+    def darker(one: Look, coat: str) -> int:
+        return int(one.colours[COATS.index(coat)].astype(int).sum())
+
+    girth = np.argsort(np.argsort([one.girth_m for one in men])) * 8 // len(men)
+    draws = {
+        "outfit": classes([one.outfit for one in men]),
+        "girth": girth,
+        "beard": classes([one.patterns[COATS.index("skin")] for one in men]),
+        **{
+            coat: np.argsort(np.argsort([darker(one, coat) for one in men])) * 8 // len(men)
+            for coat in ("shoes", "bag", "cap", "metal", "skin")
+        },
+    }
+    for one, other in itertools.combinations(draws, 2):
+        table = np.zeros((draws[one].max() + 1, draws[other].max() + 1))
+        np.add.at(table, (draws[one], draws[other]), 1.0)
+        expected = table.sum(axis=1, keepdims=True) * table.sum(axis=0) / table.sum()
+        chi2 = float(((table - expected) ** 2 / expected).sum())
+        free = (table.shape[0] - 1) * (table.shape[1] - 1)
+        assert abs(chi2 - free) < 5.0 * np.sqrt(2.0 * free), (one, other)
 
 
 def test_sixty_outfits_follow_the_season() -> None:

@@ -56,15 +56,16 @@ _LAYOUT: Final = (
     "in_kind",
     "in_fronts",
 )
-_LIT_SHARE: Final = 0.35
-_OPEN_SHARE: Final = 0.6
-"""Share of the ground floors, from door to door, that are lit at night."""
-_LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
-"""Radiance of a lit window, in the units of physics.cameras.sky, about 60 candela per square
+LIT_SHARE: Final = 0.35
+"""Share of the windows that are lit in the dark where the hour is not of the night."""
+_OPEN: Final = 1.7
+"""Ground floors, from door to door, that are lit, for each window that is."""
+_LAMPLIGHT: Final = "0.96e-3, 0.72e-3, 0.42e-3"
+"""Radiance of a lit window, in the units of physics.cameras.sky, about 36 candela per square
 metre.
 """
 
-_COOL_LIGHT: Final = "1.1e-3, 1.2e-3, 1.3e-3"
+_COOL_LIGHT: Final = "0.66e-3, 0.72e-3, 0.78e-3"
 """Radiance of a window that is lit by a fluorescent or LED lamp."""
 
 _VERTEX: Final = """
@@ -114,7 +115,12 @@ void main() {{
     vec3 own = vec3(0.0);
 #ifdef NIGHT
     float shop = chance(vec2(floor((cell.x + 0.5) / max(doors.x, 1.0)), 3.0), kind.w + fronts.w);
-    float lit = (ground_floor ? shop < {_OPEN_SHARE} : fract(drawn * 29.0) < {_LIT_SHARE}) ? side_light.w : 0.0;
+#ifdef WEATHER
+    float share = surface.w;
+#else
+    float share = {LIT_SHARE};
+#endif
+    float lit = (ground_floor ? shop < {_OPEN} * share : fract(drawn * 29.0) < share) ? side_light.w : 0.0;
     vec3 room = vec3(0.25) + 2.5 * decoded(bay.rgb);
     vec3 lamp = mix(vec3({_LAMPLIGHT}), vec3({_COOL_LIGHT}), step(0.75, fract((ground_floor ? shop : drawn) * 53.0)));
     lamp *= ground_floor ? 0.7 + 0.6 * fract(shop * 31.0) : 0.25 + fract(drawn * 71.0);

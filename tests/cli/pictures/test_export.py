@@ -89,7 +89,7 @@ def test_nodes_stand_below_the_group_of_their_kind(street: StreetSurface, file: 
     standing = {prop.kind for key in KEYS for prop, _ in street.chunk(key).props}
     assert of_group["furniture"] == {f"prop:{kind}" for kind in standing} and len(standing) > 4
     assert of_group["buildings"] == {"building:walls", "building:windows"}
-    assert of_group["barriers"] == {"barrier:red", "barrier:white"}
+    assert of_group["barriers"] == {"barrier:red", "barrier:white", "barrier:posts"}
 
 
 def ground_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
