@@ -172,7 +172,8 @@ class ScanSurface(PlaceSurface):
         """Return the heights above the ground of the lowest and highest corner of triangles."""
         corners = mesh.vertices[mesh.triangles[rows]].astype(float)
         above = corners[..., 2] - self.heights(corners[..., :2].reshape(-1, 2)).reshape(-1, 3)
-        return above.min(axis=1), above.max(axis=1)
+        a, b, c = above.T
+        return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
     def _kinds_at(self, xy: Floats) -> NDArray[np.intp]:
         """Return the number in `_KINDS` of the area at (N, 2) points, `len(_KINDS)` without one."""
