@@ -120,7 +120,7 @@ def _write(
             tape.answer(command, now_ns)
             seen = episode.advance(command, delay=delay)
             progress(f"recording {told.scenario.id}", episode.moment.tick / len(told.log))
-        check_state_hash(folder, told, episode.result()[0].state_hash)
+        check_state_hash(folder, told, episode.state_hash)
     for file in path.iterdir():
         file.rename(path.parent / file.name)
     path.rmdir()
