@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import MachineError, RunError
 from cosim.core.geometry import Floats
 from cosim.core.npz import read_open_npz
+from cosim.core.packed_demos import EXTRAS
 
 _GLIMPSE_PX: Final = (8, 6)
 """Width and height in pixels of the thumbnails by which stored pictures are checked."""
@@ -45,6 +46,7 @@ class Demonstration:
     clip: the bytes of an .mp4 with n pictures.
     scan (n, R), imu (n, 6), people (n, PEOPLE_ROWS, 5): recorded sensors, as in
         `scan_row` and `people_rows` of `cosim.spec.sensors`; empty without them.
+    near, free, scene: labels, as in `scenarios.episodes.labels`; empty without them.
     """
 
     state: NDArray[np.float32]
@@ -60,14 +62,17 @@ class Demonstration:
     scan: NDArray[np.float32] = field(default_factory=_nothing)
     imu: NDArray[np.float32] = field(default_factory=_nothing)
     people: NDArray[np.float32] = field(default_factory=_nothing)
+    near: NDArray[np.float32] = field(default_factory=_nothing)
+    free: NDArray[np.float32] = field(default_factory=_nothing)
+    scene: NDArray[np.float32] = field(default_factory=_nothing)
 
     def __len__(self) -> int:
         return len(self.state)
 
     @property
-    def sensors(self) -> dict[str, NDArray[np.float32]]:
-        """Return the recorded sensors by name."""
-        rows = {"scan": self.scan, "imu": self.imu, "people": self.people}
+    def extras(self) -> dict[str, NDArray[np.float32]]:
+        """Return the recorded sensors and labels by name."""
+        rows = {name: getattr(self, name) for name in EXTRAS}
         return {name: readings for name, readings in rows.items() if readings.size}
 
     def encoded(self) -> bytes:

@@ -26,6 +26,7 @@ from cosim.spec.scenario import Scenario
 from cosim.spec.sensors import people_rows, scan_row
 from scenarios.episodes.clip import Clip
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
+from scenarios.episodes.labels import event_numbers, event_person, label_rows
 
 _BURST_S: Final = (0.4, 1.0)
 """Shortest and longest disturbance in seconds."""
@@ -87,7 +88,9 @@ class Demonstrator(PolicyCaller):
         answer = self._expert.act(observation)
         learned = None if self.learner is None else self.learner.act(observation)
         driven = self._bursts.driven(answer, observation.robot, learned)
-        self._rows.add(observation, rgb, answer, driven is not answer)
+        self._rows.add(
+            observation, rgb, answer, driven is not answer, labelled=self._collecting.labels
+        )
         return driven
 
     def ended(self) -> None:
@@ -173,10 +176,16 @@ class _Rows:
         self._instructions: list[str] = []
         self._glimpses: list[NDArray[np.uint8]] = []
         self._colours = np.zeros((3, 256), np.int64)
-        self._sensors: dict[str, list[NDArray[np.float32]]] = {}
+        self._extras: dict[str, list[NDArray[np.float32]]] = {}
+        self._persons: list[str] = []
 
     def add(
-        self, seen: Observation, rgb: NDArray[np.uint8], answer: Command, disturbed: bool
+        self,
+        seen: Observation,
+        rgb: NDArray[np.uint8],
+        answer: Command,
+        disturbed: bool,
+        labelled: bool = False,
     ) -> None:
         self._over |= seen.reset
         if self._over:
@@ -192,8 +201,9 @@ class _Rows:
         )
         self._instructions.append(goal.text if isinstance(goal, Instruction) else "")
         self._glimpses.append(glimpse(rgb))
-        for name, row in _sensor_rows(seen).items():
-            self._sensors.setdefault(name, []).append(row)
+        for name, row in (_sensor_rows(seen) | (label_rows(seen) if labelled else {})).items():
+            self._extras.setdefault(name, []).append(row)
+        self._persons.append(event_person(seen.privileged))
         self._colours += [
             np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
         ]
@@ -211,6 +221,9 @@ class _Rows:
         waypoints, driven = waypoints_ahead(
             pose, ticks, command, disturbed, collecting.waypoints, every, log.tick_s
         )
+        extras = {name: np.stack(rows) for name, rows in self._extras.items()}
+        if "scene" in extras:
+            extras["scene"][:, 1] = event_numbers(scenario, self._persons)
         return Demonstration(
             state=numbers[:, 0:2].astype(np.float32),
             goal=numbers[:, 2:4].astype(np.float32),
@@ -222,7 +235,7 @@ class _Rows:
             glimpses=np.stack(self._glimpses),
             colours=self._colours,
             clip=np.frombuffer(self._clip.finished(), np.uint8),
-            **{name: np.stack(rows) for name, rows in self._sensors.items()},
+            **extras,
         )
 
 

@@ -28,7 +28,8 @@ from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pi
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
 from scenarios.episodes.demonstrator import _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
-from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
+from scenarios.tools.dataset.collected import Collected
+from scenarios.tools.dataset.lerobot import Filmed, write_lerobot
 from scenarios.tools.dataset.read import packed_sets, read_back, read_data_set
 from sumo_nets.city.store import SEEDS
 from tests.run_specs import record_of
@@ -418,9 +419,12 @@ def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:
         fresh("unit", (900,), ["gesturing"])
     with pytest.raises(
         CosimError,
-        match=r"unknown suite for --cities 'long-horizon'\. Valid choices: reactive, unit",
+        match=r"unknown suite for --cities 'scans'\. Valid choices: long-horizon, reactive, unit",
     ):
-        fresh("long-horizon", (900,))
+        fresh("scans", (900,))
+    with_decoys = fresh("reactive", (900,), ["gesturing", "static"], decoys=True)
+    assert with_decoys.structures == ("gesturing", "gesturing-decoy", "static")
+    assert fresh("long-horizon", (900,)).structures == ("route",)
 
 
 def test_a_damaged_demonstration_is_named(demonstrations: list[Demonstration]) -> None:
