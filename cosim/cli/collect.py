@@ -402,10 +402,11 @@ def pack(
     if is_raw(folders[0]):
         with doing("packing the episodes") as progress:
             parts = pack_raw(folders, output, wanted, part=part, jobs=jobs, progress=progress)
-        episodes, rows = (sum(one[k] for one in parts) for k in (1, 2))
+        episodes, rows = sum(one.episodes for one in parts), sum(one.rows for one in parts)
+        size_mb = sum(one.path.stat().st_size for one in parts) / 1e6
         out.print(
-            f"Packed: {parts[0][0]} to {parts[-1][0].name} ({episodes} episodes, {rows} pictures, "
-            f"{sum(one[0].stat().st_size for one in parts) / 1e6:.1f} MB)",
+            f"Packed: {parts[0].path} to {parts[-1].path.name} ({episodes} episodes, {rows} "
+            f"pictures, {size_mb:.1f} MB)",
             soft_wrap=True,
             highlight=False,
         )

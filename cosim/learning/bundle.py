@@ -68,8 +68,8 @@ def write_bundle(
             f"a lower --rate"
         )
     example = io.BytesIO()
-    named = {f"expected.{name}": value for name, value in expected.items()}
-    np.savez_compressed(example, **inputs, **named)
+    arrays: dict[str, Any] = {f"expected.{name}": value for name, value in expected.items()}
+    np.savez_compressed(example, **arrays, **dict[str, Any](inputs))
     manifest = manifest_of(training.called, examples.meta, source, network.inputs)
     manifest["files"] = {MODEL: _facts(graph)}
     write_atomic(folder / MODEL, graph)

@@ -72,7 +72,7 @@ AUXILIARY: Final = ("near", "free", "signal", "event")
 """Heads of the labels, which are outputs of the graph."""
 STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3": 2}
 """Strides of the convolutions; 1 if missing."""
-STAGES: Final = (
+STAGES: Final[tuple[tuple[str, ...], ...]] = (
     ("stem", "down1"),
     ("block2a", "block2b"),
     ("down2",),

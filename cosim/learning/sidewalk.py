@@ -54,8 +54,11 @@ def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOu
     valid = batch.valid.flatten()
     return MemoryOutput(
         NetworkOutput(*(one[valid] for one in output.plan)),
-        *(one[valid] for one in output[1:5]),
-        output.memory,
+        near=output.near[valid],
+        free=output.free[valid],
+        signal=output.signal[valid],
+        event=output.event[valid],
+        memory=output.memory,
     )
 
 

@@ -218,7 +218,8 @@ class WindowExamples:
         """Return the rows at which held-out windows begin: one after another, at most `most`."""
         rows = self.held_out
         starts = rows[(rows - self._first[rows]) % STEPS == 0]
-        return starts[:: max(1, -(-len(starts) // most))]
+        found: NDArray[np.int64] = starts[:: max(1, -(-len(starts) // most))]
+        return found
 
     def first_inputs(self) -> dict[str, NDArray[np.float32]]:
         """Return the inputs of the graph at the start of the first held-out episode."""

@@ -278,7 +278,7 @@ def test_from_the_simulator_to_a_drive(tmp_path: Path, cosim: Cosim) -> None:
     done = cosim(*words, "--out", "demos", "--resume", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     parts = pack_raw([tmp_path / "demos"], tmp_path / "d.npz", part=1)
-    assert [path.name for path, _, _ in parts] == ["d-000.npz", "d-001.npz"]
+    assert [one.path.name for one in parts] == ["d-000.npz", "d-001.npz"]
     training = "train d-000.npz d-001.npz -o net --network sidewalk --steps 1 --batch 1"
     trained = cosim(*training.split(), "--device", "cpu", cwd=tmp_path)
     assert trained.returncode == 0, trained.stderr

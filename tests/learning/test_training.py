@@ -157,7 +157,8 @@ def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
         "depth": False,
     }
     manifest = msgspec.convert(
-        manifest_of("small", street().meta | {"camera": camera}, "told"), BundleManifest
+        manifest_of("small", street().meta | {"camera": camera}, "told", SMALL.inputs),
+        BundleManifest,
     )
     assert manifest.camera.spec == CameraSpec(160, 120, 60.0, crop=(0, 30, 160, 120))
 

@@ -40,6 +40,14 @@ class _Stored(NamedTuple):
     weather: str
 
 
+class Part(NamedTuple):
+    """File of a part. episodes, rows: their numbers."""
+
+    path: Path
+    episodes: int
+    rows: int
+
+
 def is_raw(folder: Path) -> bool:
     """Return whether a folder is a collection of the format raw."""
     return (folder / ABOUT).exists()
@@ -53,8 +61,8 @@ def pack_raw(
     part: int = 250,
     jobs: int = 1,
     progress: Progress = ignore,
-) -> list[tuple[Path, int, int]]:
-    """Write collections in parts NAME-000.npz and so on; return path, episodes and rows of each.
+) -> list[Part]:
+    """Write collections in parts NAME-000.npz and so on, and return these.
 
     size: width and height of the pictures, instead of their own.
     part: episodes in a part.
@@ -71,7 +79,7 @@ def pack_raw(
     paths = [output.with_name(f"{output.stem}-{number:03d}.npz") for number in range(len(parts))]
     work = list(zip(paths, parts, strict=True))
     rows = parallel_map(partial(_write, abouts, size), work, jobs, progress, _STAGE)
-    return [(path, len(of), count) for (path, of), count in zip(work, rows, strict=True)]
+    return [Part(path, len(of), count) for (path, of), count in zip(work, rows, strict=True)]
 
 
 def _about(folder: Path) -> dict[str, Any]:
