@@ -55,7 +55,7 @@ _HIDDEN_SPEEDS: Final = 0.6
 """Share of windows whose speeds are hidden, see `examples`."""
 _FROM_START: Final = 0.15
 """Share of windows that begin with an episode."""
-_ROOM: Final = 0.6
+_ROOM: Final = 0.75
 """Largest share of a GPU's free memory for pictures; more stay in the host's memory."""
 _READERS: Final = 8
 _SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal")

@@ -4,7 +4,7 @@ END=$((SECONDS + ${MINUTES:-9} * 60))
 JOBS=${JOBS:-16} COSIM=${COSIM:-cosim} PYTHON=${PYTHON:-python3}
 mkdir -p "$W"
 
-step() { # name, words...: a command that can be interrupted and gone on with; done once
+step() { # name, words...: a command that can be interrupted and continued; done once
   local name=$1 left=$((END - SECONDS)); shift
   mkdir -p "$(dirname "$W/log/$name")"
   [ -e "$W/log/$name.done" ] && return 0

@@ -3,13 +3,14 @@
 #
 #   scenarios/examples/sidewalk_policy.sh WORK
 #
-# Works in pieces: stops after MINUTES (9 by default) and goes on where it was when called again, until it says "all done".
-# In round 0 the expert drives, disturbed; from round 1 on what was learned drives, and the expert answers. A round collects
+# Works in pieces: stops after MINUTES (9 by default), and continues when called again, until it prints "all done".
+# In round 0 the expert drives, disturbed; in later rounds the learner drives, and the expert's answers are stored. A round collects
 # for about COLLECT minutes (8), with JOBS processes (16), in CITIES new cities (48). COSIM, PYTHON: see small_policy.sh.
 # ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
 # SEEDS: trained on all rounds at the end ("0 1 2"). GPUS: trainings at once, one a GPU (1).
 # ABLATIONS=1: trains seed 0 again with each single change. SPLIT: scored part of the suites (val).
-# To go on from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
+# To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
+# MOST: most episodes with an event of a round (100000).
 # ROBOTS: which drive beside the courier ("scout dog"). WEATHERS: drawn for each episode.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
@@ -17,24 +18,24 @@ W=${1:?a folder to work in}
 . "$here/scenarios/examples/pieces.sh"
 ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-8} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
 SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val}
-ROBOTS=${ROBOTS-"scout dog"} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
+MOST=${MOST:-100000} ROBOTS=${ROBOTS-"scout dog"} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
 mkdir -p "$W/demos" "$W/nets" "$W/runs"
 
-gather() { # name, share of COLLECT, words...: as many episodes as fit in the time
-  local name=$1 minutes; minutes=$(awk "BEGIN { print $2 * $COLLECT }"); shift 2
-  step "collect-$name" bash -c '"$@" || [ $? = 1 ]' - $COSIM collect "$@" --minutes "$minutes" --episodes 100000 --fov 60 \
+gather() { # name, share of COLLECT, most episodes, words...: as many episodes as fit in the time
+  local name=$1 minutes most=$3; minutes=$(awk "BEGIN { print $2 * $COLLECT }"); shift 3
+  step "collect-$name" bash -c '"$@" || [ $? = 1 ]' - $COSIM collect "$@" --minutes "$minutes" --episodes "$most" --fov 60 \
     --labels --format raw --weathers "$WEATHERS" --jobs "$JOBS" --out "$W/demos/$name" --resume
   step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --jobs "$JOBS"
 }
 round() { # number, words of who drives...
   local k=$1; shift
-  local new=(--cities $((900 + 100 * k)):$((900 + 100 * k + CITIES)) --city-size 1000 --seed "$k" --astray 0.3)
+  local new=(--cities $((900 + 100 * k)):$((900 + 100 * k + CITIES)) --city-size 1000 --seed "$k" --astray 0.3 --unsolved)
   mkdir -p "$W/packed"
-  gather "$k-reactive" 0.55 reactive --decoys "${new[@]}" "$@"
-  gather "$k-unit" 0.1 unit "${new[@]}" "$@"
-  gather "$k-long" 0.25 long-horizon --unsolved "${new[@]}" "$@"
+  gather "$k-reactive" 0.55 "$MOST" reactive --decoys "${new[@]}" "$@"
+  gather "$k-unit" 0.1 $((60 * JOBS)) unit "${new[@]}" "$@"
+  gather "$k-long" 0.2 $((12 * JOBS)) long-horizon "${new[@]}" "$@"
   for robot in $ROBOTS; do
-    gather "$k-$robot" 0.05 reactive --decoys --robot "$robot" "${new[@]}" "$@"
+    gather "$k-$robot" 0.075 $((30 * JOBS)) reactive --decoys --robot "$robot" "${new[@]}" "$@"
   done
 }
 parts() { # last round: the packed files up to it
@@ -70,7 +71,7 @@ for k in $(seq "$FIRST" $((FIRST + ROUNDS - 1))); do
   if [ -z "$learner" ]; then
     round "$k" --noise 0.3
   else
-    round "$k" --noise 0.7 --unsolved --learner "onnx:$learner"
+    round "$k" --noise 0.7 --learner "onnx:$learner"
   fi
   if [ "$k" -lt $((FIRST + ROUNDS - 1)) ]; then
     sidewalk "round$k" "$k" --seed 0 ${learner:+--from "$learner"}
