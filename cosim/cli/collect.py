@@ -142,7 +142,11 @@ class DemoConfig:
     )
     astray: Annotated[
         float,
-        Option("Share of the episodes that begin aside of the route, turned away from it."),
+        Option(
+            "Share of the episodes that begin aside of the route, turned away from it.",
+            least=0.0,
+            most=1.0,
+        ),
     ] = 0.0
     weathers: Annotated[
         str,
@@ -153,6 +157,7 @@ class DemoConfig:
         Option(
             "Begin no episode after so long, and end with exit code 1: --resume continues.",
             default="no limit",
+            least=0.0,
         ),
     ] = math.inf
     format: Annotated[
