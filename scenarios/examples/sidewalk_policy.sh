@@ -5,12 +5,12 @@
 #
 # Works in pieces: stops after MINUTES (9 by default), and continues when called again, until it prints "all done".
 # In round 0 the expert drives, disturbed; in later rounds the learner drives, and the expert's answers are stored. A round collects
-# for about COLLECT minutes (8), with JOBS processes (16), in CITIES new cities (48). COSIM, PYTHON: see small_policy.sh.
+# for COLLECT minutes (8), with JOBS processes (16), in CITIES new cities (48), a multiple of GPUS. COSIM, PYTHON: see small_policy.sh.
 # ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
-# SEEDS: trained on all rounds at the end ("0 1 2"). GPUS: trainings at once, one a GPU (1).
+# SEEDS: trained on all rounds at the end ("0 1 2"). GPUS: they draw the pictures, and train one network each (1).
 # ABLATIONS=1: trains seed 0 again with each single change. SPLIT: scored part of the suites (val).
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
-# MOST: most episodes with an event of a round (100000).
+# MOST: most episodes of a collection with events (100000).
 # ROBOTS: which drive beside the courier ("scout dog"). WEATHERS: drawn for each episode.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
@@ -21,21 +21,32 @@ SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${
 MOST=${MOST:-100000} ROBOTS=${ROBOTS-"scout dog"} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
 mkdir -p "$W/demos" "$W/nets" "$W/runs"
 
-gather() { # name, share of COLLECT, most episodes, words...: as many episodes as fit in the time
-  local name=$1 minutes most=$3; minutes=$(awk "BEGIN { print $2 * $COLLECT }"); shift 3
-  step "collect-$name" bash -c '"$@" || [ $? = 1 ]' - $COSIM collect "$@" --minutes "$minutes" --episodes "$most" --fov 60 \
-    --labels --format raw --weathers "$WEATHERS" --jobs "$JOBS" --out "$W/demos/$name" --resume
-  step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --jobs "$JOBS"
+gather() { # name, share of JOBS, GPU, most episodes, words...: as many episodes as fit in COLLECT minutes
+  local name=$1 gpu=$3 most=$4 jobs; jobs=$(awk "BEGIN { n = int($2 * $JOBS + 0.5); print n < 1 ? 1 : n }"); shift 4
+  GLCONTEXT_DEVICE_INDEX=$gpu step "collect-$name" bash -c '"$@" || [ $? = 1 ]' - $COSIM collect "$@" --minutes "$COLLECT" \
+    --episodes "$most" --fov 60 --labels --format raw --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
 }
-round() { # number, words of who drives...
-  local k=$1; shift
-  local new=(--cities $((900 + 100 * k)):$((900 + 100 * k + CITIES)) --city-size 1000 --seed "$k" --astray 0.3 --unsolved)
-  mkdir -p "$W/packed"
-  gather "$k-reactive" 0.55 "$MOST" reactive --decoys "${new[@]}" "$@"
-  gather "$k-unit" 0.1 $((60 * JOBS)) unit "${new[@]}" "$@"
-  gather "$k-long" 0.2 $((12 * JOBS)) long-horizon "${new[@]}" "$@"
+round() { # number, words of who drives...: collections beside each other, then their arrays
+  local k=$1 first=$((900 + 100 * $1)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0; shift
+  local common=(--city-size 1000 --seed "$k" --astray 0.3 --unsolved "$@")
+  local all=(--cities $first:$((first + CITIES)) "${common[@]}")
+  gather "$k-unit" 0.08 0 "$((60 * JOBS))" unit "${all[@]}" &
+  gather "$k-long" 0.22 $((GPUS - 1)) "$((12 * JOBS))" long-horizon "${all[@]}" &
+  while [ $gpu -lt "$GPUS" ]; do
+    names+=("$k-reactive-$gpu")
+    gather "$k-reactive-$gpu" "0.56 / $GPUS" $gpu "$MOST" reactive --decoys \
+      --cities $((first + gpu * each)):$((first + (gpu + 1) * each)) "${common[@]}" &
+    gpu=$((gpu + 1))
+  done
   for robot in $ROBOTS; do
-    gather "$k-$robot" 0.075 $((30 * JOBS)) reactive --decoys --robot "$robot" "${new[@]}" "$@"
+    names+=("$k-$robot")
+    gather "$k-$robot" 0.07 $((${#names[@]} % GPUS)) "$((60 * JOBS))" reactive --decoys --robot "$robot" "${all[@]}" &
+  done
+  wait
+  mkdir -p "$W/packed"
+  for name in "${names[@]}"; do [ -e "$W/log/collect-$name.done" ] || exit 1; done
+  for name in "${names[@]}"; do
+    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --jobs "$JOBS"
   done
 }
 parts() { # last round: the packed files up to it
@@ -59,11 +70,9 @@ ablation() {
   local words=(); case $1 in share-*) words=(--share "${1#share-}") ;; no-*) words=("--$1") ;; esac
   sidewalk "$1" $((FIRST + ROUNDS - 1)) --seed 0 "${words[@]}"
 }
-score() { # name, suite, words...
-  local name=$1 suite=$2 more=(); shift 2
-  [ -e "$W/runs/$suite-$name/run.json" ] && more=(--resume)
-  step "run-$suite-$name" $COSIM run "$suite" --split "$SPLIT" --seed 1 --jobs "$JOBS" --policy "onnx:$W/nets/$name" \
-    --out "$W/runs/$suite-$name" "$@" "${more[@]}"
+score() { # name, suite, policy
+  local more=(); [ -e "$W/runs/$1/run.json" ] && more=(--resume)
+  step "run-$1" $COSIM run "$2" --split "$SPLIT" --seed 1 --jobs "$JOBS" --policy "$3" --out "$W/runs/$1" "${more[@]}"
 }
 
 learner=$FROM
@@ -78,7 +87,8 @@ for k in $(seq "$FIRST" $((FIRST + ROUNDS - 1))); do
     learner=$W/nets/round$k
   fi
 done
-names=(); for s in $SEEDS; do names+=("sidewalk-$s"); done
+names=()
+for number in $SEEDS; do names+=("sidewalk-$number"); done
 together seed "${names[@]}"
 if [ "${ABLATIONS:-0}" = 1 ]; then
   changes=(share-0.01 share-0.1 whole no-memory no-auxiliary no-decoys no-weather)
@@ -86,6 +96,8 @@ if [ "${ABLATIONS:-0}" = 1 ]; then
   names+=("${changes[@]}")
 fi
 for suite in unit reactive long-horizon; do
-  for name in "${names[@]}"; do score "$name" "$suite"; done
+  for name in "${names[@]}"; do score "$suite-$name" "$suite" "onnx:$W/nets/$name"; done
 done
+export POLICY=onnx:$W/nets/${names[0]}
+score reactive-black reactive "$here/scenarios/examples/black_pictures.py:Blinded"
 echo "all done"
