@@ -16,13 +16,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from cosim.core.errors import CosimError, RunError, SpecError
-from cosim.core.packed_demos import read_packed
+from cosim.core.packed_demos import FREE_RAYS, LABELLED_PEOPLE, read_packed
 from cosim.core.state import Command
 from cosim.spec.camera import CameraSpec
 from cosim.spec.demo_options import DemoOptions, recording_manifest
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER
+from cosim.spec.scenario import Suite, write_suite
 from cosim.spec.sensors import PEOPLE_ROWS, ScanSpec
 from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pictures
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
@@ -30,6 +31,7 @@ from scenarios.episodes.demonstrator import _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
 from scenarios.tools.dataset.collected import Collected
 from scenarios.tools.dataset.lerobot import Filmed, write_lerobot
+from scenarios.tools.dataset.pack import pack_raw
 from scenarios.tools.dataset.read import packed_sets, read_back, read_data_set
 from sumo_nets.city.store import SEEDS
 from tests.run_specs import record_of
@@ -231,10 +233,11 @@ def test_packed_rows_are_those_that_were_kept(
 
 
 def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
-    """Distances by ring and ray, inertial readings and people come back from the file; data sets
-    with other sensors are not packed together."""
+    """Distances by ring and ray, inertial readings, people and labels come back from the file; data
+    sets with other sensors are not packed together."""
     draws = np.random.default_rng(3)
     shapes = {"scan": (2, 8), "imu": (6,), "people": (PEOPLE_ROWS, 5)}
+    shapes |= {"near": (LABELLED_PEOPLE, 6), "free": (FREE_RAYS,), "scene": (2,)}
     sensors = {name: draws.random((7, *shape), np.float32) for name, shape in shapes.items()}
     told = {**sensors, "scan": sensors["scan"].reshape(7, -1)}
     lidar = msgspec.to_builtins(ScanSpec(rays=8, rings=2, elevation_deg=(-5.0, 5.0)))
@@ -247,6 +250,39 @@ def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
     assert (packed.meta["lidar"]["rings"], packed.meta["imu"]) == (2, "exact")
     with pytest.raises(SpecError, match=r"lidar is .* here and None there"):
         packed_sets([folder, written(tmp_path / "other", [shown(0, 3)])])
+
+
+def test_raw_demonstrations_are_packed_in_parts(
+    tmp_path: Path, demonstrations: list[Demonstration]
+) -> None:
+    """Of an unfinished collection what is there, in the order of its scenarios, by two processes as
+    by one; weathers are those of the scenarios. A folder without any is named."""
+    ways = [short_way(f"s-{k:03d}") for k in range(4)]
+    ways[1] = ways[1].in_weather("rain")
+    run = tmp_path / "raw/runs/00"
+    run.mkdir(parents=True)
+    write_suite(Suite(name="ways", version="1", scenarios=tuple(ways)), run / "scenarios.json")
+    (tmp_path / "raw/about.json").write_text(json.dumps(ABOUT))
+    with pytest.raises(RunError, match="no episode is finished: continue the collection"):
+        pack_raw([tmp_path / "raw"], tmp_path / "d.npz")
+    for way, one in zip(ways[:3], demonstrations, strict=True):
+        folder = run / "episodes" / way.id
+        folder.mkdir(parents=True)
+        (folder / "demonstration.npz").write_bytes(one.encoded())
+    parts = pack_raw([tmp_path / "raw"], tmp_path / "d.npz", part=2, jobs=2)
+    assert [(one.path.name, one.episodes, one.rows) for one in parts] == [
+        ("d-000.npz", 2, LENGTHS[0] + LENGTHS[1]),
+        ("d-001.npz", 1, LENGTHS[2]),
+    ]
+    first, second = (read_packed(one.path) for one in parts)
+    assert first.meta["weathers"] == ["clear", "rain"] and second.meta["scenarios"] == ["s-002"]
+    np.testing.assert_array_equal(second.command, demonstrations[2].command)
+    seen = np.stack([glimpse(rgb) for rgb in first.frames[LENGTHS[0] :]]).astype(float)
+    assert np.abs(seen - demonstrations[1].glimpses).mean() < 4.0
+    pack_raw([tmp_path / "raw"], tmp_path / "e.npz", (32, 24), part=9)
+    assert read_packed(tmp_path / "e-000.npz").frames.shape == (sum(LENGTHS), 24, 32, 3)
+    with pytest.raises(RunError, match="no collection of the format raw"):
+        pack_raw([tmp_path], tmp_path / "d.npz")
 
 
 def test_data_sets_that_do_not_fit_are_not_packed_together(data_set: Path, tmp_path: Path) -> None:
