@@ -120,7 +120,7 @@ def new_memory_parameters(seed: int) -> dict[str, Tensor]:
         parameters[f"{name}.weight"] = scale * torch.randn(shape, generator=draws)
         parameters[f"{name}.bias"] = torch.zeros(shape[0])
     parameters["speed.bias"] += 0.8
-    parameters["kept.bias"][MEMORY : 2 * MEMORY] += 1.0  # it begins with keeping what it has
+    parameters["kept.bias"][MEMORY : 2 * MEMORY] += 1.0  # at first the memory mostly stays
     return parameters
 
 

@@ -105,8 +105,8 @@ def session_of(graph: bytes) -> object:
 def test_a_memory_carried_from_step_to_step_is_that_of_the_whole_window(
     data: Path, keeps: bool
 ) -> None:
-    """The graph, asked once for each picture with its own memory, gives the plans of PyTorch for
-    all pictures at once; without a memory it gives them to each picture alone."""
+    """The graph, queried once for each picture with its own memory, gives the plans of PyTorch for
+    all pictures at once; without a memory each picture alone gives its plan."""
     parameters = new_memory_parameters(7)
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(examples.held_out[:1], 6)
@@ -203,7 +203,7 @@ def test_the_mirror_exchanges_left_and_right_in_labels_too(data: Path) -> None:
 
 
 def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
-    """The same step gives the same windows, another one others."""
+    """The same step gives the same windows, another step gives others."""
     examples = WindowExamples([data], BRISK, CPU)
     third, other, again = (examples.drawn(0, step, 3) for step in (3, 4, 3))
     assert all(torch.equal(value, getattr(again, name)) for name, value in vars(third).items())
@@ -238,7 +238,7 @@ def test_numbers_of_labels_are_those_of_the_simulator() -> None:
 
 
 def test_people_who_are_missing_do_not_count() -> None:
-    """Where nobody is, only presence is trained; where one is, also the place."""
+    """Without a person only presence is trained; with one also the place."""
     labels = torch.zeros(1, LABELLED_PEOPLE, 6)
     near = torch.zeros(1, 4, 6, requires_grad=True)
     near_loss(near, labels).backward()
