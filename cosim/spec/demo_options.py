@@ -38,7 +38,8 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     learner: policy that drives in this time; "" for the expert's command, slowed and turned at
         random.
     format: form of the data set: LeRobot, a ROS 2 bag of each episode, or raw demonstrations.
-    unsolved: also record episodes that the expert fails, up to the first reset of the robot.
+    unsolved: also record episodes that the expert fails, up to the first reset of the robot, raw
+        ones to their end.
     scan, imu, people: sensors that are recorded with the pictures, as in a manifest.
     labels: whether labels of the simulator are stored, for auxiliary heads.
     astray: share of the episodes that begin aside of the route, turned away from it.

@@ -26,7 +26,12 @@ from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Suite, write_suite
 from cosim.spec.sensors import PEOPLE_ROWS, ScanSpec
 from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pictures
-from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
+from scenarios.episodes.demonstration import (
+    Demonstration,
+    drives_ahead,
+    glimpse,
+    waypoints_ahead,
+)
 from scenarios.episodes.demonstrator import _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
 from scenarios.tools.dataset.collected import Collected
@@ -252,11 +257,28 @@ def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
         packed_sets([folder, written(tmp_path / "other", [shown(0, 3)])])
 
 
+def test_waypoints_of_a_drive_end_where_the_robot_is_put_back() -> None:
+    """It drives east at 2 m/s, is put back by 4 m after tick 9, rests for a tick and drives on: no
+    waypoint leads from one drive to the other, and the second ones are those after it."""
+    x_m = [0.1 * k for k in range(11)] + [-3.0 + 0.1 * k for k in range(10)]
+    pose = np.array([[x, 0.0, 0.0] for x in x_m])
+    ticks, begins = np.array([0, 4, 8, 10, 14]), np.array([True, False, False, True, False])
+    command, calm = np.tile([2.0, 0.0], (5, 1)), np.zeros(5, bool)
+    waypoints, driven = drives_ahead(
+        pose, np.array([9]), ticks, begins, command, calm, 3, 4, TICK_S
+    )
+    assert driven.tolist() == [2, 1, 0, 2, 1]
+    np.testing.assert_allclose(waypoints[:3, :, 0], np.tile([0.4, 0.8, 1.2], (3, 1)), atol=1e-5)
+    np.testing.assert_allclose(waypoints[3, :2, 0], [0.3, 0.7], atol=1e-5)
+    plain = waypoints_ahead(pose[:11], ticks[:3], command[:3], calm[:3], 3, 4, TICK_S)
+    np.testing.assert_array_equal(waypoints[:3], plain[0])
+
+
 def test_raw_demonstrations_are_packed_in_parts(
     tmp_path: Path, demonstrations: list[Demonstration]
 ) -> None:
     """Of an unfinished collection what is there, in the order of its scenarios, by two processes as
-    by one; weathers are those of the scenarios. A folder without any is named."""
+    by one; one that was put back is two episodes; weathers are those of the scenarios. A folder without any is named."""
     ways = [short_way(f"s-{k:03d}") for k in range(4)]
     ways[1] = ways[1].in_weather("rain")
     run = tmp_path / "raw/runs/00"
@@ -265,7 +287,10 @@ def test_raw_demonstrations_are_packed_in_parts(
     (tmp_path / "raw/about.json").write_text(json.dumps(ABOUT))
     with pytest.raises(RunError, match="no episode is finished: continue the collection"):
         pack_raw([tmp_path / "raw"], tmp_path / "d.npz")
-    for way, one in zip(ways[:3], demonstrations, strict=True):
+    begins = np.zeros(LENGTHS[1], bool)
+    begins[[0, 8]] = True
+    stored = [demonstrations[0], replace(demonstrations[1], begins=begins), demonstrations[2]]
+    for way, one in zip(ways[:3], stored, strict=True):
         folder = run / "episodes" / way.id
         folder.mkdir(parents=True)
         (folder / "demonstration.npz").write_bytes(one.encoded())
@@ -275,8 +300,12 @@ def test_raw_demonstrations_are_packed_in_parts(
         ("d-001.npz", 1, LENGTHS[2]),
     ]
     first, second = (read_packed(one.path) for one in parts)
-    assert first.meta["weathers"] == ["clear", "rain"] and second.meta["scenarios"] == ["s-002"]
+    assert first.meta["weathers"] == ["clear", "rain", "rain"] and second.meta["scenarios"] == [
+        "s-002"
+    ]
     np.testing.assert_array_equal(second.command, demonstrations[2].command)
+    assert np.bincount(first.episode).tolist() == [LENGTHS[0], 8, LENGTHS[1] - 8]
+    assert first.frame[LENGTHS[0] + 8] == 0
     seen = np.stack([glimpse(rgb) for rgb in first.frames[LENGTHS[0] :]]).astype(float)
     assert np.abs(seen - demonstrations[1].glimpses).mean() < 4.0
     pack_raw([tmp_path / "raw"], tmp_path / "e.npz", (32, 24), part=9)

@@ -1,6 +1,7 @@
 """Pack collections of the format raw, in parts, by several processes.
 
-A collection may be unfinished: its finished episodes are packed.
+A collection may be unfinished: its finished episodes are packed. An episode in which the robot was
+put back becomes several ones, which begin there.
 """
 
 from __future__ import annotations
@@ -115,10 +116,12 @@ def _write(
     """Write a part; return the number of its rows."""
     path, stored = part
     demos = [Demonstration.decoded(one.path.read_bytes(), one.path) for one in stored]
-    lengths = [len(demo) for demo in demos]
+    lengths = [length for demo in demos for length in demo.lengths]
     sources = dict.fromkeys(one.source for one in stored)
     listed = [
-        {"scenario": s.scenario, "structure": s.structure, "weather": s.weather} for s in stored
+        {"scenario": one.scenario, "structure": one.structure, "weather": one.weather}
+        for one, demo in zip(stored, demos, strict=True)
+        for _ in demo.lengths
     ]
 
     def joined(name: str) -> NDArray[Any]:
@@ -134,7 +137,7 @@ def _write(
         waypoints=joined("waypoints"),
         driven=joined("driven").astype(np.int32),
         disturbed=joined("disturbed").astype(bool),
-        episode=np.repeat(np.arange(len(demos), dtype=np.int32), lengths),
+        episode=np.repeat(np.arange(len(lengths), dtype=np.int32), lengths),
         frame=np.concatenate([np.arange(length, dtype=np.int32) for length in lengths]),
         meta=packed_meta([abouts[number] for number in sources], listed),
         **{name: joined(name) for name in extras},
