@@ -12,7 +12,7 @@ import typer
 from cosim.cli.console import notice
 from cosim.cli.options import LEARN
 from cosim.core.errors import SOME_CRASHED, MachineError
-from cosim.learning.settings import PLANNED_STEPS, TO_INSTALL, Training
+from cosim.learning.settings import BATCHES, PLANNED_STEPS, TO_INSTALL, Training
 
 train_app = typer.Typer()
 
@@ -21,7 +21,8 @@ train_app = typer.Typer()
     "train",
     rich_help_panel=LEARN,
     epilog="Examples:  \n`cosim train unit.npz -o small --minutes 9 --resume`  \n"
-    "`cosim train reactive.npz unit.npz -o mine --from small --steps 6000 --rate 3e-4 --seed 1`",
+    "`cosim train reactive.npz unit.npz -o mine --from small --steps 6000 --rate 3e-4 --seed 1`  \n"
+    "`cosim train demos-*.npz -o sidewalk --network sidewalk --minutes 9 --resume`",
 )
 def train_command(
     data: Annotated[
@@ -46,7 +47,22 @@ def train_command(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of initial parameters, batches and held-out episodes.")
     ] = 0,
-    batch: Annotated[int, typer.Option(min=1, help="Examples per step.")] = 256,
+    network: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="small, which sees four pictures, or sidewalk, which has a memory and auxiliary "
+            "heads.",
+        ),
+    ] = "small",
+    batch: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Examples per step, of sidewalk windows of 8 s.",
+            show_default=", ".join(f"{size} of {name}" for name, size in BATCHES.items()),
+        ),
+    ] = None,
     rate: Annotated[float, typer.Option(help="Peak learning rate; it then falls to 0.")] = 1e-3,
     device: Annotated[
         str, typer.Option(help="cpu, cuda, cuda:1; by default a GPU if there is one.")
@@ -58,12 +74,33 @@ def train_command(
             show_default="no limit",
         ),
     ] = math.inf,
-    name: Annotated[str, typer.Option(help="The policy's name in records and tables.")] = "small",
+    name: Annotated[
+        str,
+        typer.Option(
+            help="The policy's name in records and tables.", show_default="that of the network"
+        ),
+    ] = "",
+    share: Annotated[
+        float,
+        typer.Option(help="Ablation of sidewalk: share of the training episodes.", max=1.0),
+    ] = 1.0,
+    no_memory: Annotated[
+        bool, typer.Option("--no-memory", help="Ablation of sidewalk: no memory.")
+    ] = False,
+    no_auxiliary: Annotated[
+        bool, typer.Option("--no-auxiliary", help="Ablation of sidewalk: no auxiliary heads.")
+    ] = False,
+    no_decoys: Annotated[
+        bool, typer.Option("--no-decoys", help="Ablation of sidewalk: no decoys.")
+    ] = False,
+    no_weather: Annotated[
+        bool, typer.Option("--no-weather", help="Ablation of sidewalk: clear weather alone.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the training in the folder.")
     ] = False,
 ) -> None:
-    """Train a small camera policy on demonstrations, as a bundle for --policy onnx:FOLDER.
+    """Train a camera policy on demonstrations, as a bundle for --policy onnx:FOLDER.
 
     A checkpoint is saved every minute. A finished training continues with `--resume` and larger
     `--steps`.
@@ -85,6 +122,12 @@ def train_command(
         begin=begin,
         minutes=minutes,
         name=name,
+        network=network,
+        share=share,
+        memory=not no_memory,
+        auxiliary=not no_auxiliary,
+        decoys=not no_decoys,
+        weather=not no_weather,
     )
     if not train_and_report(data, out, training, resume, notice):
         raise typer.Exit(SOME_CRASHED)

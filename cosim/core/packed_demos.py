@@ -17,11 +17,15 @@ one for each picture, ordered by episode and time:
 | scan      | (N, rings, rays) float32 | distances of the lidar, m; its range without a return     |
 | imu       | (N, 6) float32           | angular speed rad/s and specific force m/s2: x, y, z each |
 | people    | (N, 32, 5) float32       | nearest people: 1, x, y, vx, vy, the robot's axes; else 0 |
+| near      | (N, 8, 6) float32        | label: people ahead, see `scenarios/episodes/labels.py`   |
+| free      | (N, 25) float32          | label: free distances, m, from left to right              |
+| scene     | (N, 2) float32           | label: signal and event ahead                             |
 | meta      | () str                   | JSON, see `Packed.meta`                                   |
 
-The file has scan, imu and people only if the data set has them. Waypoints are metres in the robot's
-frame at the picture. Those after `driven` extrapolate the expert's command, because the episode
-ended or the drive was disturbed. A picture is taken frame / rate_hz seconds after the episode's
+The file has scan, imu, people and the labels only if the data set has them. Labels are the
+simulator's truth, for training alone. Waypoints are metres in the robot's frame at the picture.
+Those after `driven` extrapolate the expert's command, because the episode ended or the drive was
+disturbed. A picture is taken frame / rate_hz seconds after the episode's
 start.
 """
 
@@ -46,7 +50,14 @@ _FORMAT: Final = 1
 
 
 SENSORS: Final = ("scan", "imu", "people")
-"""Names of the arrays that a file may lack."""
+"""Names of the arrays of sensors, which a file may lack."""
+LABELS: Final = ("near", "free", "scene")
+"""Names of the arrays of labels, which a file may lack."""
+LABELLED_PEOPLE: Final = 8
+"""Number of people in a row of `near`."""
+FREE_RAYS: Final = 25
+"""Number of bearings in a row of `free`."""
+EXTRAS: Final = (*SENSORS, *LABELS)
 
 
 def _nothing() -> NDArray[np.float32]:
@@ -58,10 +69,11 @@ class Packed:
     """Demonstrations in memory, with the arrays of the file.
 
     scan, imu, people: sensors, empty (0, 0) arrays without them.
+    near, free, scene: labels, empty (0, 0) arrays without them.
     meta: rate_hz and waypoint_s; goal, the name of its protocol or "none"; camera, as in
         `CameraSpec`; robot; lidar, imu and people, the settings of the sensors. policy, noise and
-        learner are lists with one value for each data set. structures and scenarios are lists with
-        the structure and the id of each episode's scenario.
+        learner are lists with one value for each data set. structures, scenarios and weathers are
+        lists with the structure, the id and the weather of each episode's scenario.
     """
 
     frames: NDArray[np.uint8]
@@ -77,6 +89,9 @@ class Packed:
     scan: NDArray[np.float32] = field(default_factory=_nothing)
     imu: NDArray[np.float32] = field(default_factory=_nothing)
     people: NDArray[np.float32] = field(default_factory=_nothing)
+    near: NDArray[np.float32] = field(default_factory=_nothing)
+    free: NDArray[np.float32] = field(default_factory=_nothing)
+    scene: NDArray[np.float32] = field(default_factory=_nothing)
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -107,7 +122,7 @@ class Packed:
         arrays = {
             one.name: getattr(self, one.name)
             for one in fields(self)
-            if one.name != "meta" and (one.name not in SENSORS or getattr(self, one.name).size)
+            if one.name != "meta" and (one.name not in EXTRAS or getattr(self, one.name).size)
         }
         meta = json.dumps({"format": _FORMAT, **self.meta}, sort_keys=True)
         try:
@@ -130,21 +145,37 @@ def packed_digest(path: Path) -> str:
     return hashlib.blake2b(repr(checksums).encode(), digest_size=8).hexdigest()
 
 
-def read_packed(path: Path) -> Packed:
-    """Load the demonstrations of a file. Raises RunError."""
+def read_packed(path: Path, pictures: bool = True) -> Packed:
+    """Load the demonstrations of a file. Raises RunError.
+
+    pictures: False for empty frames (N, 0, 0, 3); see `read_frames`.
+    """
     try:
         with np.load(path, allow_pickle=False) as held:
             meta = json.loads(str(held["meta"]))
             arrays = {
                 one.name: held[one.name]
                 for one in fields(Packed)
-                if one.name != "meta" and (one.name not in SENSORS or one.name in held)
+                if one.name not in ("meta", "frames")
+                and (one.name not in EXTRAS or one.name in held)
             }
+            rows = len(arrays["episode"])
+            arrays["frames"] = held["frames"] if pictures else np.zeros((rows, 0, 0, 3), np.uint8)
         if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
             raise ValueError("its arrays are of different lengths, or of another format")
     except (OSError, *NPZ_ERRORS) as error:
         raise _unreadable(path, error) from error
     return Packed(**arrays, meta=meta)
+
+
+def read_frames(path: Path) -> NDArray[np.uint8]:
+    """Load the pictures of a file alone. Raises RunError."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            frames: NDArray[np.uint8] = held["frames"]
+            return frames
+    except (OSError, *NPZ_ERRORS) as error:
+        raise _unreadable(path, error) from error
 
 
 def _unreadable(path: Path, error: Exception) -> RunError:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from cosim.core.errors import SOME_CRASHED, CosimError
-from cosim.learning.settings import PLANNED_STEPS, Training
+from cosim.learning.settings import BATCHES, PLANNED_STEPS, Training
 from cosim.learning.training import train_and_report
 
 
@@ -15,7 +15,7 @@ def _main() -> None:
     """Parse the command line and train."""
     parser = argparse.ArgumentParser(
         prog="python -m cosim.learning",
-        description="Train a small policy on packed demonstrations.",
+        description="Train a policy on packed demonstrations.",
     )
     default = Training()
     parser.add_argument(
@@ -27,11 +27,15 @@ def _main() -> None:
         "--steps", type=int, help=f"in all; by default {PLANNED_STEPS}, or as planned before"
     )
     parser.add_argument("--seed", type=int, default=default.seed)
-    parser.add_argument("--batch", type=int, default=default.batch)
+    parser.add_argument("--network", default=default.network, choices=list(BATCHES))
+    parser.add_argument("--batch", type=int, help=f"by default {dict(BATCHES)}")
     parser.add_argument("--rate", type=float, default=default.rate)
     parser.add_argument("--device", default=default.device)
     parser.add_argument("--minutes", type=float, default=default.minutes, help="stop after so long")
-    parser.add_argument("--name", default=default.name)
+    parser.add_argument("--name", default=default.name, help="by default that of the network")
+    parser.add_argument("--share", type=float, default=default.share, help="of training episodes")
+    for ablated in ("memory", "auxiliary", "decoys", "weather"):
+        parser.add_argument(f"--no-{ablated}", dest=ablated, action="store_false")
     parser.add_argument("--resume", action="store_true", help="continue the training in the folder")
     words = vars(parser.parse_args())
     data, out, resume = words.pop("data"), words.pop("out"), words.pop("resume")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -14,22 +15,11 @@ import torch
 
 from cosim.core.errors import RunError
 from cosim.core.files import write_atomic
-from cosim.learning.examples import Examples
-from cosim.learning.graph import INPUTS, PLAN, build_graph, run_graph
-from cosim.learning.network import (
-    GOAL_MOST_M,
-    GOAL_UNIT_M,
-    HEIGHT_PX,
-    HISTORY,
-    PICTURE_INTERVAL,
-    SPEED_MEAN_MPS,
-    SPEED_UNIT_MPS,
-    TURN_UNIT_RADPS,
-    WIDTH_PX,
-    Parameters,
-    forward,
-    plan,
-)
+from cosim.learning.graph import PLAN, run_graph
+from cosim.learning.kind import ExampleSet
+from cosim.learning.network import Parameters
+from cosim.learning.networks import NETWORKS
+from cosim.learning.settings import Training
 
 MODEL: Final = "model.onnx"
 _TOLERANCE: Final = 1e-4
@@ -56,29 +46,32 @@ def bundle_facts(folder: Path) -> BundleFacts:
 
 
 def write_bundle(
-    folder: Path, parameters: Parameters, examples: Examples, name: str, source: str
+    folder: Path, parameters: Parameters, examples: ExampleSet, training: Training, source: str
 ) -> None:
     """Write a bundle with the first held-out example.
 
     source: description of the training data
 
-    Raises RunError if the graph and the network give different or non-finite plans.
+    Raises RunError if the graph and the network give different or non-finite answers.
     """
-    graph = build_graph(parameters)
-    batch = examples.rows(examples.held_out[:1])
-    inputs = {key: getattr(batch, key).cpu().numpy().astype(np.float32) for key in INPUTS}
+    network = NETWORKS[training.network]
+    graph = network.graph(parameters, training)
+    inputs = examples.first_inputs()
     on_cpu = {key: value.cpu() for key, value in parameters.items()}
     with torch.no_grad():
-        expected = plan(forward(on_cpu, *(torch.from_numpy(inputs[key]) for key in INPUTS))).numpy()
-    error = float(np.abs(run_graph(graph, inputs) - expected).max())
+        expected = network.answers(on_cpu, inputs, training)
+    answers = run_graph(graph, inputs, list(expected))
+    error = max(float(np.abs(answers[name] - expected[name]).max()) for name in expected)
     if not error <= _TOLERANCE:
         raise RunError(
-            f"{folder}: the graph answers {error:g} otherwise than the network: train anew, at "
+            f"{folder}: the graph answers {error:g} otherwise than the network: train again, at "
             f"a lower --rate"
         )
     example = io.BytesIO()
-    np.savez_compressed(example, **{**inputs, f"expected.{PLAN}": expected})
-    manifest = {**manifest_of(name, examples.meta, source), "files": {MODEL: _facts(graph)}}
+    arrays: dict[str, Any] = {f"expected.{name}": value for name, value in expected.items()}
+    np.savez_compressed(example, **arrays, **dict[str, Any](inputs))
+    manifest = manifest_of(training.called, examples.meta, source, network.inputs)
+    manifest["files"] = {MODEL: _facts(graph)}
     write_atomic(folder / MODEL, graph)
     write_atomic(folder / "example.npz", example.getvalue())
     write_atomic(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
@@ -89,7 +82,7 @@ def _facts(data: bytes) -> dict[str, Any]:
     return {"bytes": len(data), "blake2b": hashlib.blake2b(data, digest_size=32).hexdigest()}
 
 
-def source_of(meta: dict[str, Any], seed: int, begun: BundleFacts | None = None) -> str:
+def source_of(meta: Mapping[str, Any], seed: int, begun: BundleFacts | None = None) -> str:
     """Describe the training data by the metadata of the demonstrations."""
     experts, learners = (
         ", ".join(dict.fromkeys(filter(None, meta[name]))) for name in ("policy", "learner")
@@ -100,8 +93,10 @@ def source_of(meta: dict[str, Any], seed: int, begun: BundleFacts | None = None)
     )
 
 
-def manifest_of(name: str, meta: dict[str, Any], source: str) -> dict[str, Any]:
-    """Return the manifest of the graph, from the metadata of the demonstrations."""
+def manifest_of(
+    name: str, meta: Mapping[str, Any], source: str, inputs: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the manifest of a graph, from the metadata of the demonstrations."""
     camera = {
         field: meta["camera"].get(field)
         for field in ("width", "height", "fov_deg", "mount", "crop")
@@ -115,27 +110,7 @@ def manifest_of(name: str, meta: dict[str, Any], source: str) -> dict[str, Any]:
         "rate_hz": meta["rate_hz"],
         "goal": meta["goal"],
         "camera": camera,
-        "inputs": {
-            "pictures": {
-                "what": "picture",
-                "frames": HISTORY,
-                "every": PICTURE_INTERVAL,
-                "size": [WIDTH_PX, HEIGHT_PX],
-                "layout": "N(TC)HW",
-            },
-            "goal": {
-                "what": "goal_point",
-                "values": ["x", "y"],
-                "unit_m": GOAL_UNIT_M,
-                "most_m": GOAL_MOST_M,
-            },
-            "speeds": {
-                "what": "speeds",
-                "values": ["v", "w"],
-                "mean": [SPEED_MEAN_MPS, 0.0],
-                "std": [SPEED_UNIT_MPS, TURN_UNIT_RADPS],
-            },
-        },
+        "inputs": {name: dict(one) for name, one in inputs.items()},
         "output": {
             "what": "waypoints",
             "name": PLAN,

@@ -31,7 +31,10 @@ def draw_curve(folder: Path) -> None:
     names, *rows = [line.split(",") for line in (folder / CURVE).read_text().splitlines()]
     columns = {name: [float(row[i]) for row in rows] for i, name in enumerate(names)}
     steps = columns.pop("step")
-    figure, axes = plt.subplots(2, 5, figsize=(15, 5), layout="constrained")
+    lines = -(-len(columns) // 5)
+    figure, axes = plt.subplots(lines, 5, figsize=(15, 2.5 * lines), layout="constrained")
+    for axis in axes.flat[len(columns) :]:
+        axis.set_axis_off()
     for axis, (name, values) in zip(axes.flat, columns.items(), strict=False):
         axis.plot(steps, values, marker="o" if len(steps) == 1 else "")
         axis.set_title(name.replace("_", " "))

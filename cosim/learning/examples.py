@@ -36,10 +36,13 @@ HELD_OUT: Final = 0.1
 """Share of episodes that are held out."""
 STOPS_MPS: Final = 0.3
 """Speed below which a command is a stop and a robot is at rest."""
-_DARK = 0.6
-_BRIGHT = 1.5
-_TINT: Final = 0.12
-_SHIFT_PX: Final = 3
+DARK: Final = 0.6
+BRIGHT: Final = 1.5
+"""Least and largest factor of the brightness of augmented pictures."""
+TINT: Final = 0.12
+"""Largest logarithm of the factor of one colour."""
+SHIFT_PX: Final = 3
+"""Largest shift of augmented pictures."""
 _HIDDEN_SPEEDS: Final = 0.8
 """Share of rows whose speeds are hidden.
 
@@ -48,13 +51,13 @@ when it approaches a person fast.
 """
 _FROZEN: Final = 0.5
 """Share of rows whose older pictures equal the newest, as at the start of an episode."""
-_CHANGE_SHARE: Final = 0.3
+CHANGE_SHARE: Final = 0.3
 """Share of a batch in which the expert stops a moving robot or starts a resting one.
 
 Only one row in fifty is such a change; trained on the others alone, a network keeps its speed.
 """
 _ROUNDING: Final = 1e-4
-_LISTED: Final = ("policy", "learner")
+LISTED: Final = ("policy", "learner")
 _SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal", "robot")
 
 
@@ -98,7 +101,7 @@ class Examples:
                         f"in {paths[0]}: train on demonstrations that were collected alike"
                     )
         self.meta |= {
-            name: [value for one in packed for value in one.meta.get(name, [])] for name in _LISTED
+            name: [value for one in packed for value in one.meta.get(name, [])] for name in LISTED
         }
         first_rows = np.cumsum([0, *(len(one) for one in packed)])
         first_episodes = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
@@ -148,19 +151,19 @@ class Examples:
     def drawn(self, seed: int, step: int, size: int) -> Batch:
         """Draw the augmented batch of a step: a function of seed and step."""
         draws = np.random.default_rng([seed, 0xBA7C4, step])
-        change = draws.random(size) < _CHANGE_SHARE
+        change = draws.random(size) < CHANGE_SHARE
         batch = self.rows(
             np.where(change, draws.choice(self._changes, size), draws.choice(self.learned, size))
         )
         mirrored = torch.from_numpy(draws.random(size) < 0.5).to(self._device)
-        light = draws.uniform(np.log(_DARK), np.log(_BRIGHT), (size, 1)) + draws.uniform(
-            -_TINT, _TINT, (size, 3)
+        light = draws.uniform(np.log(DARK), np.log(BRIGHT), (size, 1)) + draws.uniform(
+            -TINT, TINT, (size, 3)
         )
         gain = np.tile(np.exp(light), (1, HISTORY)).astype(np.float32)[:, :, None, None]
         visible = torch.from_numpy((draws.random(size) >= _HIDDEN_SPEEDS).astype(np.float32)).to(
             self._device
         )
-        off_px = torch.from_numpy(draws.integers(0, 2 * _SHIFT_PX + 1, (2, size, 1, 1))).to(
+        off_px = torch.from_numpy(draws.integers(0, 2 * SHIFT_PX + 1, (2, size, 1, 1))).to(
             self._device
         )
         newest = (
@@ -170,7 +173,7 @@ class Examples:
         )
         frozen = torch.from_numpy(draws.random(size) < _FROZEN).to(self._device)
         pictures = torch.where(frozen[:, None, None, None], newest, batch.pictures)
-        lit = (_shifted(pictures, off_px) * torch.from_numpy(gain).to(self._device)).clamp(max=1.0)
+        lit = (shifted(pictures, off_px) * torch.from_numpy(gain).to(self._device)).clamp(max=1.0)
         augmented = Batch(
             lit,
             batch.goal,
@@ -183,19 +186,24 @@ class Examples:
         )
         return _select(mirrored, mirror(augmented), augmented)
 
+    def first_inputs(self) -> dict[str, NDArray[np.float32]]:
+        """Return the inputs of the graph at the first held-out row."""
+        batch = self.rows(self.held_out[:1])
+        return {
+            name: getattr(batch, name).cpu().numpy().astype(np.float32)
+            for name in ("pictures", "goal", "speeds")
+        }
+
     def rows(self, rows: NDArray[np.int64]) -> Batch:
         """Return the examples at some rows, without augmentation."""
         at = torch.from_numpy(rows).to(self._device)
         frames = self._frames[self._history[at]]  # (B, HISTORY, H, W, 3)
         pictures = frames.permute(0, 1, 4, 2, 3).flatten(1, 2).float() / 255.0
-        state, command, goal = self._state[at], self._command[at], self._goal[at]
-        mean = torch.tensor([SPEED_MEAN_MPS, 0.0], device=self._device)
-        unit = torch.tensor([SPEED_UNIT_MPS, TURN_UNIT_RADPS], device=self._device)
-        far = goal.norm(dim=1, keepdim=True)
+        command = self._command[at]
         return Batch(
             pictures=pictures,
-            goal=goal * (GOAL_MOST_M / far.clamp(min=GOAL_MOST_M)) / GOAL_UNIT_M,
-            speeds=(state - mean) / unit,
+            goal=scaled_goal(self._goal[at]),
+            speeds=scaled_speeds(self._state[at]),
             speed=command[:, 0] / CRUISE_MPS,
             turn=command[:, 1],
             stop=(command[:, 0] < STOPS_MPS).float(),
@@ -204,6 +212,19 @@ class Examples:
                 torch.arange(WAYPOINTS, device=self._device) < self._driven[at][:, None]
             ).float(),
         )
+
+
+def scaled_goal(goal: Tensor) -> Tensor:
+    """Return goals (..., 2) in m as the network's input."""
+    far = goal.norm(dim=-1, keepdim=True)
+    return goal * (GOAL_MOST_M / far.clamp(min=GOAL_MOST_M)) / GOAL_UNIT_M
+
+
+def scaled_speeds(state: Tensor) -> Tensor:
+    """Return speeds (..., 2) in m/s and rad/s as the network's input."""
+    mean = torch.tensor([SPEED_MEAN_MPS, 0.0], device=state.device)
+    unit = torch.tensor([SPEED_UNIT_MPS, TURN_UNIT_RADPS], device=state.device)
+    return (state - mean) / unit
 
 
 def mirror(batch: Batch) -> Batch:
@@ -221,18 +242,18 @@ def mirror(batch: Batch) -> Batch:
     )
 
 
-def _shifted(pictures: Tensor, off_px: Tensor) -> Tensor:
-    """Shift pictures, repeating their edge.
+def shifted(pictures: Tensor, off_px: Tensor) -> Tensor:
+    """Shift pictures (B, C, H, W), repeating their edge.
 
-    off_px: (2, B, 1, 1) down and right, from 0 to 2 _SHIFT_PX; _SHIFT_PX is no shift
+    off_px: (2, B, 1, 1) down and right, from 0 to 2 SHIFT_PX; SHIFT_PX is no shift
     """
     count, _, high, wide = pictures.shape
     one = torch.arange(count, device=pictures.device).view(-1, 1, 1)
-    row = (torch.arange(high, device=pictures.device).view(1, -1, 1) + off_px[0] - _SHIFT_PX).clamp(
+    row = (torch.arange(high, device=pictures.device).view(1, -1, 1) + off_px[0] - SHIFT_PX).clamp(
         0, high - 1
     )
     column = (
-        torch.arange(wide, device=pictures.device).view(1, 1, -1) + off_px[1] - _SHIFT_PX
+        torch.arange(wide, device=pictures.device).view(1, 1, -1) + off_px[1] - SHIFT_PX
     ).clamp(0, wide - 1)
     return pictures.permute(0, 2, 3, 1)[one, row, column].permute(0, 3, 1, 2)
 

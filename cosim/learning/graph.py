@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,9 +22,10 @@ from cosim.learning.network import (
     WAYPOINTS,
     WIDTH_PX,
     Parameters,
-    new_parameters,
     turns_radps,
 )
+
+Shapes = Mapping[str, tuple[int, ...]]
 
 INPUTS: Final = {
     "pictures": (1, 3 * HISTORY, HEIGHT_PX, WIDTH_PX),
@@ -37,10 +38,11 @@ _IR: Final = 8
 """ONNX IR version, old enough for common runtimes."""
 
 
-class _Writer:
+class GraphWriter:
     """Builder of graph nodes, each named by its output."""
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, strides: Mapping[str, int]) -> None:
+        self._strides = strides
         self.nodes: list[Any] = []
         self.constants = [
             numpy_helper.from_array(value.detach().cpu().float().numpy(), name)
@@ -58,7 +60,9 @@ class _Writer:
 
     def conv(self, x: str, name: str, size: int = 3) -> str:
         inputs = [x, f"{name}.weight", f"{name}.bias"]
-        return self.add("Conv", inputs, strides=[STRIDES.get(name, 1)] * 2, pads=[size // 2] * 4)
+        return self.add(
+            "Conv", inputs, strides=[self._strides.get(name, 1)] * 2, pads=[size // 2] * 4
+        )
 
     def linear(self, x: str, name: str) -> str:
         return self.add("Gemm", [x, f"{name}.weight", f"{name}.bias"], transB=1)
@@ -66,10 +70,48 @@ class _Writer:
     def relu(self, x: str) -> str:
         return self.add("Relu", [x])
 
+    def split(self, x: str, sides: str, outputs: Sequence[str]) -> None:
+        """Add a split of the second axis. sides: name of the constant with its lengths."""
+        self.nodes.append(helper.make_node("Split", [x, sides], list(outputs), axis=1))
+
+    def plan(self, joined: str) -> None:
+        """Add the heads of the plan, as in `network.plan`, and the output PLAN."""
+        sharp = self.add(
+            "Mul", [self.linear(joined, "turn"), self.constant("sharpness", SHARPNESS)]
+        )
+        turns = self.constant("turns", turns_radps().reshape(-1, 1).numpy())
+        turn = self.add("MatMul", [self.add("Softmax", [sharp], axis=1), turns])
+        fast = self.relu(self.linear(joined, "speed"))
+        speed = self.add("Mul", [fast, self.constant("cruise", CRUISE_MPS)])
+        both = self.add("Concat", [speed, turn], axis=1)
+        tiled = self.add("Tile", [both, self.constant("times", [1, WAYPOINTS], np.int64)])
+        shape = self.constant("rows", [1, WAYPOINTS, 2], np.int64)
+        ways = self.add("Reshape", [self.linear(joined, "way"), shape])
+        rows = self.add("Concat", [ways, self.add("Reshape", [tiled, shape])], axis=2)
+        stops = self.add("Greater", [self.linear(joined, "stop"), self.constant("even", 0.0)])
+        goes = self.add("Cast", [self.add("Not", [stops])], to=TensorProto.FLOAT)
+        self.add("Mul", [rows, goes], PLAN)
+
+    def finished(self, name: str, inputs: Shapes, outputs: Shapes) -> bytes:
+        """Return the graph's bytes after a check. inputs, outputs: shapes by name."""
+
+        def ports(shapes: Shapes) -> list[Any]:
+            return [
+                helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+                for name, shape in shapes.items()
+            ]
+
+        graph = helper.make_graph(self.nodes, name, ports(inputs), ports(outputs), self.constants)
+        model = helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR
+        )
+        onnx.checker.check_model(model, full_check=True)
+        return bytes(model.SerializeToString())
+
 
 def build_graph(parameters: Parameters) -> bytes:
     """Build the graph for batches of one, equal to `network.answers` and `network.plan`."""
-    g = _Writer(parameters)
+    g = GraphWriter(parameters, STRIDES)
     x = g.add(
         "Mul", [g.add("Sub", ["pictures", g.constant("grey", 0.5)]), g.constant("contrast", 4.0)]
     )
@@ -83,42 +125,17 @@ def build_graph(parameters: Parameters) -> bytes:
     inputs = g.relu(g.linear(g.add("Concat", ["goal", "speeds"], axis=1), "told"))
     joined = g.relu(g.linear(g.add("Concat", [image, inputs], axis=1), "joined"))
 
-    sharp = g.add("Mul", [g.linear(joined, "turn"), g.constant("sharpness", SHARPNESS)])
-    turn = g.add(
-        "MatMul",
-        [
-            g.add("Softmax", [sharp], axis=1),
-            g.constant("turns", turns_radps().reshape(-1, 1).numpy()),
-        ],
-    )
-    speed = g.add("Mul", [g.relu(g.linear(joined, "speed")), g.constant("cruise", CRUISE_MPS)])
-    both = g.add("Concat", [speed, turn], axis=1)
-    tiled = g.add("Tile", [both, g.constant("times", [1, WAYPOINTS], np.int64)])
-    shape = g.constant("rows", [1, WAYPOINTS, 2], np.int64)
-    ways = g.add("Reshape", [g.linear(joined, "way"), shape])
-    rows = g.add("Concat", [ways, g.add("Reshape", [tiled, shape])], axis=2)
-    stops = g.add("Greater", [g.linear(joined, "stop"), g.constant("even", 0.0)])
-    goes = g.add("Cast", [g.add("Not", [stops])], to=TensorProto.FLOAT)
-    g.add("Mul", [rows, goes], PLAN)
-
-    floats = TensorProto.FLOAT
-    graph = helper.make_graph(
-        g.nodes,
-        "small",
-        [helper.make_tensor_value_info(name, floats, shape) for name, shape in INPUTS.items()],
-        [helper.make_tensor_value_info(PLAN, floats, (1, WAYPOINTS, 4))],
-        g.constants,
-    )
-    model = helper.make_model(
-        graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return bytes(model.SerializeToString())
+    g.plan(joined)
+    return g.finished("small", INPUTS, {PLAN: (1, WAYPOINTS, 4)})
 
 
-def load_parameters(path: Path) -> dict[str, torch.Tensor]:
-    """Load the parameters from a graph written by `build_graph`. Raises RunError for any other."""
-    wanted = new_parameters(0)
+def load_parameters(path: Path, wanted: Parameters) -> dict[str, torch.Tensor]:
+    """Load the parameters from the graph of a bundle.
+
+    wanted: parameters of these names and shapes
+
+    Raises RunError for a graph without them.
+    """
     try:
         arrays = {one.name: numpy_helper.to_array(one) for one in onnx.load(path).graph.initializer}
     except OSError as error:
@@ -132,15 +149,21 @@ def load_parameters(path: Path) -> dict[str, torch.Tensor]:
             problem = "is not there" if shape is None else f"has the shape {shape}"
             raise RunError(
                 f"{path}: {name} {problem}, and is wanted as {tuple(like.shape)}: train on from a "
-                "bundle that this version of cosim train made"
+                "bundle of the same --network that this version of cosim train made"
             )
         found[name] = torch.from_numpy(np.array(arrays[name], np.float32))
     return found
 
 
-def run_graph(graph: bytes, inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Return the plan of the graph, computed by onnx's reference evaluator."""
+def run_graph(
+    graph: bytes, inputs: Mapping[str, NDArray[np.float32]], outputs: Sequence[str]
+) -> dict[str, NDArray[np.float32]]:
+    """Return outputs of the graph by name, computed by onnx's reference evaluator."""
     from onnx.reference import ReferenceEvaluator
 
-    (plan,) = ReferenceEvaluator(onnx.load_model_from_string(graph)).run([PLAN], inputs)
-    return np.asarray(plan, np.float32)
+    answers = ReferenceEvaluator(onnx.load_model_from_string(graph)).run(
+        list(outputs), dict(inputs)
+    )
+    return {
+        name: np.asarray(answer, np.float32) for name, answer in zip(outputs, answers, strict=True)
+    }

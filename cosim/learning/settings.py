@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from cosim.core.errors import RunError, UsageError
+from cosim.core.errors import RunError, UsageError, unknown
 
+BATCHES: Final[Mapping[str, int]] = MappingProxyType({"small": 256, "sidewalk": 48})
+"""Networks, with their default numbers of examples or windows in a step."""
 PLANNED_STEPS: Final = 20_000
 """Default number of steps of a training."""
 _EVALUATIONS: Final = 20
@@ -26,40 +29,80 @@ TO_INSTALL: Final = (
 )
 
 
+_ABLATIONS: Final = ("share", "memory", "auxiliary", "decoys", "weather")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Training:
     """Settings of a training. Raises UsageError.
 
+    network: a name in BATCHES
     steps: total number; None for those of the continued training, else PLANNED_STEPS
-    batch: examples per step
+    batch: examples or windows per step; None for that of BATCHES
     rate: highest learning rate
     device: "" for the GPU if available
     begin: bundle with the initial parameters; None for new ones
     minutes: time limit; the training then writes its bundle and can be continued
-    name: of the policy
+    name: of the policy; "" for that of the network
+
+    Ablations of `sidewalk`:
+
+    share: share of the training episodes that are used
+    memory, auxiliary: whether it has a memory, and auxiliary heads
+    decoys, weather: whether decoys and episodes in other weather than clear are used
     """
 
+    network: str = "small"
     steps: int | None = None
     seed: int = 0
-    batch: int = 256
+    batch: int | None = None
     rate: float = 1e-3
     device: str = ""
     begin: Path | None = None
     minutes: float = math.inf
-    name: str = "small"
+    name: str = ""
+    share: float = 1.0
+    memory: bool = True
+    auxiliary: bool = True
+    decoys: bool = True
+    weather: bool = True
 
     def __post_init__(self) -> None:
-        for field in ("steps", "batch", "rate", "minutes"):
+        if self.network not in BATCHES:
+            raise unknown("network", self.network, BATCHES)
+        if self.share > 1.0:
+            raise UsageError(f"--share must be at most 1, not {self.share:g}")
+        if self.network == "small" and (changed := [name for name, _ in self.ablations]):
+            raise UsageError(f"--network small has no {', '.join(changed)}: use sidewalk")
+        for field in ("steps", "batch", "rate", "minutes", "share"):
             value = getattr(self, field)
             if value is not None and not value > 0:
                 raise UsageError(f"--{field} must be above 0, not {value:g}")
 
     @property
+    def size(self) -> int:
+        """Return the number of examples or windows per step."""
+        return BATCHES[self.network] if self.batch is None else self.batch
+
+    @property
+    def called(self) -> str:
+        """Return the name of the policy."""
+        return self.name or self.network
+
+    @property
+    def ablations(self) -> list[tuple[str, Any]]:
+        """Return name and value of the settings that make an ablation."""
+        return [
+            (name, getattr(self, name))
+            for name in _ABLATIONS
+            if getattr(self, name) != type(self).__dataclass_fields__[name].default
+        ]
+
+    @property
     def spec(self) -> dict[str, Any]:
         """Return the settings that must not change when a training is continued."""
-        return {
-            name: value for name, value in asdict(self).items() if name in ("seed", "batch", "rate")
-        }
+        same = {name: getattr(self, name) for name in ("network", "seed", "rate", *_ABLATIONS)}
+        return same | {"batch": self.size}
 
 
 class StepsReached(NamedTuple):

@@ -15,10 +15,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from cosim.core.errors import RunError, UsageError, unwritable
 from cosim.core.files import atomic_file
@@ -27,17 +25,9 @@ from cosim.core.progress import Progress
 from cosim.core.units import duration
 from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
 from cosim.learning.curve import CURVE, draw_curve, write_curve
-from cosim.learning.examples import Batch, Examples
 from cosim.learning.graph import load_parameters
-from cosim.learning.network import (
-    CRUISE_MPS,
-    TURN_BINS,
-    Parameters,
-    forward,
-    new_parameters,
-    plan,
-    turns_radps,
-)
+from cosim.learning.kind import ExampleSet
+from cosim.learning.networks import NETWORKS
 from cosim.learning.settings import (
     PLANNED_STEPS,
     StepsReached,
@@ -56,13 +46,9 @@ _CHECKPOINT_EVERY_S: Final = 60.0
 """Time between checkpoints, seconds."""
 _TIMED_STEPS: Final = (1, 4)
 """Steps after which progress is reported, to estimate the time of all steps."""
-_MAX_HELD_OUT: Final = 4096
 _AVERAGE_DECAY: Final = 0.999
 """Decay of the moving average of the parameters, which the bundle holds."""
 _WEIGHT_DECAY: Final = 0.01
-_TURN_SPREAD_RADPS: Final = 0.04
-_WEIGHTS: Final = {"speed": 4.0, "turn": 1.0, "stop": 1.0, "way": 0.5}
-"""Weights of the parts of the loss."""
 
 
 @dataclass
@@ -102,6 +88,7 @@ def _train(
     paths: Sequence[Path], folder: Path, training: Training, resume: bool, progress: Progress
 ) -> StepsReached:
     device = _device(training.device)
+    network = NETWORKS[training.network]
     torch.manual_seed(training.seed)
     torch.backends.cudnn.deterministic = True
     torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = True
@@ -114,10 +101,10 @@ def _train(
     begin = (
         None
         if training.begin is None or checkpoint.exists()
-        else load_parameters(training.begin / MODEL)
+        else load_parameters(training.begin / MODEL, network.new_parameters(0))
     )
     base = None if training.begin is None else bundle_facts(training.begin)
-    examples = Examples(paths, training.seed, device)
+    examples = network.examples(paths, training, device)
     folder.mkdir(parents=True, exist_ok=True)
     spec = training.spec | {
         "data": ", ".join(map(packed_digest, paths)),
@@ -139,7 +126,11 @@ def _train(
         scheduled = is_evaluated(state.step, steps)
         if scheduled or over:
             parts = {f"{name}_loss": float(part) for name, part in loss_parts.items()}
-            row = {"step": float(state.step), **parts, **_errors(state.averaged, examples)}
+            row = {
+                "step": float(state.step),
+                **parts,
+                **network.errors(state.averaged, examples, training),
+            }
             if not math.isfinite(sum(row.values())):
                 raise RunError(
                     f"{folder}: nothing is learned any more at step {state.step}: train "
@@ -159,7 +150,7 @@ def _train(
             progress(_step_in_words(state.step, steps), state.step / steps)
     _write_checkpoint(checkpoint, state, spec)
     source = source_of(examples.meta, training.seed, base) + state_in_words(state.step, state.plans)
-    write_bundle(folder, state.averaged, examples, training.name, source)
+    write_bundle(folder, state.averaged, examples, training, source)
     return StepsReached(state.step, steps)
 
 
@@ -185,7 +176,7 @@ def _device(name: str) -> torch.device:
 
 
 def _new_state(training: Training, begin: dict[str, Tensor] | None, device: torch.device) -> _State:
-    drawn = new_parameters(training.seed) if begin is None else begin
+    drawn = NETWORKS[training.network].new_parameters(training.seed) if begin is None else begin
     parameters = {name: value.to(device).requires_grad_() for name, value in drawn.items()}
     averaged = {name: value.detach().clone() for name, value in parameters.items()}
     return _State(
@@ -203,15 +194,17 @@ def _optimiser(parameters: Mapping[str, Tensor], training: Training) -> torch.op
 
 
 def _take_step(
-    state: _State, examples: Examples, training: Training, steps: int
+    state: _State, examples: ExampleSet, training: Training, steps: int
 ) -> dict[str, Tensor]:
     """Take one step and return the parts of its loss."""
     step = state.step
     for group in state.optimiser.param_groups:
         group["lr"] = training.rate * rate_share(step, steps)
-    parts = losses(state.parameters, examples.drawn(training.seed, step, training.batch))
+    network = NETWORKS[training.network]
+    batch = examples.drawn(training.seed, step, training.size)
+    parts = network.losses(state.parameters, batch, training)
     state.optimiser.zero_grad(set_to_none=True)
-    torch.stack([_WEIGHTS[name] * part for name, part in parts.items()]).sum().backward()
+    torch.stack([network.weights[name] * part for name, part in parts.items()]).sum().backward()
     torch.nn.utils.clip_grad_norm_(state.parameters.values(), 1.0)
     state.optimiser.step()
     decay = min(_AVERAGE_DECAY, (1.0 + step) / (10.0 + step))
@@ -222,73 +215,6 @@ def _take_step(
             1.0 - decay,
         )
     return {name: part.detach() for name, part in parts.items()}
-
-
-def losses(parameters: Parameters, batch: Batch) -> dict[str, Tensor]:
-    """Return the parts of the loss.
-
-    Speed and turn count only if the expert does not stop; waypoints only if they were driven.
-    """
-    output = forward(parameters, batch.pictures, batch.goal, batch.speeds)
-    moves = 1.0 - batch.stop
-    per_moving = 1.0 / moves.sum().clamp(min=1.0)
-    turn_errors = turns_radps(batch.turn.device) - batch.turn[:, None]
-    # The bin of the expert's turn, and its neighbours with less weight.
-    targets = (-0.5 * (turn_errors / _TURN_SPREAD_RADPS) ** 2).softmax(1)
-    turn = -(targets * output.turn.log_softmax(1)).sum(1)
-    speed = functional.smooth_l1_loss(output.speed, batch.speed, reduction="none", beta=0.1)
-    way = functional.smooth_l1_loss(output.way, batch.way, reduction="none", beta=0.2).sum(2)
-    return {
-        "speed": (speed * moves).sum() * per_moving,
-        "turn": (turn * moves).sum() * per_moving / math.log(TURN_BINS),
-        "stop": functional.binary_cross_entropy_with_logits(output.stop, batch.stop),
-        "way": (way * batch.driven).sum() / batch.driven.sum().clamp(min=1.0),
-    }
-
-
-def _errors(parameters: Parameters, examples: Examples) -> dict[str, float]:
-    """Return errors on the held-out episodes.
-
-    These are mean errors of speed and turn if both move, recall and precision of stops, and the
-    mean error of the last waypoint.
-    """
-    rows = examples.held_out
-    rows = rows[:: max(1, -(-len(rows) // _MAX_HELD_OUT))]
-    sums: dict[str, float] = dict.fromkeys(
-        ("loss", "goers", "speed", "turn", "stops", "seen", "said", "ends", "way"), 0
-    )
-    with torch.no_grad():
-        for part in np.array_split(rows, max(1, len(rows) // 512)):
-            batch = examples.rows(part)
-            output = forward(parameters, batch.pictures, batch.goal, batch.speeds)
-            planned = plan(output)
-            stops = output.stop > 0.0
-            both = (batch.stop == 0.0) & ~stops
-            speeds = planned[:, 0, 2:] - torch.stack([CRUISE_MPS * batch.speed, batch.turn], 1)
-            off_m = (output.way[:, -1] - batch.way[:, -1]).norm(dim=1)
-            parts = losses(parameters, batch)
-            whole = sum(_WEIGHTS[name] * float(value) for name, value in parts.items())
-            for name, value in (
-                ("loss", whole * len(part)),
-                ("goers", both.sum()),
-                ("speed", speeds[both, 0].abs().sum()),
-                ("turn", speeds[both, 1].abs().sum()),
-                ("stops", batch.stop.sum()),
-                ("seen", (stops & (batch.stop > 0.0)).sum()),
-                ("said", stops.sum()),
-                ("ends", batch.driven[:, -1].sum()),
-                ("way", (off_m * batch.driven[:, -1]).sum()),
-            ):
-                sums[name] += float(value)
-    goers, ends = max(sums["goers"], 1.0), max(sums["ends"], 1.0)
-    return {
-        "held_out_loss": sums["loss"] / max(len(rows), 1),
-        "speed_error_mps": sums["speed"] / goers,
-        "turn_error_radps": sums["turn"] / goers,
-        "way_error_m": sums["way"] / ends,
-        "stops_found": sums["seen"] / max(sums["stops"], 1.0),
-        "stops_right": sums["seen"] / max(sums["said"], 1.0),
-    }
 
 
 def _write_checkpoint(path: Path, state: _State, spec: dict[str, Any]) -> None:
@@ -342,7 +268,7 @@ def train_and_report(
     resume: bool,
     say: Callable[[str], None],
 ) -> bool:
-    """Train a small policy on packed demonstrations and print its progress.
+    """Train a policy on packed demonstrations and print its progress.
 
     Returns whether the last step was reached.
     """

@@ -15,6 +15,7 @@ from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.run_config import DataFormat
 from cosim.spec.sensors import ImuKind, PeopleKind, ScanSpec
+from cosim.spec.weather import weather_called
 
 RECORDING_CAMERA: Final = "collected"
 """Name of the recording camera when the expert has a camera of its own."""
@@ -36,9 +37,13 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     noise: share of the time in which another command than the expert's is driven, in bursts.
     learner: policy that drives in this time; "" for the expert's command, slowed and turned at
         random.
-    format: form of the data set: LeRobot, or a ROS 2 bag of each episode.
-    unsolved: also record episodes that the expert fails, up to the first reset of the robot.
+    format: form of the data set: LeRobot, a ROS 2 bag of each episode, or raw demonstrations.
+    unsolved: also record episodes that the expert fails, up to the first reset of the robot, raw
+        ones to their end.
     scan, imu, people: sensors that are recorded with the pictures, as in a manifest.
+    labels: whether labels of the simulator are stored, for auxiliary heads.
+    astray: share of the episodes that begin aside of the route, turned away from it.
+    weathers: weathers that take turns, in place of the scenarios' own.
 
     Raises SpecError.
     """
@@ -54,6 +59,9 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     scan: ScanSpec | None = None
     imu: ImuKind = "none"
     people: PeopleKind = "none"
+    labels: bool = False
+    astray: float = 0.0
+    weathers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.rate_hz not in (
@@ -73,6 +81,10 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
                 f"learner '{self.learner}' drives in the share of the time that is noise: "
                 f"give --noise 0.6"
             )
+        if not 0.0 <= self.astray <= 1.0:
+            raise SpecError(f"astray must be in [0, 1], a share of the episodes, not {self.astray}")
+        for name in self.weathers:
+            weather_called(name)
         if not 1 <= self.waypoints <= _MOST_WAYPOINTS:
             raise SpecError(f"waypoints must be in [1, {_MOST_WAYPOINTS}], not {self.waypoints}")
         if not (
@@ -182,6 +194,11 @@ def recording_manifest(
     goal: goal protocol of the run, in place of the expert's.
     """
     goal = goal or expert.goal
+    if collecting.labels and not expert.privileged:
+        raise UsageError(
+            f"--labels: expert '{expert.name}' gets no privileged state, which labels are made of: "
+            f"give --policy orca"
+        )
     kind = GOALS[goal_called(goal)]
     if not kind.has_data_set_column:
         others = ", ".join(one.name for one in GOALS.values() if one.has_data_set_column)

@@ -29,8 +29,8 @@ CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 """Renderers of `--camera`; auto selects gl where it works."""
 Appearance = Literal["splats", "mesh"]
 """Appearances of scanned places in the gl camera; splats are drawn where a scan has them."""
-DataFormat = Literal["lerobot", "rosbag2"]
-"""Forms of a data set of `cosim collect`."""
+DataFormat = Literal["lerobot", "rosbag2", "raw"]
+"""Forms of a data set of `cosim collect`; "raw" is only what `cosim dataset pack` reads."""
 Isolation = Literal["no", "auto", "namespaces", "landlock", "weak"]
 """Kinds of `--isolated`: "auto" is the strongest sandbox that the kernel offers, "weak" none."""
 POLICY_MEMORY_GB = 16.0

@@ -93,9 +93,10 @@ def join_clips(clips: Iterable[bytes], lengths: Sequence[int], path: Path, fps: 
             before += length
 
 
-def read_pictures(path: Path) -> Iterator[tuple[Fraction, NDArray[np.uint8]]]:
+def read_pictures(film_or_bytes: Path | bytes) -> Iterator[tuple[Fraction, NDArray[np.uint8]]]:
     """Yield the pictures of an .mp4 in order: the time in seconds, and RGB (H, W, 3)."""
-    with av.open(str(path), "r") as film:
+    one = film_or_bytes
+    with av.open(io.BytesIO(one) if isinstance(one, bytes) else str(one), "r") as film:
         stream = film.streams.video[0]
         stream.codec_context.thread_count = 1
         for frame in film.decode(stream):

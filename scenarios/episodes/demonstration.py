@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import io
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from typing import Final
 
 import cv2
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import MachineError, RunError
 from cosim.core.geometry import Floats
 from cosim.core.npz import read_open_npz
+from cosim.core.packed_demos import EXTRAS
 
 _GLIMPSE_PX: Final = (8, 6)
 """Width and height in pixels of the thumbnails by which stored pictures are checked."""
@@ -45,6 +47,9 @@ class Demonstration:
     clip: the bytes of an .mp4 with n pictures.
     scan (n, R), imu (n, 6), people (n, PEOPLE_ROWS, 5): recorded sensors, as in
         `scan_row` and `people_rows` of `cosim.spec.sensors`; empty without them.
+    near, free, scene: labels, as in `scenarios.episodes.labels`; empty without them.
+    begins (n,): whether a row is the first one, or the first after the robot was put back; empty
+        for one that was never put back.
     """
 
     state: NDArray[np.float32]
@@ -60,15 +65,25 @@ class Demonstration:
     scan: NDArray[np.float32] = field(default_factory=_nothing)
     imu: NDArray[np.float32] = field(default_factory=_nothing)
     people: NDArray[np.float32] = field(default_factory=_nothing)
+    near: NDArray[np.float32] = field(default_factory=_nothing)
+    free: NDArray[np.float32] = field(default_factory=_nothing)
+    scene: NDArray[np.float32] = field(default_factory=_nothing)
+    begins: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
 
     def __len__(self) -> int:
         return len(self.state)
 
     @property
-    def sensors(self) -> dict[str, NDArray[np.float32]]:
-        """Return the recorded sensors by name."""
-        rows = {"scan": self.scan, "imu": self.imu, "people": self.people}
+    def extras(self) -> dict[str, NDArray[np.float32]]:
+        """Return the recorded sensors and labels by name."""
+        rows = {name: getattr(self, name) for name in EXTRAS}
         return {name: readings for name, readings in rows.items() if readings.size}
+
+    @property
+    def lengths(self) -> list[int]:
+        """Return the numbers of rows of its drives, of which each begins with `begins`."""
+        starts = np.flatnonzero(self.begins).tolist() or [0]
+        return [after - first for first, after in pairwise([*starts, len(self)])]
 
     def encoded(self) -> bytes:
         """Return the .npz; equal demonstrations have equal bytes."""
@@ -132,6 +147,40 @@ def waypoints_ahead(
     here = pose[ticks]
     local = _turned(world - here[:, None, :2], -here[:, None, 2])
     return local.astype(np.float32), driven.astype(np.int32)
+
+
+def drives_ahead(
+    pose: Floats,
+    resets: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    begins: NDArray[np.bool_],
+    command: Floats,
+    disturbed: NDArray[np.bool_],
+    count: int,
+    every: int,
+    tick_s: float,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return what `waypoints_ahead` does, for drives that end when the robot is put back.
+
+    pose (T + 1, 3): as there, over all drives; where the robot was put is not in it.
+    resets: ticks at whose end the robot is put back, ascending.
+    begins (n,): whether a picture is the first of a drive.
+    """
+    found = []
+    starts = [*np.flatnonzero(begins).tolist(), len(ticks)]
+    for first, after in pairwise(starts):
+        rows, tick = slice(first, after), int(ticks[first])
+        ends = resets[resets >= tick]
+        drive = pose[: int(ends[0]) + 2].copy() if len(ends) else pose.copy()
+        if tick - 1 in resets and tick + 1 < len(drive):
+            drive[tick] = drive[tick + 1]  # at rest there, it has hardly moved a tick later
+        found.append(
+            waypoints_ahead(
+                drive, ticks[rows], command[rows], disturbed[rows], count, every, tick_s
+            )
+        )
+    waypoints, driven = zip(*found, strict=True)
+    return np.concatenate(waypoints), np.concatenate(driven)
 
 
 def arc_ahead(v_mps: Floats, w_radps: Floats, time_s: Floats) -> Floats:

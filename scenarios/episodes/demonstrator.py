@@ -25,7 +25,8 @@ from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
 from cosim.spec.sensors import people_rows, scan_row
 from scenarios.episodes.clip import Clip
-from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
+from scenarios.episodes.demonstration import Demonstration, drives_ahead, glimpse
+from scenarios.episodes.labels import event_numbers, event_person, label_rows
 
 _BURST_S: Final = (0.4, 1.0)
 """Shortest and longest disturbance in seconds."""
@@ -60,7 +61,7 @@ class Demonstrator(PolicyCaller):
         self._expert = expert
         self._collecting = collecting
         self._sees = expert.manifest.camera is not None
-        self._rows = _Rows(manifest.rate_hz)
+        self._rows = _Rows(manifest.rate_hz, collecting)
         self._bursts = _Bursts(0, collecting)
         self.learner = learner
         if learner is not None:
@@ -74,7 +75,8 @@ class Demonstrator(PolicyCaller):
         self._expert.close()
 
     def reset(self, episode_id: str, seed: int) -> None:
-        self._rows, self._bursts = _Rows(self.manifest.rate_hz), _Bursts(seed, self._collecting)
+        self._rows = _Rows(self.manifest.rate_hz, self._collecting)
+        self._bursts = _Bursts(seed, self._collecting)
         self._expert.reset(episode_id, seed)
         if self.learner is not None:
             self.learner.reset(episode_id, seed)
@@ -99,7 +101,7 @@ class Demonstrator(PolicyCaller):
         """Return the encoded demonstration; b"" if the episode crashed or was not solved."""
         if log is None or not (self._collecting.unsolved or solved(record, log)):
             return b""
-        return self._rows.demonstration(scenario, log, self._collecting).encoded()
+        return self._rows.demonstration(scenario, log).encoded()
 
 
 def solved(record: Record, log: Log) -> bool:
@@ -162,9 +164,12 @@ class _Bursts:
 
 
 class _Rows:
-    """Observations and commands of an episode until its first reset."""
+    """Observations and commands of an episode: raw ones to its end, others until its first
+    reset."""
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, collecting: DemoOptions) -> None:
+        self._collecting = collecting
+        self._begins: list[bool] = []
         self._fps = round(rate_hz)
         self._clip: Clip | None = None
         self._over = False
@@ -173,12 +178,13 @@ class _Rows:
         self._instructions: list[str] = []
         self._glimpses: list[NDArray[np.uint8]] = []
         self._colours = np.zeros((3, 256), np.int64)
-        self._sensors: dict[str, list[NDArray[np.float32]]] = {}
+        self._extras: dict[str, list[NDArray[np.float32]]] = {}
+        self._persons: list[str] = []
 
     def add(
         self, seen: Observation, rgb: NDArray[np.uint8], answer: Command, disturbed: bool
     ) -> None:
-        self._over |= seen.reset
+        self._over |= seen.reset and self._collecting.format != "raw"
         if self._over:
             return
         if self._clip is None:
@@ -186,31 +192,39 @@ class _Rows:
         self._clip.add(rgb)
         goal = seen.goal
         x_m, y_m = (goal.x_m, goal.y_m) if isinstance(goal, PointGoal) else (math.nan, math.nan)
+        self._begins.append(seen.reset or not self._ticks)
         self._ticks.append(seen.tick)
         self._numbers.append(
             (seen.v_mps, seen.w_radps, x_m, y_m, answer.v_mps, answer.w_radps, float(disturbed))
         )
         self._instructions.append(goal.text if isinstance(goal, Instruction) else "")
         self._glimpses.append(glimpse(rgb))
-        for name, row in _sensor_rows(seen).items():
-            self._sensors.setdefault(name, []).append(row)
+        for name, row in (
+            _sensor_rows(seen) | (label_rows(seen) if self._collecting.labels else {})
+        ).items():
+            self._extras.setdefault(name, []).append(row)
+        self._persons.append(event_person(seen.privileged))
         self._colours += [
             np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
         ]
 
-    def demonstration(self, scenario: Scenario, log: Log, collecting: DemoOptions) -> Demonstration:
-        """Return the demonstration, with waypoints of the trajectory up to the first reset."""
+    def demonstration(self, scenario: Scenario, log: Log) -> Demonstration:
+        """Return the demonstration, with waypoints of the trajectory up to the next reset."""
+        collecting = self._collecting
         assert self._clip is not None, "an episode has a picture before its first command"
         ticks, numbers = np.array(self._ticks), np.array(self._numbers)
         resets = np.flatnonzero(~np.isnan(log.reset_s_m))
-        end = int(resets[0]) + 1 if len(resets) else len(log)
-        pose = np.vstack([scenario.start, log.pose[:end]])
+        pose = np.vstack([scenario.start, log.pose])
+        begins = np.array(self._begins)
         every = Clock().ticks(collecting.waypoint_s)
         disturbed = numbers[:, 6] > 0.0
         command = numbers[:, 4:6]
-        waypoints, driven = waypoints_ahead(
-            pose, ticks, command, disturbed, collecting.waypoints, every, log.tick_s
+        waypoints, driven = drives_ahead(
+            pose, resets, ticks, begins, command, disturbed, collecting.waypoints, every, log.tick_s
         )
+        extras = {name: np.stack(rows) for name, rows in self._extras.items()}
+        if "scene" in extras:
+            extras["scene"][:, 1] = event_numbers(scenario, self._persons)
         return Demonstration(
             state=numbers[:, 0:2].astype(np.float32),
             goal=numbers[:, 2:4].astype(np.float32),
@@ -222,7 +236,8 @@ class _Rows:
             glimpses=np.stack(self._glimpses),
             colours=self._colours,
             clip=np.frombuffer(self._clip.finished(), np.uint8),
-            **{name: np.stack(rows) for name, rows in self._sensors.items()},
+            **extras,
+            begins=begins,
         )
 
 

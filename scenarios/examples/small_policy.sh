@@ -13,26 +13,10 @@
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
 W=${1:?a folder to work in}
-END=$((SECONDS + ${MINUTES:-9} * 60))
-JOBS=${JOBS:-16} COSIM=${COSIM:-cosim} PYTHON=${PYTHON:-python3}
+. "$here/scenarios/examples/pieces.sh"
 EVENTS=${EVENTS:-"obstructing conversing queueing frontal lateral overtaking ped_crossing gesturing"}
 mkdir -p "$W/demos/events" "$W/nets" "$W/runs"
 
-step() { # name, words...: a command that can be interrupted and gone on with; done once
-  local name=$1 left=$((END - SECONDS)); shift
-  mkdir -p "$(dirname "$W/log/$name")"
-  [ -e "$W/log/$name.done" ] && return 0
-  [ $left -gt 30 ] || { echo "time is up before $name: call again"; exit 1; }
-  timeout -k 30 $left "$@" >> "$W/log/$name.txt" 2>&1 || { tail -n 3 "$W/log/$name.txt"; echo "stopped in $name: call again"; exit 1; }
-  touch "$W/log/$name.done"; echo "$name: done"
-}
-learn() { # name, words...
-  local name=$1; shift
-  step "train-$name" env PYTHONPATH="$here" MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=8000000000 \
-    "$PYTHON" -m cosim.learning "$@" -o "$W/nets/$name" \
-    --batch "${BATCH:-256}" \
-    --minutes "$(awk "BEGIN { print ($END - $SECONDS) / 60 - 0.3 }")" --resume
-}
 collect() { # name, words...
   local name=$1; shift
   step "collect-$name" $COSIM collect "$@" --fov 60 --jobs "$JOBS" --out "$W/demos/$name" --resume
@@ -45,7 +29,7 @@ collect_again() { # round, learner, cities: what the expert would have done wher
 }
 finetune() { # folder, what it is called, seed, data...
   local folder=$1 called=$2 seed=$3; shift 3
-  learn "$folder" "$@" "$W/unit.npz" --from "$W/nets/small" --seed "$seed" --steps "${MORE:-8000}" --rate 3e-4 --name "$called"
+  learn "$folder" "$@" "$W/unit.npz" --batch "${BATCH:-256}" --from "$W/nets/small" --seed "$seed" --steps "${MORE:-8000}" --rate 3e-4 --name "$called"
 }
 score() { # name, policy, suite
   local more=(); [ -e "$W/runs/$3-$1/run.json" ] && more=(--resume)
@@ -59,7 +43,7 @@ for event in $EVENTS; do
 done
 step pack-unit $COSIM dataset pack "$W/demos/unit" -o "$W/unit.npz"
 step pack-events $COSIM dataset pack "$W"/demos/events/* -o "$W/events.npz"
-learn small "$W/unit.npz" --steps "${STEPS:-16000}"
+learn small "$W/unit.npz" --batch "${BATCH:-256}" --steps "${STEPS:-16000}"
 collect_again round1 "onnx:$W/nets/small" 940:980
 finetune halfway small-halfway 0 "$W/events.npz" "$W/round1.npz"
 collect_again round2 "onnx:$W/nets/halfway" 980:1020

@@ -9,7 +9,7 @@ the first one. Only this process writes to the run folder.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from logging import ERROR, WARNING
 from pathlib import Path
@@ -53,6 +53,7 @@ def run_all(
     tell: MessageHandler,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     renderer: SharedRenderer | None = None,
+    over: Callable[[], bool] = lambda: False,
 ) -> None:
     """Run scenarios, as many at a time as the transport has room for, and add each record to the
     folder.
@@ -60,6 +61,7 @@ def run_all(
     hello: introduces the policy as it was loaded here.
     tell: called with the messages about the episodes.
     renderer: draws for all episodes; the caller ends it.
+    over: whether no further episode is to begin; those that run are finished.
 
     Raises UsageError when a worker cannot load the policy, MachineError when none can be started or
     a record cannot be written."""
@@ -69,8 +71,8 @@ def run_all(
     pool = _Pool(folder, queue, hello, transport, options, tell, renderer)
     log_event("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
-        while queue or pool.busy:
-            while queue and transport.room(pool.busy) > 0:
+        while pool.busy or (queue and not over()):
+            while queue and not over() and transport.room(pool.busy) > 0:
                 pool.give(queue.next())
             pool.poll()
             pool.take_unsolicited()

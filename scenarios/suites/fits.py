@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
-from multiprocessing import get_context
 from typing import Final
 
 import numpy as np
 import shapely
 from shapely.geometry import LineString, Point
 
-from cosim.core.errors import MachineError, MapError, SpecError, UsageError
+from cosim.core.errors import MapError, SpecError, UsageError
 from cosim.core.progress import Progress, ignore
 from cosim.place.barriers import outline
 from cosim.place.street_map import StreetMap, WalkableArea
@@ -24,6 +19,7 @@ from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Su
 from cosim.spec.spec_file import join_faults
 from physics.cameras.hdri import read_hdri
 from scenarios.events import EVENT_KINDS
+from scenarios.ipc.parallel_map import parallel_map
 from scenarios.places.nets import place
 from sumo_nets.crowd.free_space import LocalWalkableArea
 
@@ -56,32 +52,15 @@ def check_places(
         there.setdefault(scenario.place, []).append(scenario)
     faults = [*_not_here(scenarios), *_odd_events(scenarios)]
     jobs = min(jobs, len(there) // _PLACES_A_PROCESS)
-    with ExitStack() as stack:
-        if jobs > 1:
-            made = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_deaf_to_ctrl_c)
-            stack.callback(made.shutdown, cancel_futures=True)
-            found = made.map(_misfits_at, there, there.values())
-        else:
-            found = map(_misfits_at, there, there.values())
-        for number in range(len(there)):
-            progress(LOOKING, number / len(there))
-            try:
-                faults += next(found)
-            except BrokenProcessPool as error:
-                raise MachineError(
-                    "a process that looked at places was ended: is there enough memory?"
-                ) from error
+    for found in parallel_map(_misfits_at, list(there.items()), jobs, progress, LOOKING):
+        faults += found
     if faults:
         raise SpecError(f"suite '{whole.name}': {join_faults(faults)}")
 
 
-def _deaf_to_ctrl_c() -> None:
-    """Ignore Ctrl-C in this process; its parent ends it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _misfits_at(where: Place, scenarios: Sequence[Scenario]) -> list[str]:
+def _misfits_at(of_place: tuple[Place, Sequence[Scenario]]) -> list[str]:
     """Return the faults of the scenarios of one place, which is generated if missing."""
+    where, scenarios = of_place
     try:
         _, street_map = place(where)
     except (MapError, UsageError, SpecError) as error:

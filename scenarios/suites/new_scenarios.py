@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import re
-import signal
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from multiprocessing import get_context
+from types import MappingProxyType
 from typing import Final
 
 import msgspec
+import numpy as np
 
-from cosim.core.errors import CosimError, MachineError, UsageError, unknown
+from cosim.core.errors import CosimError, UsageError, unknown
 from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import City, Scenario
 from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
-from scenarios.suites.recipes import Slot, candidate, repeated
+from scenarios.ipc.parallel_map import parallel_map
+from scenarios.suites.decoys import DECOY, decoy_of
+from scenarios.suites.recipes import LONG_WAY, Slot, candidate, repeated
 from scenarios.suites.unit import STRUCTURES
 from sumo_nets.city.store import SEEDS
 
 _DRAWING: Final = "drawing scenarios"
-_KINDS: Final = ("unit", "reactive")
+_STRUCTURES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "unit": STRUCTURES,
+        "reactive": (*EVENT_KINDS, STATIC),
+        "long-horizon": (LONG_WAY,),
+    }
+)
+"""Structures of the suites that can be drawn again."""
+_ROUTE_M: Final = (80.0, 200.0)
+"""Shortest and longest drawn route, in metres."""
 _MOST_SEED: Final = 2**31 - 1
 
 
@@ -32,7 +40,8 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
     """Endless sequence of scenarios.
 
     kind: suite that they resemble.
-    structures: values of `structure`, which take turns.
+    structures: values of `structure`, which take turns; one with "-decoy" is the decoy of the
+        scenario before it.
     seeds: seeds of the cities, which take turns after the structures.
     size_m: side of each city, in metres.
     """
@@ -55,21 +64,9 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
         for number in range(first, first + count):
             by_city.setdefault(number // len(self.structures) % len(self.seeds), []).append(number)
         found: dict[int, Scenario] = {}
-        with ExitStack() as stack:
-            if min(jobs, len(by_city)) > 1:
-                pool = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_deaf_to_ctrl_c)
-                stack.callback(pool.shutdown, cancel_futures=True)
-                drawn = pool.map(self._in_city, by_city.values())
-            else:
-                drawn = map(self._in_city, by_city.values())
-            for done in range(len(by_city)):
-                progress(_DRAWING, done / len(by_city))
-                try:
-                    found |= next(drawn)
-                except BrokenProcessPool as error:
-                    raise MachineError(
-                        "a process that drew scenarios was ended: is there enough memory?"
-                    ) from error
+        numbers = list(by_city.values())
+        for drawn in parallel_map(self._in_city, numbers, jobs, progress, _DRAWING):
+            found |= drawn
         return [found[number] for number in sorted(found)]
 
     def _in_city(self, numbers: Sequence[int]) -> dict[int, Scenario]:
@@ -86,6 +83,9 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
         turn, structure = divmod(number, len(self.structures))
         again, city = divmod(turn, len(self.seeds))
         called, seed = self.structures[structure], self.seeds[city]
+        if called.endswith(DECOY):
+            return decoy_of(self._one(number - 1))
+        length_m = np.random.default_rng([number, 0x1E46]).uniform(*_ROUTE_M)
         slot = Slot(
             name=f"{called}-{seed}-{again:03d}",
             suite=self.kind,
@@ -93,6 +93,7 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
             where=City(seed=seed, size_m=self.size_m),
             split="val",
             number=number,
+            length_m=round(length_m, 1) if called == LONG_WAY else 0.0,
         )
         if called != STATIC:
             return candidate(slot, again)
@@ -120,22 +121,28 @@ def fresh_cities(words: str) -> tuple[int, ...]:
 
 
 def fresh(
-    kind: str, seeds: tuple[int, ...], structures: Sequence[str] = (), size_m: float = 2000.0
+    kind: str,
+    seeds: tuple[int, ...],
+    structures: Sequence[str] = (),
+    size_m: float = 2000.0,
+    decoys: bool = False,
 ) -> Fresh:
     """Return new scenarios like those of a suite.
 
-    structures: only these. Raises UsageError with the valid names.
+    structures: only these.
+    decoys: whether each event is followed by its decoy.
+
+    Raises UsageError with the valid names.
     """
-    if kind not in _KINDS:
-        raise unknown("suite for --cities", kind, _KINDS)
-    there = STRUCTURES if kind == "unit" else (*EVENT_KINDS, STATIC)
+    if kind not in _STRUCTURES:
+        raise unknown("suite for --cities", kind, _STRUCTURES)
+    there = _STRUCTURES[kind]
     for name in structures:
         if name not in there:
             raise unknown(f"structure of '{kind}'", name, there)
     picked = tuple(name for name in there if name in structures or not structures)
+    if decoys:
+        picked = tuple(
+            one for name in picked for one in (name, name + DECOY)[: 1 + (name in EVENT_KINDS)]
+        )
     return Fresh(kind=kind, structures=picked, seeds=seeds, size_m=size_m)
-
-
-def _deaf_to_ctrl_c() -> None:
-    """Ignore Ctrl-C in this process; its parent ends it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

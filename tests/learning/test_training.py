@@ -36,6 +36,7 @@ from cosim.learning.examples import Examples, mirror  # noqa: E402
 from cosim.learning.graph import INPUTS, build_graph, load_parameters  # noqa: E402
 from cosim.learning.network import CRUISE_MPS, HEIGHT_PX, WAYPOINTS, WIDTH_PX, new_parameters  # noqa: E402
 from cosim.learning.settings import Training  # noqa: E402
+from cosim.learning.small import SMALL  # noqa: E402
 from cosim.learning.training import train  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -156,7 +157,8 @@ def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
         "depth": False,
     }
     manifest = msgspec.convert(
-        manifest_of("small", street().meta | {"camera": camera}, "told"), BundleManifest
+        manifest_of("small", street().meta | {"camera": camera}, "told", SMALL.inputs),
+        BundleManifest,
     )
     assert manifest.camera.spec == CameraSpec(160, 120, 60.0, crop=(0, 30, 160, 120))
 
@@ -220,17 +222,17 @@ def test_it_can_be_trained_on_from_the_shipped_graph_alone(
 ) -> None:
     """The graph holds the parameters that training begins with: at a rate of next to nothing it
     stays as it is."""
-    held = load_parameters(learned / "model.onnx")
+    held = load_parameters(learned / "model.onnx", new_parameters(0))
     assert train(
         [data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, ignore
     ).whole
-    for name, value in load_parameters(tmp_path / "on" / "model.onnx").items():
+    for name, value in load_parameters(tmp_path / "on" / "model.onnx", held).items():
         torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
     drawn = new_parameters(3)
     (tmp_path / "drawn.onnx").write_bytes(build_graph(drawn))
     assert all(
         torch.equal(value, drawn[name])
-        for name, value in load_parameters(tmp_path / "drawn.onnx").items()
+        for name, value in load_parameters(tmp_path / "drawn.onnx", held).items()
     )
 
 
@@ -259,7 +261,9 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
     )
     packed.save(tmp_path / "street.npz")
     trained_on = Examples([tmp_path / "street.npz"], 0, CPU).rows(np.arange(12))
-    manifest = msgspec.convert(manifest_of("small", packed.meta, "told"), BundleManifest)
+    manifest = msgspec.convert(
+        manifest_of("small", packed.meta, "told", SMALL.inputs), BundleManifest
+    )
     ports = {name: TensorPort(name, np.dtype(np.float32), shape) for name, shape in INPUTS.items()}
     feeder = Feeder(manifest.inputs, ports, 0)
     for row, (rgb, speeds, goal) in enumerate(

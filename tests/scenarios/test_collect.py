@@ -200,7 +200,7 @@ def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
         (("--camera", "160"), "--camera 160: give width x height in pixels, such as 160x90"),
         (
             ("--cities", "900:901"),
-            "unknown suite for --cities 'ways.json'. Valid choices: reactive, unit",
+            "unknown suite for --cities 'ways.json'. Valid choices: long-horizon, reactive, unit",
         ),
         (("--cities", "900:901", "--split", "val"), "--cities and --split do not go together"),
     ],

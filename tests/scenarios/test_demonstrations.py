@@ -16,19 +16,27 @@ import pyarrow.parquet as pq
 import pytest
 
 from cosim.core.errors import CosimError, RunError, SpecError
-from cosim.core.packed_demos import read_packed
+from cosim.core.packed_demos import FREE_RAYS, LABELLED_PEOPLE, read_packed
 from cosim.core.state import Command
 from cosim.spec.camera import CameraSpec
 from cosim.spec.demo_options import DemoOptions, recording_manifest
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER
+from cosim.spec.scenario import Suite, write_suite
 from cosim.spec.sensors import PEOPLE_ROWS, ScanSpec
 from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pictures
-from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
+from scenarios.episodes.demonstration import (
+    Demonstration,
+    drives_ahead,
+    glimpse,
+    waypoints_ahead,
+)
 from scenarios.episodes.demonstrator import _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
-from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
+from scenarios.tools.dataset.collected import Collected
+from scenarios.tools.dataset.lerobot import Filmed, write_lerobot
+from scenarios.tools.dataset.pack import pack_raw
 from scenarios.tools.dataset.read import packed_sets, read_back, read_data_set
 from sumo_nets.city.store import SEEDS
 from tests.run_specs import record_of
@@ -230,10 +238,11 @@ def test_packed_rows_are_those_that_were_kept(
 
 
 def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
-    """Distances by ring and ray, inertial readings and people come back from the file; data sets
-    with other sensors are not packed together."""
+    """Distances by ring and ray, inertial readings, people and labels come back from the file; data
+    sets with other sensors are not packed together."""
     draws = np.random.default_rng(3)
     shapes = {"scan": (2, 8), "imu": (6,), "people": (PEOPLE_ROWS, 5)}
+    shapes |= {"near": (LABELLED_PEOPLE, 6), "free": (FREE_RAYS,), "scene": (2,)}
     sensors = {name: draws.random((7, *shape), np.float32) for name, shape in shapes.items()}
     told = {**sensors, "scan": sensors["scan"].reshape(7, -1)}
     lidar = msgspec.to_builtins(ScanSpec(rays=8, rings=2, elevation_deg=(-5.0, 5.0)))
@@ -246,6 +255,63 @@ def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
     assert (packed.meta["lidar"]["rings"], packed.meta["imu"]) == (2, "exact")
     with pytest.raises(SpecError, match=r"lidar is .* here and None there"):
         packed_sets([folder, written(tmp_path / "other", [shown(0, 3)])])
+
+
+def test_waypoints_of_a_drive_end_where_the_robot_is_put_back() -> None:
+    """It drives east at 2 m/s, is put back by 4 m after tick 9, rests for a tick and drives on: no
+    waypoint leads from one drive to the other, and the second ones are those after it."""
+    x_m = [0.1 * k for k in range(11)] + [-3.0 + 0.1 * k for k in range(10)]
+    pose = np.array([[x, 0.0, 0.0] for x in x_m])
+    ticks, begins = np.array([0, 4, 8, 10, 14]), np.array([True, False, False, True, False])
+    command, calm = np.tile([2.0, 0.0], (5, 1)), np.zeros(5, bool)
+    waypoints, driven = drives_ahead(
+        pose, np.array([9]), ticks, begins, command, calm, 3, 4, TICK_S
+    )
+    assert driven.tolist() == [2, 1, 0, 2, 1]
+    np.testing.assert_allclose(waypoints[:3, :, 0], np.tile([0.4, 0.8, 1.2], (3, 1)), atol=1e-5)
+    np.testing.assert_allclose(waypoints[3, :2, 0], [0.3, 0.7], atol=1e-5)
+    plain = waypoints_ahead(pose[:11], ticks[:3], command[:3], calm[:3], 3, 4, TICK_S)
+    np.testing.assert_array_equal(waypoints[:3], plain[0])
+
+
+def test_raw_demonstrations_are_packed_in_parts(
+    tmp_path: Path, demonstrations: list[Demonstration]
+) -> None:
+    """Of an unfinished collection what is there, in the order of its scenarios, by two processes as
+    by one; one that was put back is two episodes; weathers are those of the scenarios. A folder without any is named."""
+    ways = [short_way(f"s-{k:03d}") for k in range(4)]
+    ways[1] = ways[1].in_weather("rain")
+    run = tmp_path / "raw/runs/00"
+    run.mkdir(parents=True)
+    write_suite(Suite(name="ways", version="1", scenarios=tuple(ways)), run / "scenarios.json")
+    (tmp_path / "raw/about.json").write_text(json.dumps(ABOUT))
+    with pytest.raises(RunError, match="no episode is finished: continue the collection"):
+        pack_raw([tmp_path / "raw"], tmp_path / "d.npz")
+    begins = np.zeros(LENGTHS[1], bool)
+    begins[[0, 8]] = True
+    stored = [demonstrations[0], replace(demonstrations[1], begins=begins), demonstrations[2]]
+    for way, one in zip(ways[:3], stored, strict=True):
+        folder = run / "episodes" / way.id
+        folder.mkdir(parents=True)
+        (folder / "demonstration.npz").write_bytes(one.encoded())
+    parts = pack_raw([tmp_path / "raw"], tmp_path / "d.npz", part=2, jobs=2)
+    assert [(one.path.name, one.episodes, one.rows) for one in parts] == [
+        ("d-000.npz", 2, LENGTHS[0] + LENGTHS[1]),
+        ("d-001.npz", 1, LENGTHS[2]),
+    ]
+    first, second = (read_packed(one.path) for one in parts)
+    assert first.meta["weathers"] == ["clear", "rain", "rain"] and second.meta["scenarios"] == [
+        "s-002"
+    ]
+    np.testing.assert_array_equal(second.command, demonstrations[2].command)
+    assert np.bincount(first.episode).tolist() == [LENGTHS[0], 8, LENGTHS[1] - 8]
+    assert first.frame[LENGTHS[0] + 8] == 0
+    seen = np.stack([glimpse(rgb) for rgb in first.frames[LENGTHS[0] :]]).astype(float)
+    assert np.abs(seen - demonstrations[1].glimpses).mean() < 4.0
+    pack_raw([tmp_path / "raw"], tmp_path / "e.npz", (32, 24), part=9)
+    assert read_packed(tmp_path / "e-000.npz").frames.shape == (sum(LENGTHS), 24, 32, 3)
+    with pytest.raises(RunError, match="no collection of the format raw"):
+        pack_raw([tmp_path], tmp_path / "d.npz")
 
 
 def test_data_sets_that_do_not_fit_are_not_packed_together(data_set: Path, tmp_path: Path) -> None:
@@ -418,9 +484,12 @@ def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:
         fresh("unit", (900,), ["gesturing"])
     with pytest.raises(
         CosimError,
-        match=r"unknown suite for --cities 'long-horizon'\. Valid choices: reactive, unit",
+        match=r"unknown suite for --cities 'scans'\. Valid choices: long-horizon, reactive, unit",
     ):
-        fresh("long-horizon", (900,))
+        fresh("scans", (900,))
+    with_decoys = fresh("reactive", (900,), ["gesturing", "static"], decoys=True)
+    assert with_decoys.structures == ("gesturing", "gesturing-decoy", "static")
+    assert fresh("long-horizon", (900,)).structures == ("route",)
 
 
 def test_a_damaged_demonstration_is_named(demonstrations: list[Demonstration]) -> None:

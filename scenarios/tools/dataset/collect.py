@@ -5,20 +5,25 @@ OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode
                       added if too few are solved. They may be deleted once
                       the data set is complete
 OUT/writing           unfinished data set
+OUT/about.json        with the format raw: what `cosim dataset pack` needs beside the runs, in
+                      place of the following
 OUT/bags              with the format rosbag2 a ROS 2 bag of each episode, in place of the following
 OUT/meta, data, videos   the data set; meta is written last and marks it as complete
 """
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -34,6 +39,8 @@ from cosim.results.run_folder import DEMONSTRATION, RunFolder
 from cosim.results.run_spec import brief
 from cosim.spec.demo_options import DemoOptions
 from cosim.spec.options import EpisodeOptions, PolicyHost
+from cosim.spec.robot import COURIER
+from cosim.spec.run_config import DataFormat
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.episodes.demonstration import Demonstration, check_parquet
 from scenarios.episodes.demonstrator import Demonstrator, load_learner
@@ -45,15 +52,19 @@ from scenarios.runs.pool import run_all
 from scenarios.suites.catalog import with_robot, with_weather
 from scenarios.suites.fits import check_places
 from scenarios.suites.new_scenarios import Fresh
-from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
-from scenarios.tools.dataset.read import ReadBack, read_back
+from scenarios.tools.dataset.collected import ABOUT, RUNS, Collected
+from scenarios.tools.dataset.variety import varied
 from scenarios.tools.viewing.bag import write_bag
 
+if TYPE_CHECKING:
+    from scenarios.tools.dataset.read import ReadBack
+
 _ASKED: Final = "collect.json"
-_RUNS: Final = "runs"
 _WRITING: Final = "writing"
 _PARTS: Final = ("videos", "data", "meta")
 _MOST_ROUNDS: Final = 8
+_BLOCK: Final = 1000
+"""Most episodes of a round of the format raw; drawing a round cannot be interrupted."""
 _STAGE: Final = "writing the data set"
 
 
@@ -106,8 +117,9 @@ class Gathered:
     run: episodes that were driven.
     dropped: numbers of excluded episodes by reason.
     spare: solved episodes beyond the requested number.
-    back: result of reading the data set back, None if it was complete before or has bags.
-    bags: whether it has a ROS 2 bag of each episode in place of tables and films.
+    back: result of reading the data set back, None if it was complete before or has no tables.
+    form: of the data set.
+    whole: whether it is complete; otherwise the time was up.
     """
 
     kept: int
@@ -116,7 +128,8 @@ class Gathered:
     dropped: Counter[str]
     spare: int
     back: ReadBack | None
-    bags: bool = False
+    form: DataFormat = "lerobot"
+    whole: bool = True
 
 
 _Showing = Callable[[Sequence[Scenario], set[str]], AbstractContextManager[MessageHandler]]
@@ -141,6 +154,7 @@ def collect(
     jobs: int = 1,
     host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
     resume: bool = False,
+    minutes: float = math.inf,
     showing: _Showing = _unshown,
     progress: Progress = ignore,
 ) -> Gathered:
@@ -154,15 +168,18 @@ def collect(
     options: seed, robot, weather, goal, own_camera and camera are used.
     episodes: number of episodes in the data set; by default all that are solved.
     host: where the expert is queried.
+    minutes: time after which no further episode begins; `resume` continues.
     showing, progress: display of the run.
 
     Raises RunError for a folder of another data set. Raises UsageError and SpecError for invalid
     arguments, and MachineError if the machine lacks a requirement.
     """
-    bags = collecting.format == "rosbag2"
-    if bags:
+    ends_s = time.monotonic() + 60.0 * minutes
+    form = collecting.format
+    if form == "rosbag2":
         message_store()
-    check_parquet()
+    if form != "raw":
+        check_parquet()
     policy = importable_name(policy)
     collecting = msgspec.structs.replace(collecting, learner=importable_name(collecting.learner))
     options = msgspec.structs.replace(options, collecting=collecting, seed=options.seed or 0)
@@ -171,9 +188,11 @@ def collect(
     wanted = episodes or (
         len(source.structures) * len(source.seeds) if isinstance(source, Fresh) else None
     )
-    rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, progress)
+    rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, ends_s, progress)
     spec = rounds.asked(wanted or len(rounds.all), expert)
     _open(out, spec, resume)
+    if form == "raw":
+        _write_about(out, spec, demonstrator)
     beside = (
         None
         if learner is None
@@ -193,9 +212,11 @@ def collect(
         run = 0
         taken = 0
         number = 0
-        while len(found) < spec.episodes and number < _MOST_ROUNDS:
+        blocks = -(-spec.episodes // _BLOCK) if form == "raw" else 1
+        while len(found) < spec.episodes and number < _MOST_ROUNDS * blocks and not rounds.over():
             lacking = spec.episodes - len(found)
             count = lacking + (lacking // 2 + 1 if number else 0)
+            count = min(count, _BLOCK) if form == "raw" else count
             held, scenarios = rounds.opened(stack, number, taken, count)
             if held is None:
                 break
@@ -205,7 +226,8 @@ def collect(
             run += len(scenarios)
             taken = taken + count
             number = number + 1
-        if not found:
+        whole = len(found) >= spec.episodes or not rounds.over()
+        if not found and whole:
             told = (
                 "; ".join(f"{words} ({count})" for words, count in dropped.most_common())
                 or "none were drawn"
@@ -213,12 +235,12 @@ def collect(
             raise SpecError(f"{out}: nothing to keep of {run} episodes: {told}")
         kept = found[: spec.episodes]
         back = None
-        if bags:
+        if whole and form == "rosbag2":
             _write_bags(out, {one.scenario.id: runs[one.scenario.id] for one in kept}, progress)
-        elif not (out / "meta").exists():
+        elif whole and form == "lerobot" and not (out / "meta").exists():
             back = _written(out, kept, spec, demonstrator, progress)
-    rows = sum(len(one.load()) for one in kept)
-    return Gathered(len(kept), rows, run, dropped, len(found) - len(kept), back, bags)
+    rows = sum(len(one.load()) for one in kept) if whole and form != "raw" else 0
+    return Gathered(len(kept), rows, run, dropped, len(found) - len(kept), back, form, whole)
 
 
 @dataclass(frozen=True)
@@ -231,7 +253,12 @@ class _Rounds:
     demonstrator: Demonstrator
     options: EpisodeOptions
     jobs: int
+    ends_s: float
     progress: Progress
+
+    def over(self) -> bool:
+        """Return whether the time is up."""
+        return time.monotonic() > self.ends_s
 
     @property
     def all(self) -> tuple[Scenario, ...]:
@@ -274,7 +301,7 @@ class _Rounds:
         """Return the run folder of a round and its scenarios. Scenarios of an existing folder are
         read.
         """
-        path = self.out / _RUNS / f"{number:02d}"
+        path = self.out / RUNS / f"{number:02d}"
         if begun := (path / "run.json").exists():
             suite = read_suite(path / "scenarios.json")
         else:
@@ -295,7 +322,9 @@ class _Rounds:
         else:
             chosen = self.all[taken : taken + count]
             made = msgspec.structs.replace(self.source, scenarios=chosen)
-        return with_weather(with_robot(made, self.options.robot), self.options.weather)
+        made = with_weather(with_robot(made, self.options.robot), self.options.weather)
+        collecting, seed = self.options.collecting or DemoOptions(), self.options.seed or 0
+        return msgspec.structs.replace(made, scenarios=varied(made.scenarios, collecting, seed))
 
     def run(
         self, held: RunFolder, scenarios: Sequence[Scenario], hello: Hello, showing: _Showing
@@ -306,7 +335,9 @@ class _Rounds:
         if todo:
             with showing(scenarios, done) as hear:
                 transport = LocalProcesses(held.path / "logs", self.jobs)
-                run_all(held, todo, hello, transport, tell=hear, options=self.options)
+                run_all(
+                    held, todo, hello, transport, tell=hear, options=self.options, over=self.over
+                )
         held.finish()
 
 
@@ -349,7 +380,7 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
             not out.is_dir() or any(one.name != f"{_ASKED}.part" for one in out.iterdir())
         ):
             raise RunError(f"{out} exists and is no data set. Choose another --out.")
-        (out / _RUNS).mkdir(parents=True, exist_ok=True)
+        (out / RUNS).mkdir(parents=True, exist_ok=True)
         write_atomic(path, msgspec.json.format(msgspec.json.encode(spec), indent=1) + b"\n")
     except OSError as error:
         raise unwritable(out, error) from error
@@ -358,7 +389,10 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
 def _kept(held: RunFolder, scenarios: Sequence[Scenario], dropped: Counter[str]) -> list[Collected]:
     """Return the episodes of a run with a demonstration, in the order of its scenarios."""
     found = []
+    done = held.finished()
     for scenario in scenarios:
+        if scenario.id not in done:
+            continue  # the time was up
         folder = held.episode_folder(scenario.id)
         record = Record.load(folder / "record.json")
         path = folder / DEMONSTRATION
@@ -405,12 +439,45 @@ def _written(
     progress: Progress,
 ) -> ReadBack:
     """Write the data set, read it back, and only then move it to its place."""
+    from scenarios.tools.dataset.lerobot import Filmed, write_lerobot
+    from scenarios.tools.dataset.read import read_back
+
     progress(_STAGE)
     camera = spec.collecting.camera
     robot = kept[0].scenario.robot
     eye = camera.mount if isinstance(camera.mount, str) else "camera"
     filmed = Filmed(eye, camera.size, round(spec.collecting.rate_hz))
-    about: dict[str, Any] = {
+    about = _about(spec, demonstrator, robot)
+    writing = out / _WRITING
+    try:
+        for name in (_WRITING, *_PARTS):
+            shutil.rmtree(out / name, ignore_errors=True)
+        writing.mkdir()
+        write_lerobot(writing, kept, filmed, robot, about)
+        back = read_back(writing, kept, progress)
+        for name in _PARTS:
+            (writing / name).rename(out / name)
+        writing.rmdir()
+    except OSError as error:
+        raise unwritable(
+            out, error, "episodes are kept; make room and go on with --resume"
+        ) from error
+    return back
+
+
+def _write_about(out: Path, spec: CollectSpec, demonstrator: Demonstrator) -> None:
+    """Write what packing needs beside the runs. Raises MachineError."""
+    about = _about(spec, demonstrator, spec.robot or COURIER.name)
+    try:
+        write_atomic(out / ABOUT, json.dumps(about, indent=1).encode() + b"\n")
+    except OSError as error:
+        raise unwritable(out, error) from error
+
+
+def _about(spec: CollectSpec, demonstrator: Demonstrator, robot: str) -> dict[str, Any]:
+    """Return how the data set was collected."""
+    camera = spec.collecting.camera
+    return {
         "rate_hz": spec.collecting.rate_hz,
         "waypoint_s": spec.collecting.waypoint_s,
         "waypoints": spec.collecting.waypoints,
@@ -431,18 +498,3 @@ def _written(
         "renderer": spec.renderer,
         "versions": spec.versions,
     }
-    writing = out / _WRITING
-    try:
-        for name in (_WRITING, *_PARTS):
-            shutil.rmtree(out / name, ignore_errors=True)
-        writing.mkdir()
-        write_lerobot(writing, kept, filmed, robot, about)
-        back = read_back(writing, kept, progress)
-        for name in _PARTS:
-            (writing / name).rename(out / name)
-        writing.rmdir()
-    except OSError as error:
-        raise unwritable(
-            out, error, "episodes are kept; make room and go on with --resume"
-        ) from error
-    return back

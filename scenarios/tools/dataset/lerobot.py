@@ -16,8 +16,7 @@ videos/<key>/chunk-000/file-000.mp4  the pictures, one for each row, in its orde
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -28,10 +27,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.results.record import Record
-from cosim.spec.scenario import Scenario
+from cosim.core.packed_demos import LABELS
 from scenarios.episodes.clip import CODEC, PIXELS, join_clips
-from scenarios.episodes.demonstration import Demonstration
+from scenarios.tools.dataset.collected import Collected
 
 CODEBASE_VERSION: Final = "v3.0"
 _FILE: Final = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -48,13 +46,13 @@ _QUANTILES: Final = (0.01, 0.1, 0.5, 0.9, 0.99)
 _SPEEDS: Final = ("v_mps", "w_radps")
 
 
-@dataclass(frozen=True)
-class Collected:
-    """Accepted episode. load: reads its demonstration from the disk at each call."""
+def feature_of(extra: str) -> str:
+    """Return the name of the feature of a sensor or a label.
 
-    scenario: Scenario
-    record: Record
-    load: Callable[[], Demonstration]
+    >>> feature_of("imu"), feature_of("free")
+    ('observation.imu', 'label.free')
+    """
+    return f"{'label' if extra in LABELS else 'observation'}.{extra}"
 
 
 class Filmed(NamedTuple):
@@ -189,8 +187,8 @@ def _rows(
         part: dict[str, NDArray[Any]] = {"observation.state": shown.state}
         if not np.isnan(shown.goal).all():
             part["observation.goal"] = shown.goal
-        for sensor, readings in shown.sensors.items():
-            part[f"observation.{sensor}"] = readings.reshape(count, -1)
+        for name, readings in shown.extras.items():
+            part[feature_of(name)] = readings.reshape(count, -1)
         part |= {
             "action": shown.command,
             "waypoints": shown.waypoints.reshape(count, -1),

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,13 +14,15 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cosim.core.errors import RunError, SpecError
-from cosim.core.packed_demos import SENSORS, Packed
+from cosim.core.errors import RunError
+from cosim.core.packed_demos import EXTRAS, LABELLED_PEOPLE, Packed
 from cosim.core.progress import Progress, ignore
 from cosim.spec.sensors import PEOPLE_ROWS
+from cosim.spec.weather import CLEAR
 from scenarios.episodes.clip import read_pictures
 from scenarios.episodes.demonstration import glimpse
-from scenarios.tools.dataset.lerobot import CODEBASE_VERSION, Collected
+from scenarios.tools.dataset.collected import Collected, packed_meta, refuse_unlike
+from scenarios.tools.dataset.lerobot import CODEBASE_VERSION, feature_of
 
 _READING: Final = "reading the pictures"
 _ALIKE: Final = 8.0
@@ -146,8 +147,8 @@ def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = 
                 held.rows["waypoints"][here], shown.waypoints.reshape(len(shown), -1)
             )
             and all(
-                np.array_equal(held.rows[f"observation.{name}"][here], rows.reshape(len(shown), -1))
-                for name, rows in shown.sensors.items()
+                np.array_equal(held.rows[feature_of(name)][here], rows.reshape(len(shown), -1))
+                for name, rows in shown.extras.items()
             )
         )
         if not same:
@@ -171,12 +172,6 @@ def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = 
     return ReadBack(len(held), float(means[0]), float(means[1]))
 
 
-_SAME: Final = ("rate_hz", "waypoint_s", "waypoints", "goal", "camera", "robot")
-"""Requirement for data sets that are merged into one file."""
-_SENSORS: Final = {"lidar": None, "imu": "none", "people": "none"}
-"""Sensors that must be the same too, with the value of a data set that does not state them."""
-
-
 def packed_sets(
     folders: Sequence[Path], size: tuple[int, int] | None = None, progress: Progress = ignore
 ) -> Packed:
@@ -187,13 +182,7 @@ def packed_sets(
     Raises RunError for a folder without a data set, SpecError for data sets that do not match.
     """
     held = [read_data_set(folder) for folder in folders]
-    for one, other in pairwise(held):
-        for name in (*_SAME, *_SENSORS):
-            mine, theirs = _stated(one, name), _stated(other, name)
-            if mine != theirs:
-                raise SpecError(
-                    f"{one.folder} and {other.folder}: {name} is {mine} here and {theirs} there"
-                )
+    refuse_unlike([(one.folder, one.about) for one in held])
     wide, high = size or held[0].info["features"][_eye(held[0])]["shape"][1::-1]
     count = sum(map(len, held))
     frames = np.empty((count, high, wide, 3), np.uint8)
@@ -218,14 +207,11 @@ def packed_sets(
     )
     first = np.cumsum([0, *(len(one.episodes) for one in held)])
     episode = [one.rows["episode_index"] + before for one, before in zip(held, first, strict=False)]
-    listed = [episode for one in held for episode in one.episodes]
-    meta = {name: _stated(held[0], name) for name in (*_SAME, *_SENSORS)} | {
-        "policy": [one.about["policy"] for one in held],
-        "noise": [one.about["noise"] for one in held],
-        "learner": [one.about.get("learner", "") for one in held],
-        "scenarios": [one["scenario"] for one in listed],
-        "structures": [one["structure"] for one in listed],
-    }
+    listed = [
+        {"weather": one.about.get("weather") or CLEAR} | episode
+        for one in held
+        for episode in one.episodes
+    ]
     return Packed(
         frames=frames,
         state=column("observation.state"),
@@ -236,25 +222,20 @@ def packed_sets(
         disturbed=column("disturbed").astype(bool),
         episode=np.concatenate(episode).astype(np.int32),
         frame=column("frame_index").astype(np.int32),
-        meta=meta,
+        meta=packed_meta([one.about for one in held], listed),
         **{
-            name: column(f"observation.{name}").reshape(count, *_shape(held[0], name))
-            for name in SENSORS
-            if f"observation.{name}" in held[0].rows
+            name: column(feature_of(name)).reshape(count, *_shape(held[0], name))
+            for name in EXTRAS
+            if feature_of(name) in held[0].rows
         },
     )
-
-
-def _stated(held: DataSet, name: str) -> Any:
-    """Return an option of a collection."""
-    return held.about.get(name, _SENSORS[name]) if name in _SENSORS else held.about[name]
 
 
 def _shape(held: DataSet, name: str) -> tuple[int, ...]:
     """Return the shape of a sensor's reading."""
     if name == "scan":
         return held.about["lidar"]["rings"], held.about["lidar"]["rays"]
-    return (PEOPLE_ROWS, -1) if name == "people" else (-1,)
+    return {"people": (PEOPLE_ROWS, -1), "near": (LABELLED_PEOPLE, -1)}.get(name, (-1,))
 
 
 def _eye(held: DataSet) -> str:

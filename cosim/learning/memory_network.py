@@ -1,0 +1,197 @@
+"""Network with a memory: the last two pictures, goal, speeds and its memory to a plan.
+
+A convolutional encoder sees each picture with the one before it. A gated recurrent unit (Cho et
+al., 2014) carries what was seen. Like `network`, it has no normalisation layers, so the exported
+graph holds the trained parameters, and residual blocks start close to the identity.
+
+Auxiliary heads predict the labels of `cosim collect --labels`. They shape the features in training,
+and are outputs of the graph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from cosim.core.packed_demos import FREE_RAYS
+from cosim.learning.network import TURN_BINS, WAYPOINTS, NetworkOutput, Parameters
+
+PICTURES: Final = 2
+"""Number of pictures in the input, the newest last."""
+MEMORY: Final = 256
+"""Numbers in the memory."""
+NEAR: Final = 4
+"""Number of the nearest people that are predicted."""
+NEAR_VALUES: Final = 6
+"""Values of a person: log odds of presence and of a hand held out; x, y, vx, vy in their units."""
+SIGNALS: Final = 3
+"""Classes of signals: none, walk, wait."""
+EVENTS: Final = 9
+"""Classes of events: none, and the eight kinds."""
+
+_IMAGE: Final = 320
+_TOLD: Final = 64
+_JOINED: Final = 320
+_SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
+    "stem": (24, 3 * PICTURES, 5, 5),
+    "down1": (48, 24, 3, 3),
+    "block2a": (48, 48, 3, 3),
+    "block2b": (48, 48, 3, 3),
+    "down2": (96, 48, 3, 3),
+    "block3a": (96, 96, 3, 3),
+    "block3b": (96, 96, 3, 3),
+    "block4a": (96, 96, 3, 3),
+    "block4b": (96, 96, 3, 3),
+    "down3": (160, 96, 3, 3),
+    "block5a": (160, 160, 3, 3),
+    "block5b": (160, 160, 3, 3),
+    "narrow": (64, 160, 1, 1),
+    "seen": (_IMAGE, 64 * 6 * 10),
+    "told": (_TOLD, 4),
+    "joined": (_JOINED, _IMAGE + _TOLD),
+    "arriving": (3 * MEMORY, _JOINED),
+    "kept": (3 * MEMORY, MEMORY),
+    "known": (_JOINED, _JOINED + MEMORY),
+    "speed": (1, _JOINED),
+    "turn": (TURN_BINS, _JOINED),
+    "stop": (1, _JOINED),
+    "way": (2 * WAYPOINTS, _JOINED),
+    "near": (NEAR * NEAR_VALUES, _JOINED),
+    "free": (FREE_RAYS, _JOINED),
+    "signal": (SIGNALS, _JOINED),
+    "event": (EVENTS, _JOINED),
+}
+"""Shapes of the weights: convolutions (out, in, height, width), linear layers (out, in)."""
+HEADS: Final = ("speed", "turn", "stop", "way", "near", "free", "signal", "event")
+AUXILIARY: Final = ("near", "free", "signal", "event")
+"""Heads of the labels, which are outputs of the graph."""
+STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3": 2}
+"""Strides of the convolutions; 1 if missing."""
+STAGES: Final[tuple[tuple[str, ...], ...]] = (
+    ("stem", "down1"),
+    ("block2a", "block2b"),
+    ("down2",),
+    ("block3a", "block3b"),
+    ("block4a", "block4b"),
+    ("down3",),
+    ("block5a", "block5b"),
+    ("narrow",),
+)
+"""Convolutions in order; a pair that ends in a and b is a residual block."""
+
+
+def is_block(stage: tuple[str, ...]) -> bool:
+    """Return whether a stage is a residual block."""
+    return stage[0].startswith("block")
+
+
+class MemoryOutput(NamedTuple):
+    """Raw outputs at N = B T steps, see `network.NetworkOutput` for the plan.
+
+    near: (N, NEAR, NEAR_VALUES)
+    free: (N, FREE_RAYS) in units of the labels' range
+    signal: (N, SIGNALS) log odds
+    event: (N, EVENTS) log odds
+    memory: (B, MEMORY) after the last step
+    """
+
+    plan: NetworkOutput
+    near: Tensor
+    free: Tensor
+    signal: Tensor
+    event: Tensor
+    memory: Tensor
+
+
+def new_memory_parameters(seed: int) -> dict[str, Tensor]:
+    """Draw float32 parameters from a seed, named "stem.weight", "stem.bias" and so on."""
+    draws = torch.Generator().manual_seed(seed)
+    parameters: dict[str, Tensor] = {}
+    for name, shape in _SHAPES.items():
+        quiet = name.endswith("b") or name in HEADS
+        gates = name in ("arriving", "kept")
+        fan = math.prod(shape[1:])
+        scale = 0.02 if quiet else math.sqrt((1.0 if gates else 2.0) / fan)
+        parameters[f"{name}.weight"] = scale * torch.randn(shape, generator=draws)
+        parameters[f"{name}.bias"] = torch.zeros(shape[0])
+    parameters["speed.bias"] += 0.8
+    parameters["kept.bias"][MEMORY : 2 * MEMORY] += 1.0  # at first the memory mostly stays
+    return parameters
+
+
+def encoded(parameters: Parameters, pictures: Tensor) -> Tensor:
+    """Return (N, _IMAGE) features of pictures (N, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1."""
+
+    def convolved(x: Tensor, name: str) -> Tensor:
+        weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
+        return functional.conv2d(x, weight, bias, STRIDES.get(name, 1), weight.shape[-1] // 2)
+
+    x = (pictures - 0.5) * 4.0
+    for stage in STAGES:
+        if is_block(stage):
+            x = (x + convolved(convolved(x, stage[0]).relu(), stage[1])).relu()
+        else:
+            for name in stage:
+                x = convolved(x, name).relu()
+    return _linear(parameters, x.flatten(1), "seen").relu()
+
+
+def _linear(parameters: Parameters, x: Tensor, name: str) -> Tensor:
+    return functional.linear(x, parameters[f"{name}.weight"], parameters[f"{name}.bias"])
+
+
+def remembered(parameters: Parameters, joined: Tensor, memory: Tensor, keeps: bool) -> Tensor:
+    """Return (B, T, MEMORY) the memory after each step. keeps: False clears it at each step."""
+    arriving = _linear(parameters, joined, "arriving")
+    found = []
+    for step in arriving.unbind(1):
+        kept = _linear(parameters, memory, "kept")
+        reset, update = (step[:, : 2 * MEMORY] + kept[:, : 2 * MEMORY]).sigmoid().chunk(2, 1)
+        new = (step[:, 2 * MEMORY :] + reset * kept[:, 2 * MEMORY :]).tanh()
+        after = update * memory + (1.0 - update) * new
+        found.append(after)
+        memory = after if keeps else memory
+    return torch.stack(found, 1)
+
+
+def forward_steps(
+    parameters: Parameters,
+    pictures: Tensor,
+    goal: Tensor,
+    speeds: Tensor,
+    memory: Tensor,
+    keeps: bool = True,
+) -> MemoryOutput:
+    """Compute the raw outputs of T steps.
+
+    pictures: (B, T, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first
+    goal, speeds: (B, T, 2), see `network.forward`
+    memory: (B, MEMORY) before the first step, 0 at the start of an episode
+    keeps: whether the memory is carried from step to step
+    """
+    batch, steps = goal.shape[:2]
+    image = encoded(parameters, pictures.flatten(0, 1))
+    told = _linear(parameters, torch.cat([goal, speeds], 2).flatten(0, 1), "told").relu()
+    joined = _linear(parameters, torch.cat([image, told], 1), "joined").relu()
+    after = remembered(parameters, joined.unflatten(0, (batch, steps)), memory, keeps)
+    both = torch.cat([joined, after.flatten(0, 1)], 1)
+    known = _linear(parameters, both, "known").relu()
+    raw = {name: _linear(parameters, known, name).float() for name in HEADS}
+    return MemoryOutput(
+        NetworkOutput(
+            raw["speed"].squeeze(1),
+            raw["turn"],
+            raw["stop"].squeeze(1),
+            raw["way"].unflatten(1, (WAYPOINTS, 2)),
+        ),
+        raw["near"].unflatten(1, (NEAR, NEAR_VALUES)),
+        raw["free"],
+        raw["signal"],
+        raw["event"],
+        after[:, -1] if keeps else torch.zeros_like(memory),
+    )

@@ -1,0 +1,190 @@
+"""Row of the network `sidewalk`: two pictures at once and a memory, with auxiliary heads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from cosim.learning.graph import PLAN
+from cosim.learning.kind import GOAL_INPUT, SPEEDS_INPUT, Arrays, Network, pictures_input
+from cosim.learning.memory_graph import MEMORY_INPUTS, NEXT, build_memory_graph
+from cosim.learning.memory_network import (
+    AUXILIARY,
+    MEMORY,
+    NEAR,
+    PICTURES,
+    MemoryOutput,
+    forward_steps,
+    new_memory_parameters,
+)
+from cosim.learning.network import NetworkOutput, Parameters, plan
+from cosim.learning.objective import PLAN_WEIGHTS, PlanErrors, plan_losses
+from cosim.learning.settings import Training
+from cosim.learning.windows import STEPS, WindowExamples, Windows
+
+NEAR_UNIT_M: Final = 10.0
+"""Unit of the predicted places of people."""
+NEAR_UNIT_MPS: Final = 1.5
+"""Unit of the predicted velocities of people."""
+FREE_UNIT_M: Final = 10.0
+"""Unit of the predicted free distances."""
+HAND: Final = 6
+"""Label of the activity of a person who holds out a hand, see `scenarios/episodes/labels.py`."""
+_WEIGHTS: Final = {**PLAN_WEIGHTS, "near": 0.5, "free": 1.0, "signal": 0.2, "event": 0.2}
+_MOST_WINDOWS: Final = 96
+"""Largest number of held-out windows of an evaluation."""
+_AT_ONCE: Final = 16
+
+
+def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOutput:
+    """Return the outputs at the valid steps of windows."""
+    memory = torch.zeros((len(batch.goal), MEMORY), device=batch.goal.device)
+    on_gpu = batch.goal.device.type == "cuda"
+    with torch.autocast("cuda", dtype=torch.bfloat16, enabled=on_gpu):
+        output = forward_steps(
+            parameters, batch.pictures, batch.goal, batch.speeds, memory, training.memory
+        )
+    valid = batch.valid.flatten()
+    return MemoryOutput(
+        NetworkOutput(*(one[valid] for one in output.plan)),
+        near=output.near[valid],
+        free=output.free[valid],
+        signal=output.signal[valid],
+        event=output.event[valid],
+        memory=output.memory,
+    )
+
+
+def _losses(parameters: Parameters, batch: Windows, training: Training) -> dict[str, Tensor]:
+    output = _run(parameters, batch, training)
+    return _parts(output, batch, training)
+
+
+def _parts(output: MemoryOutput, batch: Windows, training: Training) -> dict[str, Tensor]:
+    """Return the parts of the loss; those of auxiliary heads if they are trained."""
+    parts = plan_losses(output.plan, batch)
+    if not training.auxiliary:
+        return parts
+    classes = batch.scene.long()
+    free = (batch.free / FREE_UNIT_M).clamp(max=1.0)
+    return parts | {
+        "near": near_loss(output.near, batch.near),
+        "free": functional.smooth_l1_loss(output.free, free, beta=0.1),
+        "signal": functional.cross_entropy(output.signal, classes[:, 0]),
+        "event": functional.cross_entropy(output.event, classes[:, 1]),
+    }
+
+
+def near_loss(near: Tensor, labels: Tensor) -> Tensor:
+    """Return the loss of the nearest people.
+
+    near: (N, NEAR, NEAR_VALUES) predicted
+    labels: (N, LABELLED_PEOPLE, 6) of `cosim collect --labels`
+    """
+    labels = labels[:, :NEAR]
+    present = labels[:, :, 0]
+    hand = (labels[:, :, 5] == HAND).float()
+    units = torch.tensor(
+        [NEAR_UNIT_M] * 2 + [NEAR_UNIT_MPS] * 2, dtype=near.dtype, device=near.device
+    )
+    off = functional.smooth_l1_loss(
+        near[:, :, 2:], labels[:, :, 1:5] / units, reduction="none", beta=0.1
+    ).sum(2)
+    shown = functional.binary_cross_entropy_with_logits(near[:, :, 1], hand, reduction="none")
+    people = present.sum().clamp(min=1.0)
+    seen = functional.binary_cross_entropy_with_logits(near[:, :, 0], present)
+    return seen + ((off + shown) * present).sum() / people
+
+
+def _errors(
+    parameters: Parameters, examples: WindowExamples, training: Training
+) -> dict[str, float]:
+    """Return errors on held-out windows: of the plan, and of auxiliary heads if they are trained.
+
+    These are the mean error of the place of the nearest person, of free distances, and the share of
+    right signals where there is one, and of right events where there is one.
+    """
+    found, labels = PlanErrors(), _LabelErrors()
+    starts = examples.held_out_starts(_MOST_WINDOWS)
+    with torch.no_grad():
+        for part in np.array_split(starts, -(-len(starts) // _AT_ONCE)):
+            batch = examples.windows(part, STEPS)
+            output = _run(parameters, batch, training)
+            parts = _parts(output, batch, training)
+            loss = sum(_WEIGHTS[name] * float(value) for name, value in parts.items())
+            found.add(output.plan, batch, loss)
+            if training.auxiliary:
+                labels.add(output, batch)
+    return found.means() | (labels.means() if training.auxiliary else {})
+
+
+class _LabelErrors:
+    """Sums and counts of the errors of auxiliary heads."""
+
+    def __init__(self) -> None:
+        self._sums = dict.fromkeys(("near_error_m", "free_error_m", *_CLASSES), (0.0, 0))
+
+    def add(self, output: MemoryOutput, batch: Windows) -> None:
+        there = batch.near[:, 0, 0] > 0.0
+        off = output.near[:, 0, 2:4] * NEAR_UNIT_M - batch.near[:, 0, 1:3]
+        self._add("near_error_m", off[there].norm(dim=1))
+        free = (output.free * FREE_UNIT_M).clamp(0.0, FREE_UNIT_M)
+        self._add("free_error_m", (free - batch.free).abs().mean(1))
+        for name, odds, label in zip(
+            _CLASSES, (output.signal, output.event), batch.scene.long().unbind(1), strict=True
+        ):
+            self._add(name, (odds.argmax(1) == label)[label > 0].float())
+
+    def _add(self, name: str, values: Tensor) -> None:
+        total, count = self._sums[name]
+        self._sums[name] = total + float(values.sum()), count + len(values)
+
+    def means(self) -> dict[str, float]:
+        return {name: total / max(count, 1) for name, (total, count) in self._sums.items()}
+
+
+_CLASSES: Final = ("signals_right", "events_right")
+
+
+def _examples(paths: Sequence[Path], training: Training, device: torch.device) -> WindowExamples:
+    return WindowExamples(paths, training, device)
+
+
+def _graph(parameters: Parameters, training: Training) -> bytes:
+    return build_memory_graph(parameters, training.memory)
+
+
+def _answers(
+    parameters: Parameters, inputs: Arrays, training: Training
+) -> dict[str, NDArray[np.float32]]:
+    """Return the outputs of one step."""
+    pictures, goal, speeds, memory = (torch.from_numpy(inputs[name]) for name in MEMORY_INPUTS)
+    output = forward_steps(
+        parameters, pictures[:, None], goal[:, None], speeds[:, None], memory, training.memory
+    )
+    labels = {name: getattr(output, name).numpy() for name in AUXILIARY}
+    return {PLAN: plan(output.plan).numpy(), NEXT: output.memory.numpy(), **labels}
+
+
+SIDEWALK: Final = Network(
+    examples=_examples,
+    new_parameters=new_memory_parameters,
+    losses=_losses,
+    weights=_WEIGHTS,
+    errors=_errors,
+    graph=_graph,
+    answers=_answers,
+    inputs={
+        "pictures": pictures_input(PICTURES, 1),
+        "goal": GOAL_INPUT,
+        "speeds": SPEEDS_INPUT,
+        "memory": {"what": "state", "output": NEXT},
+    },
+)

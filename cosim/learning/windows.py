@@ -1,0 +1,340 @@
+"""Training windows of consecutive pictures from packed demonstrations.
+
+Windows that contain a moment in which the expert stops or starts are oversampled. A window is
+augmented as a whole: half are mirrored, brightness and tint vary, pictures are shifted, and speeds
+are hidden.
+
+The held-out episodes depend on the names of their scenarios alone. An event and its decoy are on
+the same side, and a later round of DAgger never trains on what an earlier one held out.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cosim.core.errors import RunError
+from cosim.core.packed_demos import LABELS, Packed, read_frames, read_packed
+from cosim.learning.examples import (
+    BRIGHT,
+    CHANGE_SHARE,
+    DARK,
+    HELD_OUT,
+    LISTED,
+    SHIFT_PX,
+    STOPS_MPS,
+    TINT,
+    scaled_goal,
+    scaled_speeds,
+    shifted,
+)
+from cosim.learning.memory_network import EVENTS, MEMORY, PICTURES, SIGNALS
+from cosim.learning.network import (
+    CRUISE_MPS,
+    HEIGHT_PX,
+    TURN_UNIT_RADPS,
+    WAYPOINTS,
+    WIDTH_PX,
+)
+from cosim.learning.settings import Training
+
+STEPS: Final = 40
+"""Steps of a window; 8 s at 5 Hz."""
+DECOY: Final = "-decoy"
+"""End of the id of a decoy."""
+_HIDDEN_SPEEDS: Final = 0.6
+"""Share of windows whose speeds are hidden, see `examples`."""
+_FROM_START: Final = 0.15
+"""Share of windows that begin with an episode."""
+_ROOM: Final = 0.75
+"""Largest share of a GPU's free memory for pictures; more stay in the host's memory."""
+_READERS: Final = 8
+_SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Batch of windows, with rows (N,) of all valid steps, N <= B T.
+
+    pictures: (B, T, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1
+    goal, speeds: (B, T, 2) inputs
+    valid: (B, T) whether a step belongs to the episode; of the fields below only such rows exist
+    speed, turn, stop, way, driven: see `objective.PlanTargets`
+    near: (N, LABELLED_PEOPLE, 6), free: (N, FREE_RAYS), scene: (N, 2) labels
+    """
+
+    pictures: Tensor
+    goal: Tensor
+    speeds: Tensor
+    valid: Tensor
+    speed: Tensor
+    turn: Tensor
+    stop: Tensor
+    way: Tensor
+    driven: Tensor
+    near: Tensor
+    free: Tensor
+    scene: Tensor
+
+
+class WindowExamples:
+    """All demonstrations; pictures on the device if they fit.
+
+    learned, held_out: rows (M,) of training and held-out episodes
+    episodes: numbers of both
+    meta: common metadata of the files, with policy and learner of all of them
+    """
+
+    def __init__(self, paths: Sequence[Path], training: Training, device: torch.device) -> None:
+        with ThreadPoolExecutor(_READERS) as readers:
+            packed = list(readers.map(lambda path: _checked(path, training), paths))
+        self.meta = _common_meta(paths, packed)
+        self._device = device
+        self._frames = _pictures(paths, [len(one) for one in packed], device)
+        firsts = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
+        episode = np.concatenate([one.episode + n for one, n in zip(packed, firsts, strict=False)])
+        frame = np.concatenate([one.frame for one in packed])
+        rows = np.arange(len(episode))
+        self._first = rows - frame
+        self._last = self._first + np.bincount(episode)[episode] - 1
+        names = [name for one in packed for name in one.meta["scenarios"]]
+        weathers = [
+            weather
+            for one in packed
+            for weather in one.meta.get("weathers", ["clear"] * len(one.meta["scenarios"]))
+        ]
+        held_out, used = split_episodes(names, weathers, training)
+        self.learned, self.held_out = rows[used[episode]], rows[held_out[episode]]
+        self.episodes = int(used.sum()), int(held_out.sum())
+        if not len(self.learned) or not len(self.held_out):
+            raise RunError(
+                f"{paths[0]}: of {len(names)} episodes {self.episodes[0]} are trained on and "
+                f"{self.episodes[1]} held out: collect more episodes"
+            )
+
+        def joined(name: str) -> Tensor:
+            arrays = [getattr(one, name) for one in packed]
+            return torch.from_numpy(np.concatenate(arrays)).to(device)
+
+        self._rows = {
+            name: joined(name)
+            for name in ("state", "goal", "command", "waypoints", "driven", *LABELS)
+            if getattr(packed[0], name).size
+        }
+        command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
+        changes = self.learned[((command < STOPS_MPS) != (state < STOPS_MPS))[self.learned]]
+        self._changes = changes if len(changes) else self.learned
+
+    def drawn(self, seed: int, step: int, size: int) -> Windows:
+        """Draw the augmented batch of a step: a function of seed and step."""
+        draws = np.random.default_rng([seed, 0x51DE, step])
+        row = np.where(
+            draws.random(size) < CHANGE_SHARE,
+            draws.choice(self._changes, size),
+            draws.choice(self.learned, size),
+        )
+        start = np.maximum(row - draws.integers(0, STEPS, size), self._first[row])
+        start = np.where(draws.random(size) < _FROM_START, self._first[row], start)
+        batch = self.windows(start, STEPS)
+        light = draws.uniform(np.log(DARK), np.log(BRIGHT), (size, 1)) + draws.uniform(
+            -TINT, TINT, (size, 3)
+        )
+        visible = draws.random(size) >= _HIDDEN_SPEEDS
+        off_px = draws.integers(0, 2 * SHIFT_PX + 1, (2, size, 1, 1))
+        mirrored = draws.random(size) < 0.5
+        return self._augmented(batch, np.exp(light), visible, off_px, mirrored)
+
+    def _augmented(
+        self,
+        batch: Windows,
+        light: NDArray[np.float64],
+        visible: NDArray[np.bool_],
+        off_px: NDArray[np.int64],
+        mirrored: NDArray[np.bool_],
+    ) -> Windows:
+        gain = torch.from_numpy(np.tile(light, (1, PICTURES)).astype(np.float32)).to(self._device)
+        pictures = shifted(batch.pictures.flatten(1, 2), torch.from_numpy(off_px).to(self._device))
+        pictures = pictures.unflatten(1, batch.pictures.shape[1:3])
+        pictures = (pictures * gain[:, None, :, None, None]).clamp(max=1.0)
+        seen = torch.from_numpy(visible.astype(np.float32)).to(self._device)
+        values = {one.name: getattr(batch, one.name) for one in fields(batch)}
+        values |= {"pictures": pictures, "speeds": batch.speeds * seen[:, None, None]}
+        lit = Windows(**values)
+        there = torch.from_numpy(mirrored).to(self._device)
+        other = mirror_windows(lit)
+        which = there[:, None].expand_as(batch.valid)[batch.valid]
+        return Windows(
+            **{
+                name: torch.where(
+                    _shaped(there if name in _PER_WINDOW else which, value),
+                    getattr(other, name),
+                    value,
+                )
+                for name, value in values.items()
+            }
+        )
+
+    def windows(self, start: NDArray[np.int64], steps: int) -> Windows:
+        """Return the windows that begin at some rows, without augmentation.
+
+        Steps after the end of an episode repeat its last row, and are not valid. The batch is as
+        long as its longest window.
+        """
+        steps = min(steps, int((self._last[start] - start).max()) + 1)
+        rows = start[:, None] + np.arange(steps)
+        valid = torch.from_numpy(rows <= self._last[start][:, None]).to(self._device)
+        rows = np.minimum(rows, self._last[start][:, None])
+        before = np.maximum(start - 1, self._first[start])[:, None]
+        shown = torch.from_numpy(np.concatenate([before, rows], 1)).to(self._frames.device)
+        frames = self._frames[shown].to(self._device).permute(0, 1, 4, 2, 3).float() / 255.0
+        at = torch.from_numpy(rows).to(self._device)
+        here = at[valid]
+        command = self._rows["command"][here]
+        driven = self._rows["driven"][here]
+        nothing = torch.zeros((len(here), 0), device=self._device)
+        return Windows(
+            pictures=torch.cat([frames[:, :-1], frames[:, 1:]], 2),
+            goal=scaled_goal(self._rows["goal"][at]),
+            speeds=scaled_speeds(self._rows["state"][at]),
+            valid=valid,
+            speed=command[:, 0] / CRUISE_MPS,
+            turn=command[:, 1].clamp(-TURN_UNIT_RADPS, TURN_UNIT_RADPS),
+            stop=(command[:, 0] < STOPS_MPS).float(),
+            way=self._rows["waypoints"][here][:, :WAYPOINTS],
+            driven=(torch.arange(WAYPOINTS, device=self._device) < driven[:, None]).float(),
+            **{name: self._rows[name][here] if name in self._rows else nothing for name in LABELS},
+        )
+
+    def held_out_starts(self, most: int) -> NDArray[np.int64]:
+        """Return the rows at which held-out windows begin: one after another, at most `most`."""
+        rows = self.held_out
+        starts = rows[(rows - self._first[rows]) % STEPS == 0]
+        found: NDArray[np.int64] = starts[:: max(1, -(-len(starts) // most))]
+        return found
+
+    def first_inputs(self) -> dict[str, NDArray[np.float32]]:
+        """Return the inputs of the graph at the start of the first held-out episode."""
+        batch = self.windows(self.held_out[:1], 1)
+        inputs = {
+            name: getattr(batch, name)[:, 0].cpu().numpy().astype(np.float32)
+            for name in ("pictures", "goal", "speeds")
+        }
+        return inputs | {"memory": np.linspace(-0.5, 0.5, MEMORY, dtype=np.float32)[None]}
+
+
+_PER_WINDOW: Final = ("pictures", "goal", "speeds", "valid")
+
+
+def mirror_windows(batch: Windows) -> Windows:
+    """Mirror windows: left and right exchanged."""
+    side = torch.tensor([1.0, -1.0], device=batch.goal.device)
+    values = {one.name: getattr(batch, one.name) for one in fields(batch)}
+    values |= {
+        "pictures": batch.pictures.flip(4),
+        "goal": batch.goal * side,
+        "speeds": batch.speeds * side,
+        "turn": -batch.turn,
+        "way": batch.way * side,
+        "free": batch.free.flip(1),
+    }
+    if batch.near.ndim == 3:
+        signs = torch.tensor([1.0, 1.0, -1.0, 1.0, -1.0, 1.0], device=batch.goal.device)
+        values["near"] = batch.near * signs
+    return Windows(**values)
+
+
+def split_episodes(
+    names: Sequence[str], weathers: Sequence[str], training: Training
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which episodes are held out, and which are trained on.
+
+    The settings of an ablation leave out training episodes alone. A smaller share is a part of a
+    larger one. Of few episodes the last scenario is held out.
+    """
+    base = [zlib.crc32(name.removesuffix(DECOY).encode()) for name in names]
+    held_out = np.array([np.random.default_rng([one, 0x4E1D]).random() < HELD_OUT for one in base])
+    if held_out.all() or not held_out.any():
+        held_out = np.array([one == base[-1] for one in base])
+    drawn = np.random.default_rng(0x5A4E).random(len(names))
+    used = ~held_out & (drawn < training.share)
+    if not training.decoys:
+        used &= np.array([not name.endswith(DECOY) for name in names])
+    if not training.weather:
+        used &= np.array([weather == "clear" for weather in weathers])
+    return held_out, used
+
+
+def _shaped(which: Tensor, like: Tensor) -> Tensor:
+    return which.view(-1, *[1] * (like.ndim - 1))
+
+
+def _pictures(paths: Sequence[Path], counts: Sequence[int], device: torch.device) -> Tensor:
+    """Load the pictures of all files, on the device if they fit."""
+    size = (sum(counts), HEIGHT_PX, WIDTH_PX, 3)
+    if device.type == "cuda" and np.prod(size) > _ROOM * torch.cuda.mem_get_info(device)[0]:
+        device = torch.device("cpu")
+    whole = torch.empty(size, dtype=torch.uint8, device=device)
+    places = torch.split(whole, list(counts))
+    with ThreadPoolExecutor(_READERS) as readers:
+        list(readers.map(_fill, places, paths))
+    return whole
+
+
+def _fill(place: Tensor, path: Path) -> None:
+    """Load the pictures of a file into a tensor. Raises RunError for another size."""
+    frames = read_frames(path)
+    high, wide = frames.shape[1:3]
+    if (high, wide) != (HEIGHT_PX, WIDTH_PX):
+        raise RunError(
+            f"{path}: pictures of {wide} x {high} pixels, wanted are {WIDTH_PX} x {HEIGHT_PX}: "
+            f"cosim collect --camera {WIDTH_PX}x{HEIGHT_PX}"
+        )
+    place.copy_(torch.from_numpy(frames))
+
+
+def _common_meta(paths: Sequence[Path], packed: Sequence[Packed]) -> dict[str, Any]:
+    """Return the metadata of all files. Raises RunError if they were collected differently."""
+    meta = dict(packed[0].meta)
+    for path, other in zip(paths[1:], packed[1:], strict=True):
+        for field in _SAME_META:
+            if other.meta.get(field) != meta.get(field):
+                raise RunError(
+                    f"{path}: {field} is {other.meta.get(field)}, and {meta.get(field)} in "
+                    f"{paths[0]}: train on demonstrations that were collected alike"
+                )
+    return meta | {
+        name: [value for one in packed for value in one.meta.get(name, [])] for name in LISTED
+    }
+
+
+def _checked(path: Path, training: Training) -> Packed:
+    """Load a file without its pictures. Raises RunError if this network cannot learn from it."""
+    packed = read_packed(path, pictures=False)
+    if not len(packed):
+        raise RunError(f"{path}: holds no demonstration: collect more episodes")
+    if packed.waypoints.shape[1] < WAYPOINTS:
+        raise RunError(
+            f"{path}: {packed.waypoints.shape[1]} waypoints a row, wanted are {WAYPOINTS}"
+        )
+    if np.isnan(packed.goal).any():
+        raise RunError(
+            f"{path}: goals are no points ({packed.meta.get('goal')}): cosim collect --goal "
+            f"route_point"
+        )
+    if training.auxiliary and not packed.scene.size:
+        raise RunError(
+            f"{path}: has no labels for auxiliary heads: cosim collect --labels, or train with "
+            f"--no-auxiliary"
+        )
+    if packed.scene.size and (packed.scene.max(axis=0) >= [SIGNALS, EVENTS]).any():
+        raise RunError(f"{path}: labels of another version: collect it again")
+    return packed

@@ -1,0 +1,20 @@
+# Functions of the training scripts, which work in pieces of MINUTES; sourced, with `here` and `W` set.
+# A step that was done is not done again. One that was stopped is continued by the next call.
+END=$((SECONDS + ${MINUTES:-9} * 60))
+JOBS=${JOBS:-16} COSIM=${COSIM:-cosim} PYTHON=${PYTHON:-python3}
+mkdir -p "$W"
+
+step() { # name, words...: a command that can be interrupted and continued; done once
+  local name=$1 left=$((END - SECONDS)); shift
+  mkdir -p "$(dirname "$W/log/$name")"
+  [ -e "$W/log/$name.done" ] && return 0
+  [ $left -gt 30 ] || { echo "time is up before $name: call again"; exit 1; }
+  timeout -k 30 $left "$@" >> "$W/log/$name.txt" 2>&1 || { tail -n 3 "$W/log/$name.txt"; echo "stopped in $name: call again"; exit 1; }
+  touch "$W/log/$name.done"; echo "$name: done"
+}
+learn() { # name, words...
+  local name=$1; shift
+  step "train-$name" env PYTHONPATH="$here" MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=8000000000 \
+    "$PYTHON" -m cosim.learning "$@" -o "$W/nets/$name" \
+    --minutes "$(awk "BEGIN { print ($END - $SECONDS) / 60 - 0.3 }")" --resume
+}

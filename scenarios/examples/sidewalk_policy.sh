@@ -1,0 +1,103 @@
+#!/usr/bin/env bash
+# From nothing to the table of a policy with a memory: demonstrations, rounds of DAgger, seeds, ablations, scores.
+#
+#   scenarios/examples/sidewalk_policy.sh WORK
+#
+# Works in pieces: stops after MINUTES (9 by default), and continues when called again, until it prints "all done".
+# In round 0 the expert drives, disturbed; in later rounds the learner drives, and the expert's answers are stored. A round collects
+# for COLLECT minutes (8), with JOBS processes (16), in CITIES new cities (48), a multiple of GPUS. COSIM, PYTHON: see small_policy.sh.
+# ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
+# SEEDS: trained on all rounds at the end ("0 1 2"). GPUS: they draw the pictures, and train one network each (1).
+# ABLATIONS=1: trains seed 0 again with each single change. SPLIT, SUITES: what is scored (val; all three).
+# To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
+# MOST: most episodes of a collection with events (100000).
+# ROBOTS: which drive beside the courier ("scout dog"). WEATHERS: drawn for each episode.
+set -uo pipefail
+here=$(cd "$(dirname "$0")/../.." && pwd)
+W=${1:?a folder to work in}
+. "$here/scenarios/examples/pieces.sh"
+ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-8} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
+SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
+MOST=${MOST:-100000} ROBOTS=${ROBOTS-"scout dog"} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
+mkdir -p "$W/demos" "$W/nets" "$W/runs"
+
+gather() { # name, share of JOBS, GPU, most episodes, words...: as many episodes as fit in COLLECT minutes
+  local name=$1 gpu=$3 most=$4 jobs; jobs=$(awk "BEGIN { n = int($2 * $JOBS + 0.5); print n < 1 ? 1 : n }"); shift 4
+  GLCONTEXT_DEVICE_INDEX=$gpu step "collect-$name" bash -c '"$@" || [ $? = 1 ]' - $COSIM collect "$@" --minutes "$COLLECT" \
+    --episodes "$most" --fov 60 --labels --format raw --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
+}
+round() { # number, words of who drives...: collections beside each other, then their arrays
+  local k=$1 first=$((900 + 100 * $1)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0; shift
+  local common=(--city-size 1000 --seed "$k" --astray 0.3 --unsolved "$@")
+  local all=(--cities $first:$((first + CITIES)) "${common[@]}")
+  gather "$k-unit" 0.08 0 "$((60 * JOBS))" unit "${all[@]}" &
+  gather "$k-long" 0.22 $((GPUS - 1)) "$((12 * JOBS))" long-horizon "${all[@]}" &
+  while [ $gpu -lt "$GPUS" ]; do
+    names+=("$k-reactive-$gpu")
+    gather "$k-reactive-$gpu" "0.56 / $GPUS" $gpu "$MOST" reactive --decoys \
+      --cities $((first + gpu * each)):$((first + (gpu + 1) * each)) "${common[@]}" &
+    gpu=$((gpu + 1))
+  done
+  for robot in $ROBOTS; do
+    names+=("$k-$robot")
+    gather "$k-$robot" 0.07 $((${#names[@]} % GPUS)) "$((60 * JOBS))" reactive --decoys --robot "$robot" "${all[@]}" &
+  done
+  wait
+  mkdir -p "$W/packed"
+  for name in "${names[@]}"; do [ -e "$W/log/collect-$name.done" ] || exit 1; done
+  for name in "${names[@]}"; do
+    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --jobs "$JOBS"
+  done
+}
+parts() { # last round: the packed files up to it
+  for k in $(seq "$FIRST" "$1"); do ls "$W"/packed/"$k"-*.npz; done
+}
+sidewalk() { # name, last round, words...
+  local name=$1 last=$2; shift 2
+  learn "$name" $(parts "$last") --network sidewalk --batch "$BATCH" --steps "$STEPS" --rate 5e-4 "$@"
+}
+together() { # what, names...: trainings beside each other, one a GPU
+  local what=$1 number=0 name; shift
+  for name in "$@"; do
+    CUDA_VISIBLE_DEVICES=$((number % GPUS)) "$what" "$name" &
+    number=$((number + 1)); [ $((number % GPUS)) = 0 ] && wait
+  done
+  wait
+  for name in "$@"; do [ -e "$W/log/train-$name.done" ] || exit 1; done
+}
+seed() { sidewalk "$1" $((FIRST + ROUNDS - 1)) --seed "${1##*-}" ${FROM:+--from "$FROM"}; }
+ablation() {
+  local words=(); case $1 in share-*) words=(--share "${1#share-}") ;; no-*) words=("--$1") ;; esac
+  sidewalk "$1" $((FIRST + ROUNDS - 1)) --seed 0 "${words[@]}"
+}
+score() { # name, suite, policy
+  local more=(); [ -e "$W/runs/$1/run.json" ] && more=(--resume)
+  step "run-$1" $COSIM run "$2" --split "$SPLIT" --seed 1 --jobs "$JOBS" --policy "$3" --out "$W/runs/$1" "${more[@]}"
+}
+
+learner=$FROM
+for k in $(seq "$FIRST" $((FIRST + ROUNDS - 1))); do
+  if [ -z "$learner" ]; then
+    round "$k" --noise 0.3
+  else
+    round "$k" --noise 0.7 --learner "onnx:$learner"
+  fi
+  if [ "$k" -lt $((FIRST + ROUNDS - 1)) ]; then
+    sidewalk "round$k" "$k" --seed 0 ${learner:+--from "$learner"}
+    learner=$W/nets/round$k
+  fi
+done
+names=()
+for number in $SEEDS; do names+=("sidewalk-$number"); done
+together seed "${names[@]}"
+if [ "${ABLATIONS:-0}" = 1 ]; then
+  changes=(share-0.01 share-0.1 whole no-memory no-auxiliary no-decoys no-weather)
+  together ablation "${changes[@]}"
+  names+=("${changes[@]}")
+fi
+for suite in $SUITES; do
+  for name in "${names[@]}"; do score "$suite-$name" "$suite" "onnx:$W/nets/$name"; done
+done
+export POLICY=onnx:$W/nets/${names[0]}
+[[ " $SUITES " = *" reactive "* ]] && score reactive-black reactive "$here/scenarios/examples/black_pictures.py:Blinded"
+echo "all done"

@@ -1,0 +1,292 @@
+"""The network with a memory, `cosim train --network sidewalk`. Needs PyTorch, which the lock files
+leave out."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import CosimError, RunError, UsageError
+from cosim.core.packed_demos import FREE_RAYS, LABELLED_PEOPLE, Packed
+from cosim.core.progress import ignore
+from cosim.core.state import Doing
+from cosim.episode.interfaces import Observation
+from cosim.policies.load import load_policy
+from cosim.policies.onnx.feeding import Feeder
+from cosim.policies.onnx.graph import TensorPort
+from cosim.policies.onnx.manifest import BundleManifest
+from cosim.results.run_folder import read_records
+from cosim.spec.goal import PointGoal
+from cosim.spec.robot import COURIER
+from scenarios.episodes.labels import DOINGS, EVENT_NUMBERS, FREE_RANGE_M
+from scenarios.tools.dataset.pack import pack_raw
+from tests.conftest import Cosim
+
+torch = pytest.importorskip("torch", reason="PyTorch is not installed: see `cosim train --help`")
+ort = pytest.importorskip("onnxruntime")
+pytest.importorskip("onnx")
+
+from cosim.learning.bundle import manifest_of  # noqa: E402
+from cosim.learning.memory_graph import MEMORY_INPUTS, build_memory_graph  # noqa: E402
+from cosim.learning.memory_network import (  # noqa: E402
+    EVENTS,
+    MEMORY,
+    forward_steps,
+    new_memory_parameters,
+)
+from cosim.learning.network import HEIGHT_PX, WAYPOINTS, WIDTH_PX, plan  # noqa: E402
+from cosim.learning.settings import Training  # noqa: E402
+from cosim.learning.sidewalk import FREE_UNIT_M, HAND, SIDEWALK, near_loss  # noqa: E402
+from cosim.learning.training import train  # noqa: E402
+from cosim.learning.windows import WindowExamples, mirror_windows, split_episodes  # noqa: E402
+
+CPU = torch.device("cpu")
+BRISK = Training(network="sidewalk", steps=2, batch=2, device="cpu")
+NAMES = ("a", "b", "c", "d", "d-decoy", "e", "f", "g", "h", "i", "j", "k", "l", "m", "n", "o")
+
+
+def street(length: int = 6, labels: bool = True) -> Packed:
+    """Episodes of random pictures, which expert and labels do not depend on."""
+    draws = np.random.default_rng(3)
+    count = len(NAMES) * length
+
+    def numbers(*shape: int) -> np.ndarray:
+        return draws.uniform(-0.6, 0.6, (count, *shape)).astype(np.float32)
+
+    near = numbers(LABELLED_PEOPLE, 6)
+    near[:, :, 0] = np.arange(LABELLED_PEOPLE) < 2
+    truth = {
+        "near": near,
+        "free": np.abs(numbers(FREE_RAYS)),
+        "scene": np.ones((count, 2), np.float32),
+    }
+    return Packed(
+        frames=draws.integers(0, 256, (count, HEIGHT_PX, WIDTH_PX, 3), np.uint8),
+        state=numbers(2),
+        goal=20.0 * numbers(2),
+        command=numbers(2),
+        waypoints=numbers(WAYPOINTS, 2),
+        driven=np.full(count, WAYPOINTS, np.int32),
+        disturbed=np.zeros(count, bool),
+        episode=np.repeat(np.arange(len(NAMES), dtype=np.int32), length),
+        frame=np.tile(np.arange(length, dtype=np.int32), len(NAMES)),
+        meta={
+            "rate_hz": 5.0,
+            "waypoint_s": 0.2,
+            "goal": "route_point",
+            "policy": ["orca"],
+            "learner": [""],
+            "robot": "courier",
+            "scenarios": list(NAMES),
+            "weathers": ["clear", "rain"] * (len(NAMES) // 2),
+            "camera": {"width": WIDTH_PX, "height": HEIGHT_PX, "fov_deg": 60.0, "mount": "front"},
+        },
+        **(truth if labels else {}),
+    )
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("packed") / "street.npz"
+    street().save(path)
+    return path
+
+
+def session_of(graph: bytes) -> object:
+    return ort.InferenceSession(graph, providers=["CPUExecutionProvider"])
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_a_memory_carried_from_step_to_step_is_that_of_the_whole_window(
+    data: Path, keeps: bool
+) -> None:
+    """The graph, queried once for each picture with its own memory, gives the plans of PyTorch for
+    all pictures at once; without a memory each picture alone gives its plan."""
+    parameters = new_memory_parameters(7)
+    examples = WindowExamples([data], BRISK, CPU)
+    batch = examples.windows(examples.held_out[:1], 6)
+    with torch.no_grad():
+        whole = forward_steps(
+            parameters, batch.pictures, batch.goal, batch.speeds, torch.zeros(1, MEMORY), keeps
+        )
+    wanted = plan(whole.plan).numpy()
+    session = session_of(build_memory_graph(parameters, keeps))
+    memory = np.zeros((1, MEMORY), np.float32)
+    for step in range(6):
+        inputs = {
+            name: getattr(batch, name)[:, step].numpy() for name in ("pictures", "goal", "speeds")
+        }
+        found, memory, near = session.run(  # type: ignore[attr-defined]
+            ["plan", "memory_next", "near"], inputs | {"memory": memory}
+        )
+        np.testing.assert_allclose(found[0], wanted[step], atol=1e-4)
+        np.testing.assert_allclose(near[0], whole.near[step].numpy(), atol=1e-4)
+        assert memory.any() == keeps
+    np.testing.assert_allclose(memory, whole.memory.numpy(), atol=1e-4)
+
+
+def test_a_run_feeds_the_graph_the_windows_of_training(data: Path) -> None:
+    """By the bundle's manifest observations become the pictures, goals and speeds of a window from
+    the start of an episode; after a reset the memory is 0 again."""
+    packed = street()
+    examples = WindowExamples([data], BRISK, CPU)
+    batch = examples.windows(np.array([0]), 6)
+    manifest = msgspec.convert(
+        manifest_of("sidewalk", packed.meta, "", SIDEWALK.inputs), BundleManifest
+    )
+    ports = {
+        name: TensorPort(name, np.dtype(np.float32), shape) for name, shape in MEMORY_INPUTS.items()
+    }
+    feeder = Feeder(manifest.inputs, ports, 0)
+    for row in range(6):
+        v_mps, w_radps, x_m, y_m = map(float, (*packed.state[row], *packed.goal[row]))
+        rgb = packed.frames[row]
+        fed = feeder.feed(
+            Observation(row, 0.0, rgb, v_mps, w_radps, COURIER, goal=PointGoal(x_m, y_m))
+        )
+        for name in ("pictures", "goal", "speeds"):
+            np.testing.assert_allclose(fed[name][0], getattr(batch, name)[0, row], atol=1e-6)
+        assert fed["memory"].any() == (row > 0)
+        feeder.remember({"memory_next": np.ones((1, MEMORY), np.float32)})
+    feeder.forget()
+    assert not feeder.feed(
+        Observation(0, 0.0, packed.frames[0], 0.0, 0.0, COURIER, goal=PointGoal(1.0, 0.0))
+    )["memory"].any()
+
+
+def test_a_training_that_was_stopped_ends_with_the_bits_of_one_that_was_not(
+    data: Path, tmp_path: Path
+) -> None:
+    """Two steps at once, and one after the other: the same graph and curve; the bundle is one that
+    runs take, and its size is at most 25 MB."""
+    assert train([data], tmp_path / "one", BRISK, False, ignore).whole
+    first = train([data], tmp_path / "other", replace(BRISK, minutes=1e-9), False, ignore)
+    assert first.step == 1
+    assert train([data], tmp_path / "other", BRISK, True, ignore).whole
+    for name in ("model.onnx", "curve.csv", "manifest.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+    assert (tmp_path / "one/model.onnx").stat().st_size <= 25e6
+    policy = load_policy(f"onnx:{tmp_path / 'one'}")
+    assert policy.manifest.name == "sidewalk" and not policy.manifest.privileged
+
+
+def test_windows_stay_in_their_episode(data: Path) -> None:
+    """A window that is longer than its episode ends with it; its first picture is seen twice."""
+    packed = street()
+    examples = WindowExamples([data], BRISK, CPU)
+    batch = examples.windows(np.array([6, 9]), 5)
+    assert batch.valid.tolist() == [[True] * 5, [True] * 3 + [False] * 2]
+    assert len(batch.speed) == 8 and len(batch.near) == 8
+    np.testing.assert_array_equal(
+        batch.turn.numpy(), packed.command[[6, 7, 8, 9, 10, 9, 10, 11], 1].clip(-0.65, 0.65)
+    )
+    first, second = batch.pictures[0, 0, :3], batch.pictures[0, 0, 3:]
+    assert torch.equal(first, second)
+    assert torch.equal(batch.pictures[1, 0, :3], batch.pictures[0, 2, 3:])
+
+
+def test_the_mirror_exchanges_left_and_right_in_labels_too(data: Path) -> None:
+    """Twice it changes nothing; people change sides, and free distances their order."""
+    examples = WindowExamples([data], BRISK, CPU)
+    batch = examples.windows(np.array([0, 6]), 4)
+    there = mirror_windows(batch)
+    back = mirror_windows(there)
+    assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
+    torch.testing.assert_close(there.near[..., 2], -batch.near[..., 2])
+    torch.testing.assert_close(there.free[:, 0], batch.free[:, -1])
+    torch.testing.assert_close(there.near[..., 1], batch.near[..., 1])
+
+
+def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
+    """The same step gives the same windows, another step gives others."""
+    examples = WindowExamples([data], BRISK, CPU)
+    third, other, again = (examples.drawn(0, step, 3) for step in (3, 4, 3))
+    assert all(torch.equal(value, getattr(again, name)) for name, value in vars(third).items())
+    assert not torch.equal(third.pictures, other.pictures)
+    assert float(third.pictures.min()) >= 0.0 and float(third.pictures.max()) <= 1.0
+
+
+def test_ablations_leave_out_training_episodes_alone() -> None:
+    """Held-out episodes follow from names: the same with any setting, with decoys on the side of
+    their events. A smaller share is a part of a larger one."""
+    names = [f"{kind}-{k}{end}" for kind in "ab" for k in range(200) for end in ("", "-decoy")]
+    weathers = ["clear", "clear", "rain", "rain"] * 200
+
+    def split(**changes: object) -> tuple[np.ndarray, np.ndarray]:
+        return split_episodes(names, weathers, replace(BRISK, **changes))  # type: ignore[arg-type]
+
+    held_out, used = split()
+    assert (held_out[::2] == held_out[1::2]).all() and 0.04 < held_out.mean() < 0.16
+    assert (used == ~held_out).all()
+    tenth, half = split(share=0.1)[1], split(share=0.5)[1]
+    assert 0.05 < tenth.mean() < 0.15 and (half | ~tenth).all()
+    assert not split(decoys=False)[1][1::2].any()
+    assert not split(weather=False)[1][np.array(weathers) == "rain"].any()
+    for changes in ({"share": 0.1}, {"decoys": False}, {"weather": False}):
+        assert (split(**changes)[0] == held_out).all()
+
+
+def test_numbers_of_labels_are_those_of_the_simulator() -> None:
+    """A hand held out, the classes of events and the unit of free distances."""
+    assert 1 + DOINGS.index("stop") == HAND and Doing.__args__ == DOINGS  # type: ignore[attr-defined]
+    assert max(EVENT_NUMBERS.values()) + 1 == EVENTS and FREE_UNIT_M == FREE_RANGE_M
+
+
+def test_people_who_are_missing_do_not_count() -> None:
+    """Without a person only presence is trained; with one also the place."""
+    labels = torch.zeros(1, LABELLED_PEOPLE, 6)
+    near = torch.zeros(1, 4, 6, requires_grad=True)
+    near_loss(near, labels).backward()
+    assert near.grad is not None and not near.grad[..., 1:].any() and near.grad[..., 0].all()
+    labels[0, 0] = torch.tensor([1.0, 5.0, 1.0, 0.0, 0.0, HAND])
+    near.grad = None
+    near_loss(near, labels).backward()
+    assert near.grad[0, 0, 1:4].all() and not near.grad[0, 1:, 1:].any()
+
+
+def test_settings_of_ablations_are_checked(data: Path, tmp_path: Path) -> None:
+    """Another network, a share above 1 and an ablation of `small` are refused; so are data without
+    labels, unless auxiliary heads are left out, and another ablation on resuming."""
+    with pytest.raises(CosimError, match="unknown network 'large'"):
+        Training(network="large")
+    with pytest.raises(UsageError, match="--share must be at most 1"):
+        replace(BRISK, share=1.5)
+    with pytest.raises(UsageError, match="--network small has no memory: use sidewalk"):
+        Training(memory=False)
+    street(labels=False).save(tmp_path / "plain.npz")
+    with pytest.raises(RunError, match="cosim collect --labels, or train with --no-auxiliary"):
+        WindowExamples([tmp_path / "plain.npz"], BRISK, CPU)
+    plain = replace(BRISK, auxiliary=False, steps=1, share=0.5)
+    assert train([tmp_path / "plain.npz"], tmp_path / "net", plain, False, ignore).whole
+    with pytest.raises(RunError, match=r"of another training: share 0\.5, not 1\.0"):
+        train([tmp_path / "plain.npz"], tmp_path / "net", replace(plain, share=1.0), True, ignore)
+
+
+@pytest.mark.engine
+def test_from_the_simulator_to_a_drive(tmp_path: Path, cosim: Cosim) -> None:
+    """Raw demonstrations are collected with labels, in two pieces, packed in parts, trained on, and
+    the bundle drives and then teaches in a round of DAgger."""
+    words = ("collect", "unit", "--event", "crosswalk", "--cities", "900:901", "--city-size", "500")
+    words += ("--labels", "--format", "raw", "--fov", "60", "--astray", "0.5", "--episodes", "2")
+    begun = cosim(*words, "--out", "demos", "--minutes", "1e-9", cwd=tmp_path)
+    assert begun.returncode == 1 and "The time is up after 0 episodes" in begun.stderr
+    done = cosim(*words, "--out", "demos", "--resume", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    parts = pack_raw([tmp_path / "demos"], tmp_path / "d.npz", part=1)
+    assert [one.path.name for one in parts] == ["d-000.npz", "d-001.npz"]
+    training = "train d-000.npz d-001.npz -o net --network sidewalk --steps 1 --batch 1"
+    trained = cosim(*training.split(), "--device", "cpu", cwd=tmp_path)
+    assert trained.returncode == 0, trained.stderr
+    driving = "run unit --scenario crosswalk-7013 --policy onnx:net --out run"
+    ran = cosim(*driving.split(), cwd=tmp_path)
+    (record,) = read_records(tmp_path / "run")
+    assert record.status == "done" and not record.manifest.privileged, ran.stderr
+    shutil.rmtree(tmp_path / "demos")
+    again = ("--noise", "0.7", "--learner", "onnx:net", "--unsolved", "--out", "demos")
+    taught = cosim(*words, *again, cwd=tmp_path)
+    assert taught.returncode == 0, taught.stderr
