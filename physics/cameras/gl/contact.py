@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from physics.cameras.gl.shading import programs
 from physics.people.skeleton import INDEX
 
-_SPOT: Final = np.dtype([("person", "i4"), ("tall", "f4")])
+_SPOT: Final = np.dtype([("person", "i4"), ("tall", "f4"), ("seat", "i4")])
 _VERTEX: Final = f"""
 layout(binding = 0) uniform sampler2D posed;
 in int person; in float tall;
@@ -48,20 +48,26 @@ class ContactShadows:
         self._context = context
         self._counts = np.zeros(0, dtype=np.intp)
         self._room = 0
-        self._held: list[moderngl.Buffer | moderngl.VertexArray] = []
+        self._held: list[moderngl.Buffer] = []
+        self._arrays: dict[int, moderngl.VertexArray] = {}
 
     def set(
-        self, counts: NDArray[np.intp], person: NDArray[np.intp], tall: NDArray[np.floating]
+        self,
+        counts: NDArray[np.intp],
+        person: NDArray[np.intp],
+        tall: NDArray[np.floating],
+        seat: NDArray[np.intp],
     ) -> None:
-        """Upload spots, by picture.
+        """Upload spots, by part of the batch.
 
-        counts: (pictures,) people with spots
+        counts: (parts,) people with spots
         person: (N,) rows of the matrix texture
         tall: (N,) size of the modelled man relative to their family
+        seat: (N,) of their scenes
         """
         self._counts = counts
         table = np.empty(len(person), dtype=_SPOT)
-        table["person"], table["tall"] = person, tall
+        table["person"], table["tall"], table["seat"] = person, tall, seat
         commands = np.zeros((len(counts), 5), dtype=np.uint32)
         commands[:, 0], commands[:, 1], commands[:, 3] = 12, counts, np.cumsum(counts) - counts
         if max(table.nbytes, commands.nbytes) > self._room or not self._held:
@@ -69,23 +75,31 @@ class ContactShadows:
         self._spots.write(table)
         self._commands.write(commands)
 
-    def draw(self, picture: int) -> None:
-        """Darken the ground of a picture. Labels and depth must be masked."""
-        if picture < len(self._counts) and self._counts[picture]:
+    def draw(self, part: int, layers: int) -> None:
+        """Darken the ground of a part of the batch. Labels and depth must be masked.
+
+        layers: `Variant.LAYERS`, or 0
+        """
+        if part < len(self._counts) and self._counts[part]:
             self._context.enable(moderngl.BLEND)
-            self._array.render_indirect(self._commands, moderngl.TRIANGLES, 1, picture)
+            self._array(layers).render_indirect(self._commands, moderngl.TRIANGLES, 1, part)
             self._context.disable(moderngl.BLEND)
 
     def release(self) -> None:
-        for thing in self._held:
+        for thing in (*self._arrays.values(), *self._held):
             thing.release()
+        self._arrays = {}
         self._held = []
 
     def _grow(self, room: int) -> None:
         self.release()
         self._room = room
         self._spots, self._commands = (self._context.buffer(reserve=room) for _ in range(2))
-        drawn = programs(self._context, _VERTEX, _FRAGMENT, False).colour
-        content = [(self._spots, "1i4 1f4/i", "person", "tall")]
-        self._array = self._context.vertex_array(drawn, content)
-        self._held = [self._array, self._spots, self._commands]
+        self._held = [self._spots, self._commands]
+
+    def _array(self, layers: int) -> moderngl.VertexArray:
+        if layers not in self._arrays:
+            drawn = programs(self._context, _VERTEX, _FRAGMENT, layers).colour
+            content = [(self._spots, "1i4 1f4 1i4/i", "person", "tall", "seat")]
+            self._arrays[layers] = self._context.vertex_array(drawn, content, skip_errors=True)
+        return self._arrays[layers]

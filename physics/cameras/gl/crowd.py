@@ -4,8 +4,8 @@ Each batch uploads a few numbers per person: four baked frames with weights, pla
 A first small pass blends the frames into 25 joint matrices per person, stored in a texture.
 They are in metres from the picture's anchor; the vertex shaders of all passes skin with them.
 Bodies of all outfits and levels are in one buffer.
-A pass of a picture is one indirect draw for near people (four joints per vertex) and one for far
-people (two).
+A pass of a part of the batch is one indirect draw for near people (four joints per vertex) and one
+for far people (two).
 """
 
 from __future__ import annotations
@@ -44,9 +44,11 @@ CAST_M: Final = 18.0
 _CONTACT_M: Final = 25.0
 """Maximum distance from the eye of people whose feet darken the ground, metres."""
 
-_INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4")])
+_INSTANCE: Final = np.dtype(
+    [("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4"), ("seat", "i4")]
+)
 """person: row of the matrix texture; dress: row of the colour texture; tall: of the modelled man
-relative to the family."""
+relative to the family; seat: of the scene."""
 _SIT: Final = list(GESTURES).index("sit")
 _SEAT_AHEAD_M: Final = SEATED_BACK_M - 0.1
 """Shift of people in wheelchairs, so that their hips are nearly at their place, metres."""
@@ -55,7 +57,7 @@ _Dress = tuple[tuple[str, ...], bytes, bytes, int, Season, bool]
 _ROW: Final = 3 * len(ROWS)
 _CROWD_MIN: Final = 64
 _KEYS: Final = (LEVELS + 1) * len(ALL)
-"""Number of forms of a picture: outfits by level, plus one level for shadows."""
+"""Number of forms of a part: outfits by level, plus one level for shadows."""
 _ENDS: Final = (0, MESH_LEVELS * len(ALL), LEVELS * len(ALL), _KEYS)
 
 _POSE_VERTEX: Final = """#version 430
@@ -154,13 +156,24 @@ class CrowdDrawing:
         self._dressed: list[_Dress] = []
         self._grow(_CROWD_MIN)
 
-    def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
+    def set(
+        self,
+        watched: Sequence[PeopleSeen],
+        shots: Shots,
+        parts: NDArray[np.intp] | None = None,
+        seats: NDArray[np.intp] | None = None,
+    ) -> None:
         """Upload the people of all pictures, each on the ground.
+
+        parts: part of the batch of each picture, in order; each its own by default
+        seats: of the scenes of the pictures
 
         Binds a framebuffer, and texture units 0 and 1 until all pictures are drawn.
         """
         counts = [len(one.people) for one in watched]
-        self._split = [[0, 0, 0, 0]] * len(watched)
+        parts = np.arange(len(watched)) if parts is None else parts
+        seats = np.zeros(len(watched), dtype=np.intp) if seats is None else seats
+        self._split = [[0, 0, 0, 0]] * (int(parts[-1]) + 1)
         if not sum(counts):
             return
         whose = np.repeat(np.arange(len(watched)), counts)
@@ -196,10 +209,14 @@ class CrowdDrawing:
         told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = xy - shots.anchor[whose], z_m, posed.scale
         told[:, 3, 0], told[:, 3, 1] = np.cos(heading), np.sin(heading)
         self._told.write(told, viewport=(0, 0, 4, len(rows)))
-        self._set_draws(whose, outfit, levels(shots, whose, xy, z_m), seen, casts, girth, rows)
+        table = np.empty(len(rows), dtype=_INSTANCE)
+        table["person"], table["dress"], table["girth"] = np.arange(len(rows)), rows, girth
+        table["tall"], table["seat"] = _TALL[outfit], seats[whose]
+        part = parts[whose]
+        self._set_draws(part, outfit, levels(shots, whose, xy, z_m), seen, casts, table)
         near = (seen & (shots.far_m(whose, xy) < _CONTACT_M)).nonzero()[0]
-        on_picture = np.bincount(whose[near], minlength=len(watched))
-        self._contact.set(on_picture, near, _TALL[outfit[near]])
+        on_part = np.bincount(part[near], minlength=len(self._split))
+        self._contact.set(on_part, near, table["tall"][near], table["seat"][near])
         self._posed.use()
         self._posed.viewport = (0, 0, _ROW, len(rows))
         self._context.enable_only(moderngl.NOTHING)
@@ -224,12 +241,12 @@ class CrowdDrawing:
             self._dressed = who
         return self._worn
 
-    def draw(self, stage: Pass, shadows: int, picture: int = 0) -> None:
-        """Draw the people of a picture; shadow maps of moving objects use the coarsest level.
+    def draw(self, stage: Pass, shadows: int, part: int = 0) -> None:
+        """Draw the people of a part; shadow maps of moving objects use the coarsest level.
 
         shadows: people are shaded by shadow maps
         """
-        near, far, cast, end = self._split[picture]
+        near, far, cast, end = self._split[part]
         if stage == "still" or near == end:
             return
         held = self._instances, self._commands
@@ -240,10 +257,10 @@ class CrowdDrawing:
             self._near.draw(stage, shadows, *held, far - near, near)
             self._far.draw(stage, shadows, *held, cast - far, far)
 
-    def draw_contact(self, picture: int = 0) -> None:
-        """Darken the ground under the feet of the people of a picture, without labels."""
-        if self._split[picture][3]:
-            self._contact.draw(picture)
+    def draw_contact(self, layers: int, part: int = 0) -> None:
+        """Darken the ground under the feet of the people of a part, without labels."""
+        if self._split[part][3]:
+            self._contact.draw(part, layers)
 
     def release(self) -> None:
         self._contact.release()
@@ -255,33 +272,28 @@ class CrowdDrawing:
 
     def _set_draws(
         self,
-        whose: NDArray[np.intp],
+        part: NDArray[np.intp],
         outfit: NDArray[np.intp],
         level: NDArray[np.intp],
         seen: NDArray[np.bool_],
         casts: NDArray[np.bool_],
-        girth: NDArray[np.float32],
-        dress: NDArray[np.intp],
+        table: NDArray[np.void],
     ) -> None:
         """Fill the buffers of instances and draws.
 
-        The order is by picture: near levels, far levels, then shadows as an additional last level.
+        The order is by part: near levels, far levels, then shadows as an additional last level.
         """
         in_view, casting = seen.nonzero()[0], casts.nonzero()[0]
         people = np.concatenate([in_view, casting])
         levels_ = np.concatenate([level[in_view], np.full(len(casting), LEVELS)])
         order, form, commands = runs_of(
-            (whose[people] * (LEVELS + 1) + levels_) * len(ALL) + outfit[people]
+            (part[people] * (LEVELS + 1) + levels_) * len(ALL) + outfit[people]
         )
-        people = people[order]
         start = self._start(form % _KEYS)
         commands[:, 0], commands[:, 2:4] = start[:, 0], start[:, 1:]
         ends = np.arange(len(self._split))[:, None] * _KEYS + np.array(_ENDS)
         self._split = form.searchsorted(ends).tolist()
-        table = np.empty(len(people), dtype=_INSTANCE)
-        table["person"], table["dress"], table["girth"] = people, dress[people], girth[people]
-        table["tall"] = _TALL[outfit[people]]
-        self._instances.write(table)
+        self._instances.write(table[people[order]])
         self._commands.write(commands)
 
     def _start(self, form: NDArray[np.intp]) -> NDArray[np.uint32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import moderngl
 import numpy as np
@@ -15,12 +15,14 @@ from cosim.spec.scenario import Light
 from physics.cameras.gl.context import context
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.lighting import lighting_of
-from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
+from physics.cameras.gl.readback import Readback
+from physics.cameras.gl.shading import SceneBlocks
 from physics.cameras.gl.shots import Shots
-from physics.cameras.gl.targets import Readback, Target
+from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import shot
 
+_NO_SUN: Final = np.eye(4)[None]
 EYE_M = 0.75
 """Height of the eye over flat ground, metres."""
 
@@ -34,7 +36,8 @@ class PeopleAlone:
     def __init__(self, size: tuple[int, int], fov_deg: float) -> None:
         self._size = size
         self._fov_deg = fov_deg
-        self._light = lighting_of(sky_of(Light(shadows=False), 0))
+        self._rows = np.zeros((1, 8, 4), dtype=np.float32)
+        self._rows[0, :7] = lighting_of(sky_of(Light(shadows=False), 0)).rows()
 
     def __enter__(self) -> Self:
         with context() as gl:
@@ -68,14 +71,12 @@ class PeopleAlone:
         eye = np.append(pose.xy, EYE_M)
         taken = shot(eye, eye + np.append(ahead, -0.1), self._size, self._fov_deg)
         shots = Shots([taken])
-        anchor = anchor_of(taken.eye_m)
         with self._context as gl:
             self._crowd.set(
                 [PeopleSeen(street.people, Clock().time_s(street.tick), _flat, shadows=False)],
                 shots,
             )
-            self._blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
-            self._blocks.upload()
+            self._blocks.set(shots.cameras(), _NO_SUN, _NO_SUN, shots.views(), self._rows)
             self._blocks.bind()
             self._target.clear()
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
@@ -83,7 +84,7 @@ class PeopleAlone:
             gl.depth_func = "<"
             self._crowd.draw("colour", shadows=False)
             self._readback.begin()
-            self._readback.copy()
+            self._readback.take()
 
     def end(self) -> Frame:
         """Return the oldest pending picture."""

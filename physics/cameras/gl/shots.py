@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from physics.cameras.gl.shading import anchor_of
+from physics.cameras.gl.shading import anchor_of, camera_matrices
 from physics.cameras.gl.shadows import middle_of
 from physics.cameras.view import VISIBLE_M, Shot
 
@@ -18,8 +18,7 @@ class Shots:
     """N views.
 
     taken: the views themselves
-    anchors, middles: (2,) and (3,) world metres of each, as from `anchor_of` and `middle_of`
-    anchor, middle: the same as (N, 2) and (N, 3) arrays
+    anchor, middle: (N, 2) and (N, 3) world metres, as from `anchor_of` and `middle_of`
     eye: (N, 3)
 
     In all methods, `whose` (M,) is the view of each of (M, 2) points.
@@ -27,14 +26,15 @@ class Shots:
 
     def __init__(self, taken: Sequence[Shot]) -> None:
         self.taken = taken
-        self.anchors = [anchor_of(one.eye_m) for one in taken]
-        self.middles = [middle_of(one.eye_m) for one in taken]
-        self.anchor, self.middle = np.array(self.anchors), np.array(self.middles)
         self.eye = np.array([one.eye_m for one in taken])
+        self.anchor, self.middle = anchor_of(self.eye), middle_of(self.eye)
+        self._half = np.array([one.half_picture for one in taken])
+        self._axes = np.array([one.axes for one in taken])
         rows = []
-        for one in taken:
+        for one, (x, y, _), (_, tall) in zip(
+            taken, self.eye.tolist(), self._half.tolist(), strict=True
+        ):
             view = one.view
-            tan = math.tan(0.5 * math.radians(one.fov_deg))
             heading, half = view.heading_rad, view.half_angle_rad
             wedge = (
                 math.cos(heading),
@@ -43,9 +43,25 @@ class Shots:
                 math.sin(half),
                 view.behind_m,
             )
-            rows.append((*one.eye_m[:2].tolist(), *wedge, 1.75 * 0.5 * one.size[1] / tan))
+            rows.append((x, y, *wedge, 1.75 * 0.5 * one.size[1] / tall))
         self._columns = np.array(rows).T
         self._alone = rows[0] if len(rows) == 1 else None
+
+    def cameras(self) -> Floats:
+        """Return the (N, 4, 4) matrices of `camera_matrix`."""
+        eye = self.eye.copy()
+        eye[:, :2] -= self.anchor
+        return camera_matrices(self._axes, eye, self._half)
+
+    def views(self) -> Floats:
+        """Return the (N, 5, 4) rows of `SceneBlocks.set`."""
+        rows = np.zeros((len(self.eye), 5, 4))
+        rows[:, 0, :3] = self.eye
+        rows[:, 0, :2] -= self.anchor
+        rows[:, 1, :2] = self.anchor
+        rows[:, 2:, :3] = self._axes
+        rows[:, 2:4, 3] = self._half
+        return rows
 
     def sees(self, whose: NDArray[np.intp], xy: Floats, margin_m: float) -> NDArray[np.bool_]:
         """Return the (M,) mask of `View.sees` for each point in its view."""
