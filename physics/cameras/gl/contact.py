@@ -100,6 +100,7 @@ class ContactShadows:
     def _array(self, layers: int) -> moderngl.VertexArray:
         if layers not in self._arrays:
             drawn = programs(self._context, _VERTEX, _FRAGMENT, layers).colour
-            content = [(self._spots, "1i4 1f4 1i4/i", "person", "tall", "seat")]
-            self._arrays[layers] = self._context.vertex_array(drawn, content, skip_errors=True)
+            layout = ("1i4 1f4 1i4/i", "person", "tall", "seat")
+            content = [(self._spots, *(layout if layers else ("1i4 1f4 4x/i", *layout[1:3])))]
+            self._arrays[layers] = self._context.vertex_array(drawn, content)
         return self._arrays[layers]

@@ -14,6 +14,7 @@ pane       clear glass, blended over the finished picture; it casts no shadow
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from itertools import pairwise
 from typing import Final, Literal
 
 import moderngl
@@ -313,7 +314,7 @@ class Things:
             own = commands[drawn]
             own[:, 0], own[:, 2:4] = draws[drawn, k, 0], draws[drawn, k, 1:]
             ends = key[drawn].searchsorted(limits).tolist() if parts > 1 else [0, len(own)]
-            self.draws[material] = [own[i:j] for i, j in zip(ends, ends[1:], strict=False)]
+            self.draws[material] = [own[i:j] for i, j in pairwise(ends)]
         pooled = np.empty(len(form), dtype=POOLED)
         for name in INSTANCE.names or ():
             pooled[name] = rows[name]

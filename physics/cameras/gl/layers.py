@@ -111,6 +111,8 @@ class DepthLayers:
 
     def _texture(self) -> int:
         name = ctypes.c_uint(0)
+        error = _function("glGetError", ctypes.c_uint, "")
+        error()  # of an earlier call
         _function("glGenTextures", None, "ip")(1, ctypes.addressof(name))
         _function("glActiveTexture", None, "u")(_TEXTURE0 + self._context.default_texture_unit)
         _function("glBindTexture", None, "uu")(_TEXTURE_2D_ARRAY, name.value)
@@ -125,7 +127,7 @@ class DepthLayers:
             values |= {_COMPARE_MODE: _COMPARE_REF_TO_TEXTURE, _COMPARE_FUNC: _LEQUAL}
         for key, value in values.items():
             set_to(_TEXTURE_2D_ARRAY, key, value)
-        if _function("glGetError", ctypes.c_uint, "")():
+        if error():
             raise EngineError(
                 f"the graphics driver has no memory for {self.layers} layers of "
                 f"{self._size[0]} x {self._size[1]} pixels: draw fewer or smaller pictures at a time"
@@ -152,6 +154,7 @@ class LayerTarget(Frame):
             self.colour.filter = moderngl.NEAREST, moderngl.NEAREST
             self.frame = self._context.framebuffer([self.colour])
             self._depth.attach(self.frame)
+            self.frame.depth_mask = True  # moderngl knows of no depths
 
     def release(self) -> None:
         self._depth.release()
