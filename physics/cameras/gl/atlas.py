@@ -116,6 +116,7 @@ class Atlas:
             self._readback.begin(len(batch))
             try:
                 batch_drawing(gl).draw(pictures, self._target, self._readback)
+                self._readback.send()
             except BaseException:
                 self._readback.forget()
                 raise

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import ctypes
 from collections import OrderedDict
-from collections.abc import Callable
-from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 import moderngl
 
 from cosim.core.errors import EngineError
+from physics.cameras.gl.driver import function
 from physics.cameras.gl.targets import Frame
 
 _SIZES_MAX: Final = 4
@@ -74,9 +73,7 @@ class DepthLayers:
     def attach(self, frame: moderngl.Framebuffer) -> None:
         """Make them the depths of a framebuffer."""
         frame.use()
-        _function("glFramebufferTexture", None, "uuui")(
-            _FRAMEBUFFER, _DEPTH_ATTACHMENT, self._name, 0
-        )
+        function("glFramebufferTexture", "uuui")(_FRAMEBUFFER, _DEPTH_ATTACHMENT, self._name, 0)
 
     def use(self) -> None:
         """Make them the target of later draws."""
@@ -90,14 +87,14 @@ class DepthLayers:
     def clear(self, layer: int) -> None:
         """Clear one layer."""
         far = ctypes.c_float(1.0)
-        _function("glClearTexSubImage", None, "uiiiiiiiuup")(
+        function("glClearTexSubImage", "uiiiiiiiuup")(
             *(self._name, 0, 0, 0, layer, *self._size, 1),
             *(_DEPTH_COMPONENT, _FLOAT, ctypes.addressof(far)),
         )
 
     def bind(self, unit: int) -> None:
-        _function("glActiveTexture", None, "u")(_TEXTURE0 + unit)
-        _function("glBindTexture", None, "uu")(_TEXTURE_2D_ARRAY, self._name)
+        function("glActiveTexture", "u")(_TEXTURE0 + unit)
+        function("glBindTexture", "uu")(_TEXTURE_2D_ARRAY, self._name)
 
     def release(self) -> None:
         if self._frame is not None:
@@ -105,21 +102,21 @@ class DepthLayers:
             self._frame = None
         if self._name:
             name = ctypes.c_uint(self._name)
-            _function("glDeleteTextures", None, "ip")(1, ctypes.addressof(name))
+            function("glDeleteTextures", "ip")(1, ctypes.addressof(name))
             self._name = 0
         self.layers = 0
 
     def _texture(self) -> int:
         name = ctypes.c_uint(0)
-        error = _function("glGetError", ctypes.c_uint, "")
+        error = function("glGetError", "", "u")
         error()  # of an earlier call
-        _function("glGenTextures", None, "ip")(1, ctypes.addressof(name))
-        _function("glActiveTexture", None, "u")(_TEXTURE0 + self._context.default_texture_unit)
-        _function("glBindTexture", None, "uu")(_TEXTURE_2D_ARRAY, name.value)
-        _function("glTexStorage3D", None, "uiuiii")(
+        function("glGenTextures", "ip")(1, ctypes.addressof(name))
+        function("glActiveTexture", "u")(_TEXTURE0 + self._context.default_texture_unit)
+        function("glBindTexture", "uu")(_TEXTURE_2D_ARRAY, name.value)
+        function("glTexStorage3D", "uiuiii")(
             _TEXTURE_2D_ARRAY, 1, _DEPTH_COMPONENT24, *self._size, self.layers
         )
-        set_to = _function("glTexParameteri", None, "uui")
+        set_to = function("glTexParameteri", "uui")
         filter_ = _LINEAR if self._shadow else _NEAREST
         values = {_MIN_FILTER: filter_, _MAG_FILTER: filter_}
         values |= {_WRAP_S: _CLAMP_TO_EDGE, _WRAP_T: _CLAMP_TO_EDGE}
@@ -181,16 +178,3 @@ class LayerTargets:
         self._sizes[size] = held
         held.room(layers)
         return held
-
-
-_KINDS: Final = {"u": ctypes.c_uint, "i": ctypes.c_int, "p": ctypes.c_void_p}
-
-
-@lru_cache(maxsize=32)
-def _function(name: str, result: Any, kinds: str) -> Callable[..., Any]:
-    """Return a function of the driver. kinds: of its arguments, u, i or p for each"""
-    egl = ctypes.CDLL("libEGL.so.1")
-    egl.eglGetProcAddress.restype = ctypes.c_void_p
-    egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
-    called = ctypes.CFUNCTYPE(result, *(_KINDS[kind] for kind in kinds))
-    return called(egl.eglGetProcAddress(name.encode()))

@@ -85,6 +85,7 @@ class PeopleAlone:
             self._crowd.draw("colour", shadows=False)
             self._readback.begin()
             self._readback.take()
+            self._readback.send()
 
     def end(self) -> Frame:
         """Return the oldest pending picture."""
