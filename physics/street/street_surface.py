@@ -203,7 +203,9 @@ class StreetSurface(PlaceSurface):
         if len(xy) and (cells == cells[0]).all():
             return self.tile((int(cells[0, 0]), int(cells[0, 1]))).height(xy)
         height = np.zeros(len(xy))
-        for i, j in dict.fromkeys(map(tuple, cells.tolist())):
-            here = (cells[:, 0] == i) & (cells[:, 1] == j)
-            height[here] = self.tile((i, j)).height(xy[here])
+        for i in np.unique(cells[:, 0]).tolist():
+            row = cells[:, 0] == i
+            for j in np.unique(cells[row, 1]).tolist():
+                here = row & (cells[:, 1] == j)
+                height[here] = self.tile((i, j)).height(xy[here])
         return height
