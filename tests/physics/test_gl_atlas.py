@@ -74,8 +74,7 @@ def test_layers_hold_the_pictures_of_single_cameras(
         keys = [atlas.join(worlds[k % 3], light) for k, light in enumerate(lights)]
         order = [(0, 1, 2, 3), (3, 0), (1, 2), (0, 3, 1), (2, 1, 0), (1,), (3, 2, 0), (0, 0, 1)]
         found = [
-            atlas.render([(keys[k], *asked[tick]) for k in some])
-            for tick, some in enumerate(order)
+            atlas.render([(keys[k], *asked[tick]) for k in some]) for tick, some in enumerate(order)
         ]
     for tick, some in enumerate(order):
         for k, frame in zip(some, found[tick], strict=True):

@@ -12,16 +12,19 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import Frame, Street
 from cosim.spec.scenario import Light
-from physics.cameras.gl.context import context
+from physics.cameras.gl.context import context, draws_layers
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
+from physics.cameras.gl.layers import LayerTarget
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.readback import Readback
-from physics.cameras.gl.shading import SceneBlocks
+from physics.cameras.gl.shading import SceneBlocks, SeatMaps
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
+from physics.cameras.gl.variants import Variant
 from physics.cameras.sky import sky_of
 from physics.cameras.view import shot
 
+_FIRST: Final = np.zeros(1, dtype=np.intp)
 _NO_SUN: Final = np.eye(4)[None]
 EYE_M = 0.75
 """Height of the eye over flat ground, metres."""
@@ -47,6 +50,9 @@ class PeopleAlone:
                 Target(gl, self._size),
             )
             self._readback = Readback(gl, self._target)
+            self._layers = LayerTarget(gl, self._size)
+            self._seats = SeatMaps(gl)
+            self._variant = Variant.LAYERS if draws_layers(gl) else Variant.NONE
         self._context = gl
         return self
 
@@ -57,7 +63,10 @@ class PeopleAlone:
         trace: TracebackType | None,
     ) -> None:
         with self._context:
-            for thing in (self._crowd, self._blocks, self._target, self._readback):
+            for thing in (
+                *(self._crowd, self._blocks, self._target, self._readback),
+                *(self._layers, self._seats),
+            ):
                 thing.release()
 
     def render(self, pose: Pose, street: Street) -> Frame:
@@ -77,15 +86,28 @@ class PeopleAlone:
                 shots,
             )
             self._blocks.set(shots.cameras(), _NO_SUN, _NO_SUN, shots.views(), self._rows)
-            self._blocks.bind()
-            self._target.clear()
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             gl.front_face = "cw"
             gl.depth_func = "<"
-            self._crowd.draw("colour", shadows=False)
             self._readback.begin()
-            self._readback.take()
+            if self._variant:
+                self._draw_layer()
+            else:
+                self._blocks.bind()
+                self._target.clear()
+                self._crowd.draw("colour", Variant.NONE)
+                self._readback.take()
             self._readback.send()
+
+    def _draw_layer(self) -> None:
+        """Draw the picture as a layer, as on a graphics card."""
+        self._layers.room(1)
+        self._blocks.bind_all()
+        self._seats.set(1, _FIRST, _FIRST)
+        self._seats.bind()
+        self._layers.clear()
+        self._crowd.draw("colour", self._variant)
+        self._readback.take_layers(self._layers, 0, 1, 0)
 
     def end(self) -> Frame:
         """Return the oldest pending picture."""
