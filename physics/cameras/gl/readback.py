@@ -120,6 +120,7 @@ class Readback:
         self._buffer.bind_to_storage_buffer(_BYTES_BINDING)
         words = self._each // 4
         program["places"] = first, place * words, words
+        self._context.memory_barrier()  # llvmpipe else does not see a clear without draws
         program.run((words + _GROUP - 1) // _GROUP, count)
         self._context.memory_barrier()
 
