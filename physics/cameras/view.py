@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -146,20 +146,42 @@ def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotSta
 
     It tilts with the ground, or with the trunk of a robot with legs.
     """
+    return mounted_shot(surface, model, Mounting.of(spec, model), robot)
+
+
+class Mounting(NamedTuple):
+    """Place of a camera on a robot, and its picture.
+
+    at_m: from the robot's frame
+    way: unit vector of the view: ahead, to the left, down
+    """
+
+    at_m: tuple[float, float, float]
+    way: tuple[float, float, float]
+    size: tuple[int, int]
+    fov_deg: float
+
+    @classmethod
+    def of(cls, spec: CameraSpec, model: Robot) -> Mounting:
+        """Return the place of a camera on a robot."""
+        mount = spec.on(model)
+        x, y, z = mount.at_m
+        down, left = math.radians(mount.pitch_down_deg), math.radians(mount.yaw_left_deg)
+        way = math.cos(down) * math.cos(left), math.cos(down) * math.sin(left), math.sin(down)
+        at_m = x, y, z - model.drive.pivot_m
+        return cls(at_m, way, (spec.width, spec.height), spec.fov_deg)
+
+
+def mounted_shot(surface: Surface, model: Robot, mounting: Mounting, robot: RobotState) -> Shot:
+    """Return the view of `robot_shot` of a camera whose place on the robot is known."""
     posture = posture_of(surface, model, robot)
     turn = attitude(posture.roll_rad, posture.pitch_rad, posture.heading_rad)
-    mount = spec.on(model)
-    x, y, z = mount.at_m
-    z -= model.drive.pivot_m
-    down, left = math.radians(mount.pitch_down_deg), math.radians(mount.yaw_left_deg)
-    ahead = math.cos(down) * math.cos(left)
-    aside = math.cos(down) * math.sin(left)
-    below = math.sin(down)
+    (x, y, z), (ahead, aside, below), size, fov_deg = mounting
     eye = np.array(
         [at + a * x + b * y + c * z for at, (a, b, c) in zip(posture.at_m, turn, strict=True)]
     )
     way = np.array([a * ahead + b * aside - c * below for a, b, c in turn])
-    return Shot(eye, eye + way, (spec.width, spec.height), spec.fov_deg)
+    return Shot(eye, eye + way, size, fov_deg)
 
 
 def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: float) -> Shot:

@@ -472,7 +472,7 @@ def _height_above_land(xy: Floats, ramp_to: shapely.Geometry) -> Floats:
     lowest, highest = bounds[:, :2], bounds[:, 2:]
     reach = RAMP_M + 0.01  # beyond it no distance is needed
     inside = (xy[:, None] > lowest - reach) & (xy[:, None] < highest + reach)
-    rows = inside.all(axis=2).any(axis=1).nonzero()[0]
+    rows = np.flatnonzero(np.any(np.all(inside, axis=2), axis=1))
     height[rows] = _up_the_ramp(xy[rows], ramp_to)
     return height
 

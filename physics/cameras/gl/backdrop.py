@@ -114,7 +114,7 @@ class SkyLayers:
     def hold(self, sky: Sky) -> int:
         """Return the layer of a sky. `drop` it when it is not needed any more."""
         texels = sky_texels(sky.radiance)
-        key = hashlib.blake2b(texels.view(np.uint8), digest_size=16).digest()
+        key = hashlib.blake2b(texels.tobytes(), digest_size=16).digest()
         free = len(self._held)
         for layer, held in enumerate(self._held):
             if held is not None and held[0] == key:

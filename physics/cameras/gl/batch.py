@@ -145,8 +145,8 @@ class BatchDrawing:
 
     def _arrange(self, pictures: Sequence[PictureOrder], parts: Sequence[Part]) -> Shots:
         shots = Shots([one.taken for one in pictures])
-        for one, middle, anchor in zip(pictures, shots.middle, shots.anchor, strict=True):
-            one.stage.scene.arrange(one.taken.view, middle, anchor, one.street)
+        for one, lattice in zip(pictures, shots.lattice, strict=True):
+            one.stage.scene.arrange(one.taken.view, lattice, one.street)
         scenes = [one.stage.scene for one in pictures]
         self.street.set(scenes)
         watched = []
@@ -182,7 +182,7 @@ class BatchDrawing:
         views = shots.views()
         for i, one in enumerate(pictures):
             if (shadows := one.stage.shadows) is not None:
-                matrices = shadows.matrices(shots.middle[i], shots.anchor[i], one.stage.light)
+                matrices = shadows.matrices(shots.lattice[i], one.stage.light)
                 suns[i], to_maps[i] = matrices
                 if isinstance(shadows, ShadowSeat):
                     views[i, 0, 3] = shadows.layer
@@ -233,7 +233,7 @@ class BatchDrawing:
                     i = part.first
                     self._blocks.bind(i, sun=True)
                     draw = partial(self._draw_pass, part, stage)
-                    stage.shadows.draw(shots.middle[i], shots.anchor[i], stage.light, draw)
+                    stage.shadows.draw(shots.lattice[i], stage.light, draw)
 
     def _cast_layered(
         self,
@@ -246,13 +246,12 @@ class BatchDrawing:
         """Update the shadow maps of a part. begins: it is the first of the batch with these maps"""
         stage = pictures[part.first].stage
         self._blocks.bind_all(sun=True)
-        lattice = np.hstack([shots.middle, shots.anchor])[part.first : part.end].tolist()
         wanted = {}
         number = {}
-        for i, at in enumerate(lattice, part.first):
+        for i in range(part.first, part.end):
             shadows = pictures[i].stage.shadows
             assert isinstance(shadows, ShadowSeat)
-            wanted[shadows.layer] = (*at, *shadows.to_sun)
+            wanted[shadows.layer] = shots.lattice[i][1:], shadows.to_sun
             number[shadows.layer] = i
         changed = maps.begin_still(wanted)
         if changed:

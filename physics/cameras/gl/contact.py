@@ -86,8 +86,10 @@ class ContactShadows:
             self._context.disable(moderngl.BLEND)
 
     def release(self) -> None:
-        for thing in (*self._arrays.values(), *self._held):
-            thing.release()
+        for array in self._arrays.values():
+            array.release()
+        for buffer in self._held:
+            buffer.release()
         self._arrays = {}
         self._held = []
 

@@ -107,8 +107,8 @@ class MeshPool:
     def hold(self, rows: NDArray[np.void], triangles: NDArray[np.uint32]) -> Piece:
         """Upload a mesh unless the pool has it. `drop` it when it is not needed any more."""
         rows, triangles = np.ascontiguousarray(rows), np.ascontiguousarray(triangles)
-        key = hashlib.blake2b(rows.view(np.uint8), digest_size=16)
-        key.update(triangles.view(np.uint8))
+        key = hashlib.blake2b(rows.tobytes(), digest_size=16)
+        key.update(triangles.tobytes())
         piece, users = self._held.get(key.digest(), (None, 0))
         if piece is None:
             base, first = self._corners.take(len(rows)), self._indices.take(len(triangles))

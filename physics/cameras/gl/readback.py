@@ -73,7 +73,7 @@ class _Landing:
         """Return the memory as an array. It is written again once this and its views are gone."""
         memory = (ctypes.c_ubyte * self.size).from_address(self._at)
         self._lent = weakref.ref(memory)
-        return np.frombuffer(memory, dtype=np.uint8)
+        return np.asarray(np.frombuffer(memoryview(memory), dtype=np.uint8))
 
     def release(self) -> None:
         """Free the memory; no array may be in use."""

@@ -30,7 +30,7 @@ from physics.cameras.gl.lamps import Lamps, WallMap, lamp_heads, lamps_of, neare
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.pool import NO_DRAWS, Piece
 from physics.cameras.gl.scans import scan_rows
-from physics.cameras.gl.shadows import STEP_M
+from physics.cameras.gl.shots import CELL_M, STEP_M, Lattice
 from physics.cameras.gl.street import (
     STEPS,
     TILE_KINDS,
@@ -60,9 +60,8 @@ from physics.street import props
 from physics.street.furniture import KINDS, parts_of
 from physics.street.surface import grounded_obstacles
 
-_CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
-_SLACK_M: Final = _CELL_M * math.sqrt(0.5)
+_SLACK_M: Final = CELL_M * math.sqrt(0.5)
 """Maximum distance of an eye from the middle of its cell, metres."""
 _NEAR_M: Final = 12.0
 """Distance within which objects have all their details, metres."""
@@ -150,10 +149,10 @@ class GlScene:
         self._tiles: dict[Key, _Tile] = {}
         self._keys: list[Key] = []
         self._cell: tuple[int, int] | None = None
-        self._placed = False
+        self._placed_for: tuple[float, ...] | None = None
         self._anchor: Floats = np.zeros(2)
         self._seen_for: tuple[tuple[int, int], int, int | None] | None = None
-        self._still_for: tuple[float, ...] | None = None
+        self._still_for: tuple[tuple[float, ...], tuple[float, ...]] | None = None
         self._lit_for: list[bool | None] = []
         self._lit: _Placed = _NOTHING
         self._fences = [self._fence(barrier) for barrier in world.barriers]
@@ -161,24 +160,23 @@ class GlScene:
         self._obstacles = self._stood(world.obstacles)
         self._obstacle_xy = np.array([(o.x_m, o.y_m) for o in world.obstacles]).reshape(-1, 2)
 
-    def arrange(self, view: View, middle: Floats, anchor: Floats, street: Street) -> None:
-        """Prepare all static objects that a picture can show.
-
-        middle: (3,) of the space with shadows
-        """
-        cell = round(view.eye_m[0] / _CELL_M), round(view.eye_m[1] / _CELL_M)
+    def arrange(self, view: View, lattice: Lattice, street: Street) -> None:
+        """Prepare all static objects that a picture can show."""
+        cell, anchor, middle = lattice.cell, lattice.anchor, lattice.middle
         if cell != self._cell:
             self._stream(cell)
             self._cell = cell
-        if not self._placed or (anchor != self._anchor).any():
-            self._place(anchor)
+        if anchor != self._placed_for:
+            self._place(np.array(anchor))
+            self._placed_for = anchor
         self._light(street)
         seen_for = cell, *_sector(view)
         if seen_for != self._seen_for:
             self._choose(*seen_for)
             self._seen_for = seen_for
-        if self._shadows:
-            self._stand(middle, anchor)
+        if self._shadows and (middle, anchor) != self._still_for:
+            self._stand(middle, np.array(anchor))
+            self._still_for = middle, anchor
 
     def lamps(self, view: View, vehicles: Vehicles) -> Lamps | None:
         """Return the lamps of a view after `arrange`, and prepare their wall map; None by day."""
@@ -226,7 +224,7 @@ class GlScene:
 
     def _stream(self, cell: tuple[int, int]) -> None:
         """Load the tiles around a cell, the nearest first."""
-        x, y = cell[0] * _CELL_M, cell[1] * _CELL_M
+        x, y = cell[0] * CELL_M, cell[1] * CELL_M
         keys = [key for _, key in sorted(tile_distances_within(x, y, VISIBLE_M + _SLACK_M))]
         if keys == self._keys:
             return
@@ -250,12 +248,11 @@ class GlScene:
         self._posts = [
             one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)
         ]
-        self._placed = False
+        self._placed_for = None
 
     def _place(self, anchor: Floats) -> None:
         """Set the anchor that all positions are relative to."""
         self._anchor = anchor
-        self._placed = True
         self._seen_for = None
         self._still_for = None
         self._lit_for = []
@@ -270,13 +267,13 @@ class GlScene:
 
     def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
         """Select everything visible from any eye in the cell with a heading in the sector."""
-        offset = self._stands_xy - np.multiply(cell, _CELL_M)
+        offset = self._stands_xy - np.multiply(cell, CELL_M)
         away = np.hypot(offset[:, 0], offset[:, 1])
         chosen = away < self._stands_seen_m + _SLACK_M
         tiles = np.ones(len(self._keys), dtype=bool)
         if half is not None:
             chosen &= _within(offset, sector, half, PROP_MARGIN_M)
-            tiles = _within(self._middles - np.multiply(cell, _CELL_M), sector, half, _TILE_REACH_M)
+            tiles = _within(self._middles - np.multiply(cell, CELL_M), sector, half, _TILE_REACH_M)
         rows = chosen.nonzero()[0]
         form, things = self._stands
         form = np.where(away > _NEAR_M, self._far, form)
@@ -285,25 +282,22 @@ class GlScene:
         for kind in TILE_KINDS:
             if kind != "decals":
                 self._show_tiles("colour", kind, tiles.nonzero()[0])
-        x, y = np.multiply(cell, _CELL_M).tolist()
+        x, y = np.multiply(cell, CELL_M).tolist()
         near = [tile_distance(key, x, y) < DECALS_M + _SLACK_M for key in self._keys]
         self._show_tiles("colour", "decals", (tiles & np.array(near)).nonzero()[0])
 
-    def _stand(self, middle: Floats, anchor: Floats) -> None:
+    def _stand(self, middle: tuple[float, ...], anchor: Floats) -> None:
         """Prepare the shadow casters in the square around `middle`, visible or not."""
-        still = (*middle.tolist(), *anchor.tolist())
-        if still != self._still_for:
-            keys = tiles_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
-            obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
-            self._standing.set(
-                *_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles]),
-                self.seat,
-            )
-            self._show_things("standing", self._standing)
-            tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
-            for kind in ("ground", "walls"):
-                self._show_tiles("still", kind, tiles)
-            self._still_for = still
+        keys = tiles_within(middle[0], middle[1], VISIBLE_M - STEP_M)
+        obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
+        self._standing.set(
+            *_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles]),
+            self.seat,
+        )
+        self._show_things("standing", self._standing)
+        tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
+        for kind in ("ground", "walls"):
+            self._show_tiles("still", kind, tiles)
 
     def _built(self, key: Key) -> _Tile:
         held = self._surface.kept("gl", key, lambda: self._made(key))

@@ -340,7 +340,8 @@ def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
     The first row of the picture is at the bottom, as it is read top first.
     """
     eye = shot.eye_m - (float(anchor[0]), float(anchor[1]), 0.0)
-    return camera_matrices(shot.axes[None], eye[None], np.array([shot.half_picture]))[0]
+    matrices = camera_matrices(shot.axes[None], eye[None], np.array([shot.half_picture]))
+    return np.asarray(matrices[0])
 
 
 def camera_matrices(axes: Floats, eye: Floats, half_picture: Floats) -> Floats:

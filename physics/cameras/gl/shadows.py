@@ -22,11 +22,10 @@ from cosim.core.geometry import Floats
 from physics.cameras.gl.layers import DepthLayers
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Pass
+from physics.cameras.gl.shots import Lattice
 
 SHADOW_REACH_M: Final = 32.0
 """Half the side of the square that has shadows, metres."""
-STEP_M: Final = 8.0
-"""Spacing of the lattice of shadow box middles, metres."""
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
@@ -36,11 +35,6 @@ TO_TEXTURE: Final = np.array(
     [[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
 )
 """Matrix from clip space to texture space."""
-
-
-def middle_of(eye_m: Floats) -> Floats:
-    """Return the (..., 3) middles of the spaces with shadows around eyes, world metres."""
-    return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
 
 
 def shadow_matrix(
@@ -92,13 +86,14 @@ class SunView:
 
     def __init__(self, side_px: int) -> None:
         self._side_px = side_px
-        self._matrices_for: tuple[float, ...] | None = None
+        self._matrices_for: tuple[object, ...] | None = None
         self._matrices: tuple[Floats, Floats] = np.eye(4), TO_TEXTURE
 
-    def matrices(self, middle: Floats, anchor: Floats, light: Lighting) -> tuple[Floats, Floats]:
+    def matrices(self, lattice: Lattice, light: Lighting) -> tuple[Floats, Floats]:
         """Return `shadow_matrix`, and the same to texture space; the last ones are cached."""
-        key = (*middle.tolist(), *anchor.tolist())
+        key = lattice.anchor, lattice.middle
         if key != self._matrices_for:
+            middle, anchor = np.array(lattice.middle), np.array(lattice.anchor)
             from_at = shadow_matrix(middle, anchor, light.to_sun, self._side_px)
             self._matrices_for = key
             self._matrices = (from_at, TO_TEXTURE @ from_at)
@@ -126,14 +121,12 @@ class ShadowMaps(SunView):
         texture.repeat_x = texture.repeat_y = False
         return texture
 
-    def draw(
-        self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Pass], None]
-    ) -> None:
+    def draw(self, lattice: Lattice, light: Lighting, draw: Callable[[Pass], None]) -> None:
         """Update the maps, within `casting`.
 
         The scene block must hold their matrix as its camera.
         """
-        key = (*middle.tolist(), *anchor.tolist(), *light.to_sun.tolist())
+        key = (*lattice.anchor, *lattice.middle, *light.to_sun.tolist())
         if key != self._drawn_for:
             self._draw("still", draw)
             self._drawn_for = key
@@ -178,7 +171,7 @@ class ShadowLayers:
             DepthLayers(context, (side, side), shadow=True) for side in sides
         )
         self._seats: set[int] = set()
-        self._drawn: dict[int, tuple[float, ...]] = {}
+        self._drawn: dict[int, object] = {}
 
     def take(self) -> int:
         """Return an unused layer of the static maps."""
@@ -191,7 +184,7 @@ class ShadowLayers:
         self._seats.remove(layer)
         self._drawn.pop(layer, None)
 
-    def begin_still(self, wanted: Mapping[int, tuple[float, ...]]) -> list[int]:
+    def begin_still(self, wanted: Mapping[int, object]) -> list[int]:
         """Clear the static maps to be drawn, and return their layers.
 
         wanted: what the map of each layer depends on

@@ -4,20 +4,39 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from physics.cameras.gl.shading import anchor_of, camera_matrices
-from physics.cameras.gl.shadows import middle_of
 from physics.cameras.view import VISIBLE_M, Shot
+
+STEP_M: Final = 8.0
+"""Spacing of the lattice of shadow box middles, metres."""
+CELL_M: Final = 2.0
+"""Side of a cell of eyes: what is visible from a scene is decided for a whole cell, metres."""
+
+
+def middle_of(eye_m: Floats) -> Floats:
+    """Return the (..., 3) middles of the spaces with shadows around eyes, world metres."""
+    return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
+
+
+class Lattice(NamedTuple):
+    """Where an eye is on the lattices of cells, anchors and shadow boxes."""
+
+    cell: tuple[int, ...]
+    anchor: tuple[float, ...]
+    middle: tuple[float, ...]
 
 
 class Shots:
     """N views.
 
     taken: the views themselves
+    lattice: of each
     anchor, middle: (N, 2) and (N, 3) world metres, as from `anchor_of` and `middle_of`
     eye: (N, 3)
 
@@ -28,6 +47,9 @@ class Shots:
         self.taken = taken
         self.eye = np.array([one.eye_m for one in taken])
         self.anchor, self.middle = anchor_of(self.eye), middle_of(self.eye)
+        cells = np.round(self.eye[:, :2] / CELL_M).astype(np.int64)
+        columns = (map(tuple, of.tolist()) for of in (cells, self.anchor, self.middle))
+        self.lattice = list(map(Lattice, *columns))
         self._half = np.array([one.half_picture for one in taken])
         self._axes = np.array([one.axes for one in taken])
         rows = []

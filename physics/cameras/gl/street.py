@@ -40,6 +40,7 @@ STEPS: Final[tuple[Step, ...]] = (
     *(("still", kind) for kind in TILE_KINDS),
     *((things, material) for things in ("seen", "standing", "fenced") for material in MATERIALS),
 )
+_OPAQUE: Final[tuple[Material, ...]] = ("solid", "cut-out")
 _PLACE: Final = np.dtype([("middle", "f4", 2), ("middle_in_world", "f4", 2), ("seat", "i4")])
 _PLACE_LAYOUT: Final = ("2f 2f 1i4/i", "middle", "middle_in_world", "seat")
 
@@ -127,11 +128,11 @@ class StreetDrawing:
         far."""
         if stage == "moving":
             return
-        for material in ("solid", "cut-out"):
+        for material in _OPAQUE:
             self._draw_things(
                 "seen" if stage == "colour" else "standing", material, stage, style, part
             )
-        for material in ("solid", "cut-out"):
+        for material in _OPAQUE:
             self._draw_fences(material, stage, style, part)
         self._draw_tiles("walls", stage, style, part)
         self._draw_tiles("ground", stage, style, part)
