@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import moderngl
-import numpy as np
-from numpy.typing import NDArray
 
 from physics.cameras.gl.shading import programs
 from physics.people.skeleton import INDEX
 
-_SPOT: Final = np.dtype([("person", "i4"), ("tall", "f4"), ("seat", "i4")])
+CORNERS: Final = 12
+"""Corners of the two spots of a person."""
 _VERTEX: Final = f"""
 layout(binding = 0) uniform sampler2D posed;
 in int person; in float tall;
@@ -46,63 +45,32 @@ class ContactShadows:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self._counts = np.zeros(0, dtype=np.intp)
-        self._room = 0
-        self._held: list[moderngl.Buffer] = []
         self._arrays: dict[int, moderngl.VertexArray] = {}
 
-    def set(
+    def draw(
         self,
-        counts: NDArray[np.intp],
-        person: NDArray[np.intp],
-        tall: NDArray[np.floating],
-        seat: NDArray[np.intp],
+        instances: moderngl.Buffer,
+        commands: moderngl.Buffer,
+        first: int,
+        count: int,
+        layers: int,
     ) -> None:
-        """Upload spots, by part of the batch.
+        """Draw `count` indirect draws, from `first` on. Labels and depth must be masked.
 
-        counts: (parts,) people with spots
-        person: (N,) rows of the matrix texture
-        tall: (N,) size of the modelled man relative to their family
-        seat: (N,) of their scenes
-        """
-        self._counts = counts
-        table = np.empty(len(person), dtype=_SPOT)
-        table["person"], table["tall"], table["seat"] = person, tall, seat
-        commands = np.zeros((len(counts), 5), dtype=np.uint32)
-        commands[:, 0], commands[:, 1], commands[:, 3] = 12, counts, np.cumsum(counts) - counts
-        if max(table.nbytes, commands.nbytes) > self._room or not self._held:
-            self._grow(max(2 * table.nbytes, 2 * commands.nbytes, 1024))
-        self._spots.write(table)
-        self._commands.write(commands)
-
-    def draw(self, part: int, layers: int) -> None:
-        """Darken the ground of a part of the batch. Labels and depth must be masked.
-
+        instances: as for `Skins`, until `release`
         layers: `Variant.LAYERS`, or 0
         """
-        if part < len(self._counts) and self._counts[part]:
-            self._context.enable(moderngl.BLEND)
-            self._array(layers).render_indirect(self._commands, moderngl.TRIANGLES, 1, part)
-            self._context.disable(moderngl.BLEND)
-
-    def release(self) -> None:
-        for array in self._arrays.values():
-            array.release()
-        for buffer in self._held:
-            buffer.release()
-        self._arrays = {}
-        self._held = []
-
-    def _grow(self, room: int) -> None:
-        self.release()
-        self._room = room
-        self._spots, self._commands = (self._context.buffer(reserve=room) for _ in range(2))
-        self._held = [self._spots, self._commands]
-
-    def _array(self, layers: int) -> moderngl.VertexArray:
         if layers not in self._arrays:
             drawn = programs(self._context, _VERTEX, _FRAGMENT, layers).colour
-            layout = ("1i4 1f4 1i4/i", "person", "tall", "seat")
-            content = [(self._spots, *(layout if layers else ("1i4 1f4 4x/i", *layout[1:3])))]
+            layout = ("1i4 8x 1f4 1i4/i", "person", "tall", "seat")
+            content = [(instances, *(layout if layers else ("1i4 8x 1f4 4x/i", *layout[1:3])))]
             self._arrays[layers] = self._context.vertex_array(drawn, content)
-        return self._arrays[layers]
+        self._context.enable(moderngl.BLEND)
+        self._arrays[layers].render_indirect(commands, moderngl.TRIANGLES, count, first)
+        self._context.disable(moderngl.BLEND)
+
+    def release(self) -> None:
+        """Free the arrays; they are made again when needed."""
+        for array in self._arrays.values():
+            array.release()
+        self._arrays = {}

@@ -102,15 +102,15 @@ class Shots:
         x, y, *_ = self._of(whose)
         return np.asarray(np.hypot(xy[:, 0] - x, xy[:, 1] - y))
 
-    def tall_px(self, whose: NDArray[np.intp], xy: Floats, z_m: Floats) -> Floats:
+    def tall_px(self, whose: NDArray[np.intp], far_m: Floats, z_m: Floats) -> Floats:
         """Return (M,) heights of people in the pictures, in pixels.
 
-        xy: (M, 2) positions
+        far_m: (M,) horizontal distances from the eyes
         z_m: (M,) ground heights
         """
         (*_, px) = self._of(whose)
         dz = z_m + 0.9 - self.eye[whose, 2]
-        return np.asarray(px / np.maximum(np.hypot(self.far_m(whose, xy), dz), 0.1))
+        return np.asarray(px / np.maximum(np.hypot(far_m, dz), 0.1))
 
     def _of(self, whose: NDArray[np.intp]) -> Iterable[Floats] | Iterable[float]:
         """Return the parameters of each point's view as columns; for a single view, as scalars."""
