@@ -203,9 +203,9 @@ class StreetSurface(PlaceSurface):
         if len(xy) and (cells == cells[0]).all():
             return self.tile((int(cells[0, 0]), int(cells[0, 1]))).height(xy)
         height = np.zeros(len(xy))
-        for i in np.unique(cells[:, 0]).tolist():
-            row = cells[:, 0] == i
-            for j in np.unique(cells[row, 1]).tolist():
-                here = row & (cells[:, 1] == j)
-                height[here] = self.tile((i, j)).height(xy[here])
+        key = (cells[:, 0] << 32) + cells[:, 1]
+        for one in set(key.tolist()):
+            here = key == one
+            first = cells[here.argmax()].tolist()
+            height[here] = self.tile((first[0], first[1])).height(xy[here])
         return height

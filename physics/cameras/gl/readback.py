@@ -29,7 +29,7 @@ _GROUP: Final = 64
 _LENT_MAX: Final = 3
 """Maximum number of batches whose memory the caller holds; later ones are copied."""
 _PIXEL_PACK_BUFFER: Final = 0x88EB
-_MAP_READ: Final = 0x0001
+_MAP_READ_WRITE: Final = 0x0003
 _MAP_PERSISTENT: Final = 0x0040
 _MAP_COHERENT: Final = 0x0080
 _CLIENT_STORAGE: Final = 0x0200
@@ -50,7 +50,7 @@ class _Landing:
         function("glGenBuffers", "ip")(1, ctypes.addressof(name))
         bind = function("glBindBuffer", "uu")
         bind(_PIXEL_PACK_BUFFER, name.value)
-        flags = _MAP_READ | _MAP_PERSISTENT | _MAP_COHERENT
+        flags = _MAP_READ_WRITE | _MAP_PERSISTENT | _MAP_COHERENT
         function("glBufferStorage", "ulpu")(_PIXEL_PACK_BUFFER, size, None, flags | _CLIENT_STORAGE)
         at = function("glMapBufferRange", "ullu", "p")(_PIXEL_PACK_BUFFER, 0, size, flags)
         bind(_PIXEL_PACK_BUFFER, 0)
