@@ -88,8 +88,8 @@ class Shot:
     @property
     def steep_rad(self) -> float:
         """Return the angle of the view below the horizon."""
-        ahead = self.target_m - self.eye_m
-        return math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1]))
+        x, y, z = self._way
+        return math.atan2(-z, math.hypot(x, y))
 
     @property
     def half_picture(self) -> tuple[float, float]:
@@ -98,22 +98,22 @@ class Shot:
         return tall * self.size[0] / self.size[1], tall
 
     @cached_property
+    def _way(self) -> tuple[float, float, float]:
+        x, y, z = (self.target_m - self.eye_m).tolist()
+        return x, y, z
+
+    @cached_property
     def view(self) -> View:
-        ahead = self.target_m - self.eye_m
+        x, y, z = self._way
         half_up = math.radians(0.5 * self.fov_deg)
-        lowest = max(math.cos(abs(self.steep_rad) + half_up), 0.05)
+        steep_rad = self.steep_rad
+        lowest = max(math.cos(abs(steep_rad) + half_up), 0.05)
         half_wide = math.atan(math.tan(half_up) * self.size[0] / self.size[1] / lowest)
-        heading_rad = (
-            math.atan2(ahead[1], ahead[0])
-            if math.hypot(ahead[0], ahead[1]) > 0.0
-            else 0.5 * math.pi
-        )
-        past_rad = self.steep_rad + half_up - 0.5 * math.pi
+        heading_rad = math.atan2(y, x) if math.hypot(x, y) > 0.0 else 0.5 * math.pi
+        past_rad = steep_rad + half_up - 0.5 * math.pi
         if past_rad <= 0.0:
             return View(self.eye_m, heading_rad, half_wide)
-        return View(
-            self.eye_m, heading_rad, 0.5 * math.pi, max(-ahead[2], _MOUNT_M) * math.tan(past_rad)
-        )
+        return View(self.eye_m, heading_rad, 0.5 * math.pi, max(-z, _MOUNT_M) * math.tan(past_rad))
 
     @cached_property
     def axes(self) -> Floats:
@@ -121,7 +121,7 @@ class Shot:
 
         A view straight down has north at the top.
         """
-        x, y, z = (self.target_m - self.eye_m).tolist()
+        x, y, z = self._way
         flat = math.hypot(x, y)
         long = math.hypot(x, y, z)
         x, y, z = x / long, y / long, z / long

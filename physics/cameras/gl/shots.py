@@ -87,7 +87,7 @@ class Shots:
 
     def sees(self, whose: NDArray[np.intp], xy: Floats, margin_m: float) -> NDArray[np.bool_]:
         """Return the (M,) mask of `View.sees` for each point in its view."""
-        x, y, cos, sin, cos_half, sin_half, behind, _ = self._of(whose)
+        x, y, cos, sin, cos_half, sin_half, behind = self._of(whose, 0, 7)
         dx, dy = xy[:, 0] - x, xy[:, 1] - y
         ahead = dx * cos + dy * sin
         aside = np.abs(dy * cos - dx * sin)
@@ -99,7 +99,7 @@ class Shots:
 
     def far_m(self, whose: NDArray[np.intp], xy: Floats) -> Floats:
         """Return (M,) horizontal distances of points from the eyes."""
-        x, y, *_ = self._of(whose)
+        x, y = self._of(whose, 0, 2)
         return np.asarray(np.hypot(xy[:, 0] - x, xy[:, 1] - y))
 
     def tall_px(self, whose: NDArray[np.intp], far_m: Floats, z_m: Floats) -> Floats:
@@ -108,10 +108,14 @@ class Shots:
         far_m: (M,) horizontal distances from the eyes
         z_m: (M,) ground heights
         """
-        (*_, px) = self._of(whose)
+        (px,) = self._of(whose, 7, 8)
         dz = z_m + 0.9 - self.eye[whose, 2]
         return np.asarray(px / np.maximum(np.hypot(far_m, dz), 0.1))
 
-    def _of(self, whose: NDArray[np.intp]) -> Iterable[Floats] | Iterable[float]:
-        """Return the parameters of each point's view as columns; for a single view, as scalars."""
-        return self._columns[:, whose] if self._alone is None else self._alone
+    def _of(
+        self, whose: NDArray[np.intp], first: int, end: int
+    ) -> Iterable[Floats] | Iterable[float]:
+        """Return parameters of each point's view as columns; for a single view, as scalars."""
+        if self._alone is None:
+            return self._columns[first:end, whose]
+        return self._alone[first:end]
