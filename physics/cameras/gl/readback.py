@@ -144,10 +144,9 @@ class Readback:
         pictures = begun.pictures
         function("glClientWaitSync", "puq", "u")(begun.fence, _FLUSH_COMMANDS, _FOREVER_NS)
         function("glDeleteSync", "p")(begun.fence)
-        data = begun.landing.lend()[: pictures * self._each]
-        if sum(one.lent for one in self._landings) > _LENT_MAX:
-            data = data.copy()
-        return [self._target.parted(one) for one in data.reshape(pictures, self._each)]
+        data = begun.landing.lend()[: pictures * self._each].reshape(pictures, self._each)
+        held = sum(one.lent for one in self._landings) > _LENT_MAX
+        return [self._target.parted(one.copy() if held else one) for one in data]
 
     def release(self) -> None:
         if self._written is not None:
