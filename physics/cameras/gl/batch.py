@@ -49,6 +49,9 @@ _PEOPLE_MAX: Final = 8192
 """Maximum number of people in a batch; a picture with more is a separate batch."""
 
 
+_NO_SUN: Final = np.eye(4)
+
+
 class Stage(NamedTuple):
     """Resources of a camera: street scene, optional shadow maps, backdrop, light.
 
@@ -177,8 +180,8 @@ class BatchDrawing:
 
     def _arrange_blocks(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Upload the blocks of the pictures and of their shadow passes."""
-        suns = np.tile(np.eye(4), (len(pictures), 1, 1))
-        to_maps = np.tile(TO_TEXTURE, (len(pictures), 1, 1))
+        suns, to_maps = np.empty((2, len(pictures), 4, 4))
+        suns[:], to_maps[:] = _NO_SUN, TO_TEXTURE
         views = shots.views()
         for i, one in enumerate(pictures):
             if (shadows := one.stage.shadows) is not None:

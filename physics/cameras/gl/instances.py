@@ -311,15 +311,17 @@ class Things:
         limits = kinds * np.arange(parts + 1)
         for k, material in enumerate(MATERIALS):
             drawn = draws[:, k, 0] > 0
+            if not drawn.any():
+                continue
             own = commands[drawn]
             own[:, 0], own[:, 2:4] = draws[drawn, k, 0], draws[drawn, k, 1:]
             ends = key[drawn].searchsorted(limits).tolist() if parts > 1 else [0, len(own)]
             self.draws[material] = [own[i:j] for i, j in pairwise(ends)]
-        pooled = np.empty(len(form), dtype=POOLED)
-        for name in INSTANCE.names or ():
-            pooled[name] = rows[name]
-        pooled["seat"] = seat
-        self._rows.write(self._start, pooled[order])
+        pooled = np.empty((len(form), POOLED.itemsize), dtype=np.uint8)
+        pooled[:, : INSTANCE.itemsize] = rows[order].view(np.uint8).reshape(len(form), -1)
+        seats = pooled.view(POOLED)["seat"][:, 0]
+        seats[:] = seat if isinstance(seat, int) else seat[order]
+        self._rows.write(self._start, pooled)
 
     def release(self) -> None:
         self._rows.give(self._start, self._room)

@@ -420,7 +420,7 @@ class SeatMaps:
         self._context = context
         self._room = 0
         self._buffers: list[moderngl.Buffer] = []
-        self._held: list[bytes] = []
+        self._held: tuple[int, bytes, bytes] | None = None
 
     def set(self, count: int, seats: NDArray[np.intp], maps: NDArray[np.intp]) -> None:
         """Upload the places of N scenes.
@@ -432,15 +432,16 @@ class SeatMaps:
             self.release()
             self._room = 2 * count
             self._buffers = [self._context.buffer(reserve=8 * self._room) for _ in range(2)]
-            self._held = [b"", b""]
+            self._held = None
+        wanted = count, seats.tobytes(), maps.tobytes()
+        if wanted == self._held:
+            return
+        self._held = wanted
         pictures = np.arange(len(seats))
-        for i, layers in enumerate((pictures, maps)):
+        for buffer, layers in zip(self._buffers, (pictures, maps), strict=True):
             rows = np.zeros((count, 2), dtype=np.int32)
             rows[seats, 0], rows[seats, 1] = pictures, layers
-            whole = rows.tobytes()
-            if whole != self._held[i]:
-                self._held[i] = whole
-                self._buffers[i].write(whole)
+            buffer.write(rows)
 
     def bind(self, still: bool = False) -> None:
         """Bind the places of pictures, or of static shadow maps, for later draws."""

@@ -27,7 +27,7 @@ def middle_of(eye_m: Floats) -> Floats:
 class Lattice(NamedTuple):
     """Where an eye is on the lattices of cells, anchors and shadow boxes."""
 
-    cell: tuple[int, ...]
+    cell: tuple[int, int]
     anchor: tuple[float, ...]
     middle: tuple[float, ...]
 
@@ -48,11 +48,11 @@ class Shots:
         self.eye = np.array([one.eye_m for one in taken])
         self.anchor, self.middle = anchor_of(self.eye), middle_of(self.eye)
         cells = np.round(self.eye[:, :2] / CELL_M).astype(np.int64)
-        columns = (map(tuple, of.tolist()) for of in (cells, self.anchor, self.middle))
-        self.lattice = list(map(Lattice, *columns))
+        rows = zip(cells.tolist(), self.anchor.tolist(), self.middle.tolist(), strict=True)
+        self.lattice = [Lattice((i, j), tuple(at), tuple(middle)) for (i, j), at, middle in rows]
         self._half = np.array([one.half_picture for one in taken])
         self._axes = np.array([one.axes for one in taken])
-        rows = []
+        columns = []
         for one, (x, y, _), (_, tall) in zip(
             taken, self.eye.tolist(), self._half.tolist(), strict=True
         ):
@@ -65,9 +65,9 @@ class Shots:
                 math.sin(half),
                 view.behind_m,
             )
-            rows.append((x, y, *wedge, 1.75 * 0.5 * one.size[1] / tall))
-        self._columns = np.array(rows).T
-        self._alone = rows[0] if len(rows) == 1 else None
+            columns.append((x, y, *wedge, 1.75 * 0.5 * one.size[1] / tall))
+        self._columns = np.array(columns).T
+        self._alone = columns[0] if len(columns) == 1 else None
 
     def cameras(self) -> Floats:
         """Return the (N, 4, 4) matrices of `camera_matrix`."""
