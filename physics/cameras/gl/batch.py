@@ -23,6 +23,7 @@ from cosim.spec.robot import Robot
 from physics.cameras.gl.air import AirDrawing, LinearTarget
 from physics.cameras.gl.backdrop import Backdrop, SkySeat
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
+from physics.cameras.gl.driver import flush
 from physics.cameras.gl.instances import Forms
 from physics.cameras.gl.lamps import casting_people
 from physics.cameras.gl.layers import LayerTarget, LayerTargets
@@ -290,6 +291,7 @@ class BatchDrawing:
         place: int,
     ) -> None:
         """Draw the pictures of a part as layers. place: number of the first of the batch"""
+        flush()  # people and shadow maps are on their way
         stage = pictures[part.first].stage
         target = self._layers.of(size, len(pictures))
         self._blocks.bind_all()

@@ -29,3 +29,8 @@ def function(name: str, kinds: str, result: str = "") -> Callable[..., Any]:
     returns = _KINDS[result] if result else None
     called = ctypes.CFUNCTYPE(returns, *(_KINDS[kind] for kind in kinds))
     return called(egl.eglGetProcAddress(name.encode()))
+
+
+def flush() -> None:
+    """Start all queued commands, while the processor prepares the next ones."""
+    function("glFlush", "")()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
 from physics.cameras.gl.context import is_card
-from physics.cameras.gl.driver import function
+from physics.cameras.gl.driver import flush, function
 from physics.cameras.gl.layers import LayerTarget
 from physics.cameras.gl.targets import Target
 
@@ -131,6 +131,7 @@ class Readback:
             size = begun.pictures * self._each
             self._context.copy_buffer(begun.landing.buffer, self._written, size=size)
         begun.fence = function("glFenceSync", "uu", "p")(_GPU_COMMANDS_COMPLETE, 0)
+        flush()
 
     def forget(self) -> None:
         """Drop the most recent batch after a failed drawing."""
