@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain, compress
+from types import TracebackType
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -20,7 +21,6 @@ import sumo as eclipse_sumo  # noqa: F401  sets the path of SUMO's data
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
-from cosim.core.state import write_protect
 
 
 @contextmanager
@@ -45,6 +45,27 @@ libsumo: Any = _sumo
 libsumo.simulationStep = libsumo.simulation.step
 _native: Final = libsumo._libsumo
 """libsumo without its Python wrappers, for functions that are called hundreds of times a tick."""
+
+for _name in ("moveToXY", "getRoadID", "getNextEdge", "getLanePosition", "getAngle", "setSpeed"):
+    setattr(libsumo.person, _name, getattr(_native, f"person_{_name}"))
+for _name in ("getLaneID", "getLanePosition", "setSpeed"):
+    setattr(libsumo.vehicle, _name, getattr(_native, f"vehicle_{_name}"))
+
+
+class _Entries:
+    """Adds persons to SUMO, and counts them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def add(self, *arguments: Any, **named: Any) -> None:
+        """Call SUMO's `person.add`."""
+        self.count += 1
+        _native.person_add(*arguments, **named)
+
+
+_entries: Final = _Entries()
+libsumo.person.add = _entries.add
 
 _ERRORS: Final = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
@@ -184,13 +205,23 @@ def close() -> None:
     libsumo.simulation.close()
 
 
-@contextmanager
-def sumo_errors(doing: str) -> Iterator[None]:
-    """Raise SUMO's exceptions as EngineError. doing: the action, for the message."""
-    try:
-        yield
-    except _ERRORS as error:
-        raise EngineError(f"SUMO failed while {doing}: {error}") from error
+class sumo_errors:
+    """Context that raises SUMO's exceptions as EngineError. doing: the action, for the message."""
+
+    def __init__(self, doing: str) -> None:
+        self._doing = doing
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        if isinstance(error, _ERRORS):
+            raise EngineError(f"SUMO failed while {self._doing}: {error}") from error
 
 
 class NearPersons(NamedTuple):
@@ -213,95 +244,108 @@ class NearVehicles(NamedTuple):
     xy: middles of the front bumpers (N, 2), metres.
     mps: speeds (N,), m/s.
     angle_deg: SUMO's angles (N,), degrees.
+    from_xy, away_m: a point, metres, and the distances of the bumpers from it (N,), metres.
     """
 
     names: tuple[str, ...]
     xy: Floats
     mps: Floats
     angle_deg: Floats
+    from_xy: tuple[float, float]
+    away_m: Floats
 
 
-def persons_waiting_s(names: Sequence[str]) -> list[float]:
+_HALTING_MPS: Final = 0.2
+"""Speed from which nothing is standing for SUMO, with a margin, m/s."""
+
+
+def persons_waiting_s(near: NearPersons) -> list[float]:
     """Return for how long each of these persons has been standing, seconds."""
-    return [*map(_native.person_getWaitingTime, names)]
+    return _waiting_s(_native.person_getWaitingTime, near)
 
 
-def vehicles_waiting_s(names: Sequence[str]) -> list[float]:
+def vehicles_waiting_s(near: NearVehicles) -> list[float]:
     """Return for how long each of these vehicles has been standing, seconds."""
-    return [*map(_native.vehicle_getWaitingTime, names)]
+    return _waiting_s(_native.vehicle_getWaitingTime, near)
+
+
+def _waiting_s(query: Callable[[str], float], near: NearPersons | NearVehicles) -> list[float]:
+    """Return waiting times, which are 0 for all that move."""
+    paces = zip(near.names, near.mps.tolist(), strict=True)
+    return [query(name) if mps < _HALTING_MPS else 0.0 for name, mps in paces]
 
 
 class NearReader:
-    """Reads persons and vehicles near a point.
+    """Reads persons and vehicles near a point, once after every step.
 
-    Names are sorted and selected again only where SUMO's list of them has changed.
+    Names are sorted again only where SUMO's list of them may have changed. Persons must enter by
+    `person.add` alone.
 
     crowd: names of the persons to read; those of persons that are in SUMO already never change.
     """
 
     def __init__(self, crowd: Container[str]) -> None:
-        self._persons = _Selection(
-            _native.person_getIDList, _native.person_getPosition, crowd.__contains__
-        )
-        self._vehicles = _Selection(_native.vehicle_getIDList, _native.vehicle_getPosition)
+        self._crowd = crowd
+        self._persons: tuple[str, ...] = ()
+        self._present = -1, 0
+        self._listed: Sequence[str] = ()
+        self._vehicles: tuple[str, ...] = ()
+        self._reach: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
+        self._reach_m = np.zeros(0)
 
-    def persons_near(self, x_m: float, y_m: float, reach_m: float) -> NearPersons:
-        """Return the persons of the crowd within `reach_m` of a point."""
-        names, xy = self._persons.near(x_m, y_m, reach_m)
-        return NearPersons(
-            names,
-            xy,
-            _of_each(_native.person_getSpeed, names),
-            [*map(_native.person_getNextEdge, names)],
-        )
-
-    def vehicles_near(self, x_m: float, y_m: float, reach_m: float) -> NearVehicles:
-        """Return the vehicles within `reach_m` of a point."""
-        names, xy = self._vehicles.near(x_m, y_m, reach_m)
-        speeds = _of_each(_native.vehicle_getSpeed, names)
-        return NearVehicles(names, xy, speeds, _of_each(_native.vehicle_getAngle, names))
-
-
-class _Selection:
-    """Selects persons or vehicles by their distance to a point.
-
-    listed: returns all names, in SUMO's order.
-    position_of: returns the position of one, metres.
-    chosen: returns whether a name is read.
-    """
-
-    def __init__(
-        self,
-        listed: Callable[[], Sequence[str]],
-        position_of: Callable[[str], tuple[float, float]],
-        chosen: Callable[[str], bool] | None = None,
-    ) -> None:
-        self._listed = listed
-        self._position_of = position_of
-        self._chosen = chosen
-        self._last: Sequence[str] = ()
-        self._names: tuple[str, ...] = ()
-
-    def near(self, x_m: float, y_m: float, reach_m: float) -> tuple[tuple[str, ...], Floats]:
-        """Return the sorted names within `reach_m` of a point, and their positions (N, 2), metres.
+    def near(
+        self, x_m: float, y_m: float, persons_m: float, vehicles_m: float
+    ) -> tuple[NearPersons, NearVehicles]:
+        """Return the persons of the crowd within `persons_m` of a point, and the vehicles within
+        `vehicles_m`.
 
         While they are the same, the names are the same tuple.
         """
-        listed = self._listed()
-        if listed != self._last:
-            self._last = listed
-            self._names = tuple(filter(self._chosen, sorted(listed)))
-        places = chain.from_iterable(map(self._position_of, self._names))
-        xy = np.fromiter(places, dtype=float, count=2 * len(self._names)).reshape(-1, 2)
+        self._update_names()
+        persons, vehicles = self._persons, self._vehicles
+        k, n = len(persons), len(persons) + len(vehicles)
+        places = chain(
+            map(_native.person_getPosition, persons), map(_native.vehicle_getPosition, vehicles)
+        )
+        xy = np.fromiter(chain.from_iterable(places), dtype=float, count=2 * n).reshape(n, 2)
+        speeds = chain(
+            map(_native.person_getSpeed, persons), map(_native.vehicle_getSpeed, vehicles)
+        )
+        mps = np.fromiter(speeds, dtype=float, count=n)
         dx, dy = xy[:, 0] - x_m, xy[:, 1] - y_m
-        near = np.sqrt(dx * dx + dy * dy) <= reach_m
-        if near.all():
-            return self._names, write_protect(xy)
-        return tuple(compress(self._names, near.tolist())), write_protect(xy[near])
+        away_m = np.sqrt(dx * dx + dy * dy)
+        if (reach := (k, n, persons_m, vehicles_m)) != self._reach:
+            self._reach = reach
+            self._reach_m = np.repeat([persons_m, vehicles_m], [k, n - k])
+        near = away_m <= self._reach_m
+        inside = near.tobytes()
+        if 0 in inside:
+            if 0 in inside[:k]:
+                persons = tuple(compress(persons, inside[:k]))
+            if 0 in inside[k:]:
+                vehicles = tuple(compress(vehicles, inside[k:]))
+            k = len(persons)
+            xy, mps, away_m = xy[near], mps[near], away_m[near]
+        xy.setflags(write=False)
+        angles = map(_native.vehicle_getAngle, vehicles)
+        angle_deg = np.fromiter(angles, dtype=float, count=len(vehicles))
+        return (
+            NearPersons(persons, xy[:k], mps[:k], [*map(_native.person_getNextEdge, persons)]),
+            NearVehicles(vehicles, xy[k:], mps[k:], angle_deg, (x_m, y_m), away_m[k:]),
+        )
 
-
-def _of_each(getter: Callable[[str], float], names: Sequence[str]) -> Floats:
-    return np.fromiter(map(getter, names), dtype=float, count=len(names))
+    def _update_names(self) -> None:
+        """Sort names that may have changed: persons leave where their number changes, and enter
+        only by `person.add`."""
+        state = _native.person_getIDCount(), _entries.count
+        if state != self._present:
+            self._present = state
+            names = tuple(filter(self._crowd.__contains__, sorted(_native.person_getIDList())))
+            if names != self._persons:
+                self._persons = names
+        if (listed := _native.vehicle_getIDList()) != self._listed:
+            self._listed = listed
+            self._vehicles = tuple(sorted(listed))
 
 
 def time_crowd_steps(timed: Callable[[str, Callable[[], None]], Callable[[], None]]) -> None:

@@ -7,11 +7,13 @@ import hashlib
 import importlib
 import io
 import itertools
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -44,18 +46,21 @@ settings.load_profile("tests")
 LONGEST = (
     "scenarios/test_hostile.py",
     "cli/test_cli.py",
+    "scenarios/test_reactive_suite.py",
+    "scenarios/test_scan_import.py",
     "scenarios/test_chaos.py",
     "report/test_page_in_chromium.py",
-    "policies/test_orca_policy.py",
     "sumo_nets/test_importer.py",
+    "scenarios/test_exploit.py",
     "scenarios/test_collect.py",
+    "policies/test_orca_policy.py",
     "scenarios/test_setup.py",
     "scenarios/test_remote.py",
     "sumo_nets/test_crossings.py",
+    "cli/test_run_command.py",
     "scenarios/test_cheats.py",
     "sumo_nets/test_crowd.py",
     "scenarios/test_verify.py",
-    "scenarios/test_exploit.py",
 )
 """Files of engine tests that take longest. They are the first of these, so that no worker of
 pytest-xdist is left alone with one of them in the end."""
@@ -67,9 +72,22 @@ COLLECTED = pytest.StashKey[list[str]]()
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     config.stash[COLLECTED] = [item.nodeid for item in items]
+    if worker := os.environ.get("PYTEST_XDIST_WORKER"):
+        collected_by(worker).write_text(json.dumps(config.stash[COLLECTED]))
     slow = {item.path for item in items if item.get_closest_marker("engine")}
     rank = {ROOT / "tests" / name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: (item.path in slow, rank.get(item.path, len(rank))))
+
+
+def pytest_sessionfinish() -> None:
+    if worker := os.environ.get("PYTEST_XDIST_WORKER"):
+        collected_by(worker).unlink(missing_ok=True)
+
+
+def collected_by(worker: str) -> Path:
+    """Return the file with the ids of all tests as a worker of this run has collected them."""
+    run = os.environ["PYTEST_XDIST_TESTRUNUID"]
+    return Path(tempfile.gettempdir(), f"cosim-tests-{run}-{worker}.json")
 
 
 def still_runs(pid: int) -> bool:

@@ -4,6 +4,7 @@ read."""
 from __future__ import annotations
 
 import ast
+import json
 import os
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import COLLECTED, LONGEST, PATIENCE_S
+from tests.conftest import COLLECTED, LONGEST, PATIENCE_S, collected_by
 
 ROOT = Path(__file__).parents[1]
 COLLECT = (
@@ -27,10 +28,22 @@ COLLECT = (
 LONGEST_PARAMETERS = 120
 
 
+def runs_all(config: pytest.Config) -> bool:
+    """Return whether all tests are run, not some files."""
+    return all(Path(asked).resolve() in (ROOT, ROOT / "tests") for asked in config.args)
+
+
 @pytest.fixture(scope="module")
-def elsewhere() -> list[str]:
-    """The ids of all tests, engine tests too, as another process collects them, later and with
-    other hashes."""
+def elsewhere(request: pytest.FixtureRequest) -> list[str]:
+    """The ids of all tests, engine tests too, as another process collects them with other hashes:
+    another worker of this run, or one of its own."""
+    here = os.environ.get("PYTEST_XDIST_WORKER")
+    if here and runs_all(request.config) and "PYTHONHASHSEED" not in os.environ:
+        count = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        others = [worker for worker in map("gw{}".format, range(count)) if worker != here]
+        for path in filter(Path.exists, map(collected_by, others)):
+            ids: list[str] = json.loads(path.read_text())
+            return ids
     environment = os.environ | {"PYTHONHASHSEED": "1"}
     done = subprocess.run(
         COLLECT, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S
@@ -60,8 +73,11 @@ def test_two_processes_collect_the_same_tests(
     must agree. Of a part of the tests those that were asked for are compared."""
     here = request.config.stash[COLLECTED]
     assert len(elsewhere) == len(set(elsewhere)) > 900
-    whole = all(Path(asked).resolve() in (ROOT, ROOT / "tests") for asked in request.config.args)
-    there = elsewhere if whole else [test_id for test_id in elsewhere if test_id in set(here)]
+    there = (
+        elsewhere
+        if runs_all(request.config)
+        else [test_id for test_id in elsewhere if test_id in set(here)]
+    )
     assert by_function(here) == by_function(there)
 
 

@@ -101,7 +101,7 @@ def judged(
         return refused(
             "stamp",
             f"sends {CMD_VEL} as Twist, which has no stamp: --ros2-wait stamped needs "
-            "TwistStamped with the stamp of the picture; or choose --ros2-wait next",
+            "TwistStamped with the stamp of the observation; or choose --ros2-wait next",
         )
     if wait == "stamped" and stamp_ns < tick_ns:
         return Judged()  # an answer to an older observation
@@ -113,8 +113,8 @@ def _late_stamp(stamp_ns: int, tick_ns: int) -> str:
     if stamp_ns <= _WALL_NS:
         return f"stamps {CMD_VEL} ahead of /clock: give it the time of the observation"
     return (
-        f"stamps {CMD_VEL} {stamp_ns / 1e9:.2f} s, and /clock is at {tick_ns / 1e9:.2f} s: start "
-        "it with use_sim_time:=true, so that it reads /clock"
+        f"stamps {CMD_VEL} {stamp_ns / 1e9:.2f} s, and /clock is at {tick_ns / 1e9:.2f} s: give it "
+        "the time of the observation, or start a node of rclpy or rclcpp with use_sim_time:=true"
     )
 
 
@@ -246,6 +246,12 @@ class Remarks:
             self._counts[key] += 1
             self._words.setdefault(key, fault.words)
             return self._counts[key] == 1
+
+    @property
+    def kinds(self) -> list[str]:
+        """The first fault of each kind."""
+        with self._lock:
+            return list(self._words.values())
 
     @property
     def words(self) -> list[str]:

@@ -137,6 +137,15 @@ class Ros2Node:
         """Return the publishers of a topic in this network by gid."""
         return self._others_at(topic, "MP")
 
+    def subscriptions(self) -> list[tuple[str, Endpoint]]:
+        """Return the subscriptions of other nodes to advertised topics, of any type: topic and
+        entity."""
+        return [
+            (topic, end)
+            for topic in self._publishers
+            for end in self._others_at(topic, "MS").values()
+        ]
+
     def subscriptions_arrived(self) -> bool:
         """Return whether another node subscribes to an advertised topic, and messages reach it.
 

@@ -285,6 +285,7 @@ def _percentiles(values: Floats, percent: Sequence[float]) -> str:
 def bench_realism(
     places: Sequence[str],
     splits: Sequence[str],
+    weathers: Sequence[str],
     frames: int,
     appearance: Appearance,
     weights: Path | None,
@@ -296,18 +297,29 @@ def bench_realism(
     before: realism.json of another run, whose figures are shown in columns of their own.
     """
     from cosim.spec.scenario import split_called
-    from scenarios.tools.bench.realism import as_json, figures_of, measure_realism, read_realism
+    from cosim.spec.weather import CLEAR, weather_called
+    from scenarios.tools.bench.realism import (
+        as_json,
+        called,
+        figures_of,
+        measure_realism,
+        read_realism,
+    )
 
     named = [one for one in map(split_called, splits) if one is not None]
+    skies = [weather_called(one).name for one in weathers]
     if weights is not None and not weights.is_dir():
         raise UsageError(f"--weights {weights}: no folder; give the one with the networks' files")
     earlier = [] if before is None else read_realism(before)
     with doing("driving") as progress:
         found = measure_realism(
-            places or ("",), named, frames, appearance, weights, folder, progress
+            places or ("",), named, skies, frames, appearance, weights, folder, progress
         )
-    columns = {f"{one['place']}, {one['split']}, before": figures_of(one) for one in earlier}
-    columns |= {f"{one.place}, {one.split}": figures_of(as_json(one)) for one in found}
+    columns = {
+        f"{called(one['place'], one['split'], one.get('weather', CLEAR))}, before": figures_of(one)
+        for one in earlier
+    }
+    columns |= {one.called: figures_of(as_json(one)) for one in found}
     names = dict.fromkeys(name for figures in columns.values() for name in figures)
     rows = [(name, *(figures.get(name, "") for figures in columns.values())) for name in names]
     tables.show(out, [*tables.names(""), *tables.figures(*columns)], rows)
@@ -453,8 +465,16 @@ def bench(
             "held out; default: val; repeatable.",
         ),
     ] = None,
+    weather: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="For `realism`: weather of the routes, one of those of `cosim list`; default: "
+            "clear; repeatable.",
+        ),
+    ] = None,
     frames: Annotated[
-        int, typer.Option(min=1, help="For `realism`: frames of each place and split.")
+        int, typer.Option(min=1, help="For `realism`: frames of each place, split and weather.")
     ] = 80,
     appearance: Appears = "splats",
 ) -> None:
@@ -485,7 +505,8 @@ def bench(
         bench_people(jobs)
         return
     if what == "realism":
-        bench_realism(places or (), split or ("val",), frames, appearance, weights, folder, compare)
+        skies, splits = weather or ("clear",), split or ("val",)
+        bench_realism(places or (), splits, skies, frames, appearance, weights, folder, compare)
         return
     if what == "exploit":
         named, sought, goals = (

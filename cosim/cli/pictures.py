@@ -190,21 +190,22 @@ look_app = typer.Typer()
     rich_help_panel=LOOK,
     epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 "
     "--residents 8`  \n`cosim look mine.toml --scenario 2 --view above`  \n`cosim look "
-    "frontal-sumo-fkk-in-000 --map sumo-fkk-in`",
+    "reactive --scenario 3`  \n`cosim look frontal-sumo-fkk-in-000 --map sumo-fkk-in`",
 )
 def look(
     scenario: Annotated[
         str,
         typer.Argument(
-            help="A scenario's id (`cosim list long-horizon`), or a file: your .toml, a suite's "
-            ".json, or a run folder."
+            help="A scenario's id (`cosim list long-horizon`), a suite, or a file: your .toml, a "
+            "suite's .json, or a run folder."
         ),
     ],
     which: Annotated[
         str | None,
         typer.Option(
             "--scenario",
-            help="Of a file or run, which scenario: its id or its number; by default the first.",
+            help="Of a suite, file or run, which scenario: its id or its number; by default the "
+            "first.",
         ),
     ] = None,
     at: Annotated[float, typer.Option(min=0.0, help="Seconds into the episode.")] = 0.0,

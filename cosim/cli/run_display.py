@@ -17,6 +17,7 @@ from cosim.cli.options import NO_OPENGL, check_rerun, connect_options, write_rer
 from cosim.cli.run_progress import EpisodeBars, ProgressDisplay
 from cosim.cli.run_table import kinds_of, print_by_kind, print_next_commands, print_table
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED
+from cosim.results.run_folder import read_records
 from cosim.results.throughput import Throughput, ThroughputTimer
 from cosim.spec.connection import Connection
 from cosim.spec.episode_id import episode_id_of
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from scenarios.runs.run import Carrier
     from scenarios.runs.transport import HeldRun
 
+_MOST_CRASHED = 5
+"""Largest number of crashed episodes that are named when a run is resumed."""
 _EXAMPLE_PEDESTRIAN = '{"id": "eve", "path": [{"ahead": 15, "left": 1}]}'
 
 
@@ -116,6 +119,7 @@ class Terminal(EpisodeBars):
             notice(note)
         if done := len(run.picked) - len(run.todo):
             err.print(f"{done} of {len(run.picked)} episodes are finished already.")
+            _print_crashed(run)
         if run.todo and self._of_here:
             jobs = config.jobs or 1
             words = announcement(
@@ -140,6 +144,19 @@ class Terminal(EpisodeBars):
             f"{self.folder}."
         )
         err.print(f"Continue with: cosim {again} --resume", soft_wrap=True)
+
+
+def _print_crashed(run: HeldRun) -> None:
+    """Print how to run the crashed episodes of a resumed run again, if there are any."""
+    records = read_records(run.held.path)
+    crashed = sorted(one.scenario.id for one in records if one.status == "crashed")
+    if crashed:
+        chosen = " ".join(f"--scenario {name}" for name in crashed[:_MOST_CRASHED])
+        more = " ..." if len(crashed) > _MOST_CRASHED else ""
+        notice(
+            f"{len(crashed)} of them crashed, which is a result: --resume does not repeat them. To "
+            f"run them again, begin another run with {chosen}{more} and another --out."
+        )
 
 
 def _print_live_commands(hub: Connection, run: HeldRun, *, several: bool, paced: bool) -> None:

@@ -35,7 +35,10 @@ def list_all(
 
 
 def print_names(out: Console) -> None:
-    """Print a line for each suite, robot, camera, weather, policy and goal."""
+    """Print a line for each suite, robot, camera, weather, policy and goal.
+
+    Raises SpecError for the first robot with faults, after all lines.
+    """
     from cosim.policies import POLICIES
     from cosim.policies.follow.networks import weights_in_words
     from cosim.policies.follow.policy import Follow
@@ -57,8 +60,14 @@ def print_names(out: Console) -> None:
             f"suite   {name}  {_counts_in_words(whole)}, version {whole.version}, "
             f"{whole.content_hash}"
         )
+    faults = []
     for one in ROBOTS.values():
-        check_robot(one)
+        try:
+            check_robot(one)
+        except SpecError as fault:
+            faults.append(fault)
+            out.print(f"robot   {one.name}  cannot be used: see the error below")
+            continue
         size = f"{one.length_m:.2f} x {one.width_m:.2f} m"
         out.print(
             f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at "
@@ -85,6 +94,8 @@ def print_names(out: Console) -> None:
     )
     for goal in GOALS.values():
         out.print(f"goal    {goal.name}  {goal.summary}", soft_wrap=True)
+    if faults:
+        raise faults[0]
 
 
 def _counts_in_words(suite: Suite) -> str:

@@ -387,11 +387,17 @@ def sources_hash(*rooms: Path) -> str:
 
     Call it when a module is imported: later edits do not change what this process makes.
     """
-    seen = hashlib.sha256(" ".join(version(package) for package in _ARRAY_PACKAGES).encode())
+    seen = hashlib.sha256(_array_versions().encode())
     for room in rooms:
         for source in sorted(room.rglob("*.py")):
             seen.update(source.relative_to(room).as_posix().encode() + b"\0" + source.read_bytes())
     return seen.hexdigest()[:16]
+
+
+@lru_cache(maxsize=1)
+def _array_versions() -> str:
+    """Return the versions of the libraries that make arrays; reading them takes milliseconds."""
+    return " ".join(version(package) for package in _ARRAY_PACKAGES)
 
 
 def mapped_arrays(name: str, made_by: str, make: Callable[[], Arrays]) -> Arrays:

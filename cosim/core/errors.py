@@ -36,7 +36,7 @@ INTERRUPTED = 130
 BROKEN_PIPE = 141
 """Exit code when the reader of standard output has closed the pipe, as shells use it."""
 
-MOST_LISTED = 30
+MOST_LISTED = 40
 """Maximum number of valid choices that a message lists in full; of more, it lists five."""
 
 

@@ -51,12 +51,26 @@ def wrap_angle(angle_rad: float) -> float:
 
 def wrap_angles(angles_rad: ArrayLike) -> Floats:
     """Return every angle of an array wrapped into (-pi, pi]."""
-    return np.pi - (np.pi - np.asarray(angles_rad, dtype=float)) % (2.0 * np.pi)
+    wrapped = np.subtract(np.pi, angles_rad, dtype=float)
+    wrapped = np.remainder(wrapped, 2.0 * np.pi)
+    wrapped_rad: Floats = np.subtract(np.pi, wrapped)
+    return wrapped_rad
+
+
+def hypot(x: float, y: float) -> float:
+    """Return the length of a vector with the bits of `np.hypot`; `math.hypot` rounds
+    differently."""
+    return abs(complex(x, y))
+
+
+def heading_from_sumo(angle_deg: float) -> float:
+    """Convert one angle with the bits of `headings_from_sumo`."""
+    return math.pi - (math.pi - math.radians(90.0 - angle_deg)) % (2.0 * math.pi)
 
 
 def headings_from_sumo(angles_deg: ArrayLike) -> Floats:
     """Convert SUMO's navigational degrees (0 north, clockwise) to headings in radians."""
-    return wrap_angles(np.radians(90.0 - np.asarray(angles_deg, dtype=float)))
+    return wrap_angles(np.radians(np.subtract(90.0, angles_deg, dtype=float)))
 
 
 def heading_to_sumo(heading_rad: float) -> float:
@@ -83,6 +97,8 @@ class Polyline:
         self._lengths = np.hypot(steps[:, 0], steps[:, 1])
         self._directions = steps / self._lengths[:, None]
         self.s_m: Floats = np.concatenate([[0.0], np.cumsum(self._lengths)])
+        self._rows: list[list[float]] | None = None
+        self._starts_m: list[float] = []
         for array in (self.points, self.s_m):
             array.flags.writeable = False
 
@@ -92,13 +108,15 @@ class Polyline:
 
     def at(self, s_m: float) -> Pose:
         """Return the pose at arc length `s_m`, clamped to the ends, heading along the polyline."""
-        i = min(
-            max(int(np.searchsorted(self.s_m, s_m, side="right")) - 1, 0), len(self._lengths) - 1
-        )
-        along = min(max(s_m - self.s_m[i], 0.0), self._lengths[i])
-        x, y = self.points[i] + along * self._directions[i]
-        dx, dy = self._directions[i]
-        return Pose(float(x), float(y), math.atan2(dy, dx))
+        if self._rows is None:
+            columns = (self.points[:-1], self._directions, self._lengths[:, None])
+            self._starts_m = self.s_m.tolist()
+            self._rows = np.column_stack(columns).tolist()
+        s_m = float(s_m)
+        i = min(max(bisect_right(self._starts_m, s_m) - 1, 0), len(self._rows) - 1)
+        x, y, dx, dy, length_m = self._rows[i]
+        along = min(max(s_m - self._starts_m[i], 0.0), length_m)
+        return Pose(x + along * dx, y + along * dy, math.atan2(dy, dx))
 
     def project(
         self, x_m: float, y_m: float, near_s_m: tuple[float, float] | None = None

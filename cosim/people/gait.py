@@ -112,25 +112,31 @@ class Strides:
         age: `Age` of each.
         """
         row, new = self._rows.of(ids)
-        at = self._xy[row]
-        strides = self._strides[row]
-        pace = self._pace[row]
+        at, strides, pace = self._xy, self._strides, self._pace
         if ids and not isinstance(row, slice):
+            at, strides, pace = at[row], strides[row], pace[row]
             self._stature = stature = self._stature[row]
             for i in new:
                 at[i], strides[i], pace[i] = xy[i], first_stride(ids[i]), speed[i]
                 stature[i] = stature_m(ids[i], age[i])
             self._length_scale, self._pace_scale = _length_scale(stature), _pace_scale(stature)
-        pace = pace + (speed - pace) * min(self.period_s / PACE_TIME_CONSTANT_S, 1.0)
+        if not ids:
+            return np.zeros(0), np.zeros(0)
+        change = speed - pace
+        change *= min(self.period_s / PACE_TIME_CONSTANT_S, 1.0)
+        pace = pace + change
         step = xy - at
         moved = np.hypot(step[:, 0], step[:, 1])
-        if ids:
-            relative = pace * self._pace_scale
-            stride = self._length_scale * np.interp(relative, _PACES_MPS, _STRIDES_M)
-            strides = strides + np.where(moved < _JUMP_M, moved, 0.0) / stride
-            self._xy = xy
-            self._strides = strides
-            self._pace = pace
+        stride = np.interp(pace * self._pace_scale, _PACES_MPS, _STRIDES_M)
+        stride *= self._length_scale
+        walked = moved < _JUMP_M
+        if 0 in walked.tobytes():
+            moved = np.where(walked, moved, 0.0)
+        moved /= stride
+        strides = strides + moved
+        self._xy = xy
+        self._strides = strides
+        self._pace = pace
         return strides, pace
 
 

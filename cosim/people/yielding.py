@@ -20,7 +20,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Point, Polygon
 
-from cosim.core.geometry import Floats, Pose
+from cosim.core.geometry import Floats, Pose, hypot
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.spec.events import StandingBody
 from cosim.spec.obstacle import Obstacle, footprint
@@ -88,72 +88,101 @@ def stepped_around(
     tangent, on the side on which the step passes the centre. The choice reinforces itself, so that
     people do not oscillate.
     """
-    if not _anyone_within_gap(wanted, body):
+    rows = _within_gap(wanted, body)
+    if not rows:
         return wanted
-    length, width = body.half_m
-    ahead = ANTICIPATION_S * max(body.v_mps, 0.0)
-    low = np.array([-length, -width])
-    high = np.array([length, width])
-    reach = np.array([ahead, 0.0])
     turn = _axes(body)
-    targets = (wanted - body.pose.xy) @ turn
-    rows = np.flatnonzero(_disk_gap(targets, low, high + reach) < STEP_ROUND_GAP_M)
-    if not len(rows):
-        return wanted
-    local = ((before - body.pose.xy) @ turn)[rows]
-    near = targets[rows]
-    step = near - local
-    pace = np.hypot(step[:, 0], step[:, 1])
-    side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
-
-    if body.closed != (0.0, 0.0):
-        closed_side = np.array(body.closed) @ turn
-        to_left = step[:, 0] * closed_side[1] - step[:, 1] * closed_side[0]
-        side = np.where(to_left == 0.0, side, np.where(to_left > 0.0, 1.0, -1.0))
-
-    out = local - np.clip(local, low, high)
-    far = np.hypot(out[:, 0], out[:, 1])
-    normal = out / np.maximum(far, 1e-9)[:, None]
-    inward = -(step * normal).sum(axis=1)
-    tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
-    slides = (_disk_gap(near, low, high) < STEP_ROUND_GAP_M) & (inward > 0.0) & (far > 1e-6)
-    moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
-    if stand is not None:
-        back = np.clip(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0, BACK_AWAY_M)
-        comes_up = slides & stand[rows]
-        moved[comes_up] = (near + normal * (inward + back)[:, None])[comes_up]
-
-    meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length)
-    aside = np.where(local[:, 1] >= 0.0, pace, -pace)
-    moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
-    targets[rows] = moved
-    rounded: Floats = targets @ turn.T + body.pose.xy
+    centre = body.pose.xy
+    targets = (wanted - centre) @ turn
+    local = (before - centre) @ turn
+    closed = None if body.closed == (0.0, 0.0) else (np.array(body.closed) @ turn).tolist()
+    front_m = body.half_m[0] + ANTICIPATION_S * max(body.v_mps, 0.0)
+    for row in rows:
+        target = targets[row].tolist()
+        if _box_gap(target, body.half_m, front_m) < STEP_ROUND_GAP_M:
+            stands = stand is not None and bool(stand[row])
+            targets[row] = _stepped(local[row].tolist(), target, body.half_m, closed, stands)
+    rounded: Floats = targets @ turn.T + centre
     return rounded
 
 
-def _anyone_within_gap(xy: Floats, body: RobotBody) -> bool:
-    """Return whether people may be within STEP_ROUND_GAP_M of the ground that a body covers or will
-    cover; only rounding makes it true for others."""
+def _stepped(
+    at: list[float],
+    target: list[float],
+    half_m: tuple[float, float],
+    closed: list[float] | None,
+    stands: bool,
+) -> tuple[float, float]:
+    """Return the new position of one person within the gap, in metres in the body's frame.
+
+    at, target: current and preferred position.
+    closed: direction to the side without a passage, if there is one.
+    """
+    length_m, width_m = half_m
+    (x, y), (target_x, target_y) = at, target
+    step_x, step_y = target_x - x, target_y - y
+    pace = hypot(step_x, step_y)
+    side = 1.0 if x * step_y - y * step_x >= 0.0 else -1.0
+    if closed is not None:
+        to_left = step_x * closed[1] - step_y * closed[0]
+        if to_left != 0.0:
+            side = 1.0 if to_left > 0.0 else -1.0
+
+    out_x = x - min(max(x, -length_m), length_m)
+    out_y = y - min(max(y, -width_m), width_m)
+    far = hypot(out_x, out_y)
+    normal_x, normal_y = out_x / max(far, 1e-9), out_y / max(far, 1e-9)
+    inward = -(step_x * normal_x + step_y * normal_y)
+    if inward > 0.0 and far > 1e-6 and _box_gap(target, half_m, length_m) < STEP_ROUND_GAP_M:
+        if stands:
+            back = min(max(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0), BACK_AWAY_M)
+            on = inward + back
+            return target_x + normal_x * on, target_y + normal_y * on
+        on = side * pace
+        return x - normal_y * on, y + normal_x * on
+    if step_x < 0.0 and x > length_m:
+        return x, y + (pace if y >= 0.0 else -pace)
+    return target_x, target_y
+
+
+def _box_gap(at: list[float], half_m: tuple[float, float], front_m: float) -> float:
+    """Return the distance from a person's disk to the body in the body's frame, in metres.
+
+    front_m: distance of the body's front.
+    """
+    x, y = at
+    away_x = x - min(max(x, -half_m[0]), front_m)
+    away_y = y - min(max(y, -half_m[1]), half_m[1])
+    return hypot(away_x, away_y) - PERSON_RADIUS_M
+
+
+def _within_gap(xy: Floats, body: RobotBody) -> list[int]:
+    """Return the rows of people who may be within STEP_ROUND_GAP_M of the ground that a body covers
+    or will cover; only rounding adds others."""
     x_m, y_m, heading_rad = body.pose
     near_m = reaction_distance_m(body) + _ROUNDING_M
     dx, dy = xy[:, 0] - x_m, xy[:, 1] - y_m
     near = dx * dx + dy * dy <= near_m * near_m
-    if not near.any():
-        return False
+    if 1 not in near.tobytes():
+        return []
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     half_length, half_width = body.half_m
     front = half_length + ANTICIPATION_S * max(body.v_mps, 0.0)
     gap_m = PERSON_RADIUS_M + STEP_ROUND_GAP_M + _ROUNDING_M
-    for x, y in zip(dx[near].tolist(), dy[near].tolist(), strict=True):
+    rows = []
+    for row in near.nonzero()[0].tolist():
+        x, y = float(dx[row]), float(dy[row])
         ahead, left = cos * x + sin * y, cos * y - sin * x
         beyond = max(ahead - front, -half_length - ahead, 0.0)
         if math.hypot(beyond, max(abs(left) - half_width, 0.0)) < gap_m:
-            return True
-    return False
+            rows.append(row)
+    return rows
 
 
 def approaches_body(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
     """Return whether each step approaches the robot's outline below the gap, (N,) booleans."""
+    if not _within_gap(after, body._replace(v_mps=0.0)):
+        return np.zeros(len(after), dtype=bool)
     turn = _axes(body)
     half = np.array(body.half_m)
     gap = _disk_gap((after - body.pose.xy) @ turn, -half, half)
@@ -241,7 +270,7 @@ class StandingObstacles:
         """
         moved_m = math.inf
         if len(xy) == len(self._searched):
-            moved_m = math.sqrt(2.0) * float(np.abs(xy - self._searched).max())
+            moved_m = math.sqrt(2.0) * float(np.maximum.reduce(np.abs(xy - self._searched), None))
         if moved_m > _SEARCH_M:
             gap = xy[:, None] - self._xy[None]
             nearest_m = np.sqrt((gap * gap).sum(axis=2).min(axis=0))

@@ -82,6 +82,8 @@ OTHER_NAMES = (
     "package.module:Class",
     f"{ONNX_SCHEME}FOLDER",
     f"{SCHEDULE_SCHEME}FILE.json",
+    f"{REMOTE_SCHEME}NAME",
+    ROS2_SCHEME,
 )
 """Forms of policy names that are not listed."""
 

@@ -23,10 +23,9 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import msgspec
-import pandas as pd
 from filelock import FileLock
 
 from cosim.core.errors import MachineError, RunError, UsageError, listed, unknown, unwritable
@@ -36,9 +35,11 @@ from cosim.results.folder_guard import FolderGuard
 from cosim.results.log import Log
 from cosim.results.record import RECORD_FILE, Record
 from cosim.results.run_spec import RUN_FILE, RunSpec, decode_spec
-from cosim.results.table import table_of
 from cosim.spec.scenario import Scenario, Suite, read_suite, write_suite
 from cosim.spec.validation import shown
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 DATABASE = "results.sqlite"
 REMEDY = (
@@ -382,6 +383,9 @@ class RunFolder:
 
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""
+        # Imported only here: replays read run folders, and have no use for pandas.
+        from cosim.results.table import table_of
+
         table = table_of(self.restore())
         path = self.path / "results.csv"
         with _write_errors(path, "all episodes are kept; make room and add --resume"):

@@ -486,6 +486,10 @@ class _ImageGoals:
         """Nothing to discard: the sub-goals detect a reset themselves."""
 
 
+_PIXELS: Final = np.moveaxis(np.mgrid[:PATCH_PX, :PATCH_PX], 0, -1)
+"""(80, 80, 2) row and column of the pixels of a raster."""
+
+
 def route_patch_at(pose: Pose, route: Floats) -> NDArray[np.uint8]:
     """Return a raster as in `RoutePatch`, (80, 80) uint8.
 
@@ -502,7 +506,7 @@ def route_patch_at(pose: Pose, route: Floats) -> NDArray[np.uint8]:
         (top, left) = low[i]
         (bottom, right) = high[i]
         step = at[i + 1] - at[i]
-        off = np.moveaxis(np.mgrid[top:bottom, left:right], 0, -1) - at[i]
+        off = _PIXELS[top:bottom, left:right] - at[i]
         along = np.clip(off @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
         off -= along[..., None] * step
         pixels[top:bottom, left:right][(off * off).sum(axis=-1) <= 1.0] = 255

@@ -60,6 +60,21 @@ SENT: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 """Type of each published topic, in the order in which those of a tick are sent."""
+SENT_WITH: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "/cosim/instruction": "--goal instruction",
+        "/cosim/goal": "--goal with a point",
+        "/goal_pose": "--goal with a point",
+        "/imu": "--ros2-imu",
+        "/scan": "--ros2-scan with one ring",
+        "/points": "--ros2-scan with several rings",
+        "/camera/camera_info": "--ros2-camera",
+        "/camera/depth": "--ros2-depth",
+        "/camera/image_raw/compressed": "--ros2-camera",
+        "/camera/image_raw": "--ros2-camera",
+    }
+)
+"""Options of a run on which it depends whether a topic has messages."""
 CMD_VEL: Final = "/cmd_vel"
 PLAN: Final = "/plan"
 TAKEN: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(

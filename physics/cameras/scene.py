@@ -80,10 +80,8 @@ class BulletScene:
         for barrier in world.barriers:
             size = (barrier.thickness_m, barrier.length_m)
             z = surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
-            for mesh, colour in zip(
-                props.barrier_meshes(barrier), (props.PROP_RED, props.PROP_WHITE), strict=True
-            ):
-                body = canvas.add(mesh, colour, "barrier")
+            for part in props.barrier_parts(barrier):
+                body = canvas.add(part.mesh, part.colour or props.PROP_RED, "barrier")
                 canvas.put(body, (barrier.x_m, barrier.y_m, z), barrier.heading_rad)
 
     def arrange(self, view: View, street: Street) -> None:

@@ -259,10 +259,14 @@ class Bodies(BulletClient):
             self._paths[kind].append((body, placements))
 
     def place_led(self, substep: int) -> None:
-        """Put the bodies of `lead` where they are after a substep."""
-        for led in self._paths.values():
+        """Put the bodies of `lead` where they are after a substep.
+
+        People that are not watched cannot touch the robot: they move at the end of the tick.
+        """
+        for kind, led in self._paths.items():
             for body, way in led:
-                p.resetBasePositionAndOrientation(body, *way[substep], self._client)
+                if kind == "vehicle" or substep + 1 == len(way) or body in self.watched:
+                    p.resetBasePositionAndOrientation(body, *way[substep], self._client)
 
     def _park(self, body: int) -> None:
         self._final_poses.pop(body, None)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import blake2b
 from typing import Final
 
 import numpy as np
@@ -44,7 +44,7 @@ _COMPANIONS: Final[tuple[tuple[Companion, int], ...]] = (
     ("wheelchair", 6),
 )
 """Objects that people push or lead, and how many of 1000 people do."""
-_UMBRELLAS: Final = 700
+_UMBRELLAS: Final = 600
 """How many of 1000 people hold an umbrella in rain."""
 
 
@@ -110,12 +110,12 @@ def companion_of(name: str, seed: int = 0, rain: bool = False, crowd: bool = Tru
     rain: most of those with free hands hold an umbrella, in the left hand
     crowd: people may push or lead something, too
     """
-    draw = _draw(name, seed, "beside") // 7 % 1000
+    draw = _draw(name, seed, "companion") % 1000
     for companion, share in _COMPANIONS if crowd else ():
         if draw < share:
             return companion
         draw -= share
-    if rain and _draw(name, seed, "umbrella") // 7 % 1000 < _UMBRELLAS:
+    if rain and _draw(name, seed, "umbrella") % 1000 < _UMBRELLAS:
         return "umbrella"
     return ""
 
@@ -148,7 +148,7 @@ def _patterns(name: str, seed: int, clothes: Clothes) -> NDArray[np.uint8]:
     outfit = clothes.outfit
     beard = 0
     if outfit.build.woman < 0.5 and outfit.family in ("man", "elder"):
-        beard = max(0, _draw(name, seed, "beard") // 5 % (BEARDS + 2) - 2)
+        beard = max(0, _draw(name, seed, "beard") % (BEARDS + 2) - 2)
     maps = {
         "top": layer("top", clothes.top, outfit.legs == "coat"),
         "bottom": layer("bottom", clothes.bottom, outfit.legs == "skirt"),
@@ -173,11 +173,15 @@ def _fits(clothes: Clothes, family: Family, name: str) -> bool:
 def _pick(palette: tuple[str, ...], name: str, seed: int, what: str) -> _Colour:
     """Pick a colour of a palette and vary its brightness slightly."""
     draw = _draw(name, seed, what)
-    shade = 0.88 + 0.24 * (draw >> 16 & 0xFF) / 255.0
+    shade = 0.88 + 0.24 * (draw >> 48 & 0xFF) / 255.0
     code = palette[draw % len(palette)]
     red, green, blue = (min(int(int(code[i : i + 2], 16) * shade), 255) for i in (0, 2, 4))
     return red, green, blue
 
 
 def _draw(name: str, seed: int, what: str) -> int:
-    return zlib.crc32(f"{what} {seed} {name}".encode())
+    """Return 64 bits, independent for each person, seed and purpose.
+
+    A checksum such as CRC32 is not: of nearly equal strings its low bits are correlated.
+    """
+    return int.from_bytes(blake2b(f"{what} {seed} {name}".encode(), digest_size=8).digest(), "big")

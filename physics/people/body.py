@@ -20,6 +20,7 @@ from physics.people.families import Family, man_rest_m, skeleton
 from physics.people.figure import (
     LEVELS,
     MESH_LEVELS,
+    RIBBON_RINGS,
     RIBBONS,
     Build,
     Companion,
@@ -142,9 +143,12 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
     """Build the body at a level of tubes or ribbons, MESH_LEVELS to LEVELS - 1."""
     if not MESH_LEVELS <= level < LEVELS:
         raise ValueError(f"levels of tubes go from {MESH_LEVELS} to {LEVELS - 1}: {level}")
-    ribbon = level == RIBBONS
+    ribbon = level >= RIBBONS
     of = min(level, RIBBONS - 1)
-    tubes = [(piece.coat, tube(piece, of, ribbon)) for piece in pieces(outfit) if piece.sides[of]]
+    share = RIBBON_RINGS[level - RIBBONS] if ribbon else 1.0
+    tubes = [
+        (piece.coat, tube(piece, of, ribbon, share)) for piece in pieces(outfit) if piece.sides[of]
+    ]
     starts = np.cumsum([0, *(len(t.middle) for _, t in tubes)])
     weights = np.concatenate(
         [_sided(t.corners, t.weights) if t.still else t.weights for _, t in tubes]

@@ -225,14 +225,14 @@ def _dog() -> list[Piece]:
 
 def _umbrella() -> list[Piece]:
     x, y, _ = HANDLES["umbrella"][0]
-    top = 2.03
+    top = 2.16
     canopy = [
         upright_loft((x, y, z), wide, 1.0, wide, _CHEST)
         for z, wide in (
-            (top - 0.30, 0.46),
-            (top - 0.27, 0.48),
-            (top - 0.16, 0.40),
-            (top - 0.04, 0.20),
+            (top - 0.25, 0.46),
+            (top - 0.23, 0.48),
+            (top - 0.13, 0.40),
+            (top - 0.03, 0.20),
             (top, 0.03),
         )
     ]

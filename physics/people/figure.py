@@ -11,18 +11,20 @@ from typing import Final, Literal
 
 from physics.people.lofted_mesh import Joints, Piece, Ring
 
-LEVELS: Final = 5
-"""Levels of detail: two of meshes, then two of tubes, then one of ribbons."""
+LEVELS: Final = 6
+"""Levels of detail: two of meshes, then two of tubes, then two of ribbons."""
 MESH_LEVELS: Final = 2
-RIBBONS: Final = LEVELS - 1
-"""Level of ribbons, drawn as the outlines of the tubes of the previous level."""
+RIBBONS: Final = 4
+"""First level of ribbons, drawn as the outlines of the tubes of the previous level."""
+RIBBON_RINGS: Final = (1.0, 0.5)
+"""Share of the rings of these tubes, by level of ribbons."""
 Sleeve = Literal["long", "short"]
 Legs = Literal["trousers", "shorts", "skirt", "coat"]
 Companion = Literal["", "dog", "pram", "bicycle", "wheelchair", "umbrella"]
 """Object that a person leads, pushes, sits in or holds up."""
 
-TORSO: Final = (28, 18, 6, 4)
-LIMB: Final = (14, 10, 6, 4)
+TORSO: Final = (28, 14, 6, 4)
+LIMB: Final = (14, 8, 6, 4)
 SMALL: Final = (12, 8, 6, 4)
 
 

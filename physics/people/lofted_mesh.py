@@ -8,6 +8,7 @@ Silhouettes therefore agree between levels of detail.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -131,15 +132,18 @@ class Tube:
         )
 
 
-def tube(piece: Piece, level: int, ribbon: bool = False) -> Tube:
+def tube(piece: Piece, level: int, ribbon: bool = False, share: float = 1.0) -> Tube:
     """Build a piece at a coarse level with an even number of sides.
 
     ribbon: draw the piece as a ribbon if it is upright
+    share: fraction of the level's rings to use; three rings or fewer remain
 
     A piece that follows both legs spreads sideways, which turned rings cannot show.
     Its corners are not turned, and it has more of them.
     """
-    table = _chosen(_table(piece.rings), piece.rings_kept[level])
+    kept = piece.rings_kept[level]
+    kept = max(min(kept, 3), math.ceil(share * kept))
+    table = _chosen(_table(piece.rings), kept)
     sides = piece.sides[level]
     spreads = bool(
         (

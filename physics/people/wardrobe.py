@@ -222,13 +222,13 @@ ALL: Final[tuple[Outfit, ...]] = (
 
 PALETTES: Final[dict[str, tuple[str, ...]]] = {
     "shirts": ("964844", "3d5d88", "4e8466", "574a70", "3b3d42", "909fad", "92684c", "758766"),
-    "light": ("ebeae6", "e1e7eb", "ece3d6", "d7ded3", "e3d4d4", "cdd5e0", "f3f1e9", "d6cfc4"),
+    "light": ("d8d6d0", "b4bec9", "c6b9a4", "a5b0a1", "c0a9ab", "94a4b9", "e0ddd3", "aaa08e"),
     "bright": ("ac453f", "3f6ca3", "dfba63", "499270", "c4788d", "ce8357", "569ca9", "f1efea"),
     "muted": ("8c8f94", "776b60", "727c70", "7e5d5c", "5d6775", "aca495", "4c4f58", "98909c"),
     "coats": ("3c3f46", "766757", "979085", "38475e", "62403d", "525c4f", "bcaa91", "5a5b5e"),
     "suits": ("3e424b", "4a4a4d", "5a554c", "384253", "6d6f75"),
-    "jeans": ("475a75", "637995", "354157", "8799af", "4b4f55"),
+    "jeans": ("41536d", "546a86", "303b4f", "6d809a", "44484e"),
     "dark": ("303237", "393632", "404652", "44403e", "525458"),
-    "chinos": ("a39784", "877f71", "beb5a3", "6c6e64", "6f6153", "9b9c9d"),
+    "chinos": ("84765f", "675f51", "92866f", "54574d", "5a4c3f", "64666a"),
 }
 """Colours of cloth as sRGB, by the name that `Clothes` use."""

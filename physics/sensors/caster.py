@@ -4,7 +4,7 @@ The shapes are those of `physics.dynamics.bodies`. They are stored apart from th
 query therefore cannot change. The robot itself has no shape here.
 
 Boxes and cylinders are arrays (`shapes`). The triangles of the ground and of scans are bodies of an
-own PyBullet client, for rays that reach below the highest triangle.
+own Bullet client (`triangles`), for rays that reach below the highest triangle.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
 from physics.cameras.posture import posture_of
 from physics.dynamics.bodies import PERSON_HEIGHT_M, VEHICLE_HEIGHT_M, building_boxes
-from physics.dynamics.client import BulletClient
 from physics.ground.mesh import join
 from physics.ground.tiles import Key, tile_distance, tiles_within
 from physics.robots.kinematics import Rotation, attitude, rotate
@@ -39,6 +38,7 @@ from physics.sensors.shapes import (
     joined,
     within,
 )
+from physics.sensors.triangles import TriangleRays
 from physics.street.furniture import Prop, solids_of
 from physics.street.surface import Chunk, Surface, grounded_obstacles
 
@@ -118,7 +118,7 @@ class RayCaster:
         self._surface = surface
         self._robot = robot
         self._range_m = range_m
-        self._client: BulletClient | None = None
+        self._client: TriangleRays | None = None
         self._tiles: dict[Key, Solids] = {}
         self._meshes: dict[Key, _Meshes] = {}
         self._near: _Near | None = None
@@ -128,7 +128,7 @@ class RayCaster:
         self._own = joined([Solids(boxes_of(own), cylinders_of([])), _prop_solids(props)])
 
     def __enter__(self) -> Self:
-        self._client = BulletClient()
+        self._client = TriangleRays()
         return self
 
     def __exit__(
@@ -216,9 +216,11 @@ class RayCaster:
         low = np.flatnonzero(z0 + np.minimum(rays.z, 0.0) * reach <= near.high_m)
         if not len(low) or self._client is None:
             return distance
-        begin = np.broadcast_to(rays.origin, (len(low), 3))
-        ways = reach[low, None] * np.stack([rays.x[low], rays.y[low], rays.z[low]], axis=1)
-        shares = self._client.hit_shares(begin, begin + ways)
+        begin, end = np.empty((2, len(low), 3))
+        begin[:] = rays.origin
+        for axis, way in enumerate((rays.x, rays.y, rays.z)):
+            end[:, axis] = reach[low] * way[low]
+        shares = self._client.hit_shares(begin, np.add(end, begin, out=end))
         hit = shares < 1.0
         distance[low[hit]] = shares[hit] * reach[low[hit]]
         return distance
@@ -254,7 +256,7 @@ class RayCaster:
             raise EngineError("the sensors are not running: use RayCaster in a 'with' block")
         for key in [key for key in self._meshes if key not in keys]:
             for body in self._meshes.pop(key).bodies:
-                client.remove_body(body)
+                client.remove(body)
         for key in keys:
             if key not in self._meshes:
                 chunk = self._surface.chunk(key)
@@ -262,7 +264,7 @@ class RayCaster:
                 meshes = [mesh for mesh in (ground, *chunk.standing) if len(mesh)]
                 heights = np.concatenate([np.zeros(0), *(mesh.vertices[:, 2] for mesh in meshes)])
                 self._meshes[key] = _Meshes(
-                    tuple([client.add_concave(mesh) for mesh in meshes]),
+                    tuple([client.add(mesh) for mesh in meshes]),
                     float(heights.min(initial=math.inf)),
                     float(heights.max(initial=-math.inf)),
                 )

@@ -14,7 +14,7 @@ from typing import Final, Literal
 import numpy as np
 
 from cosim.core.geometry import Floats
-from physics.ground.mesh import Part, box, disc, frustum, join
+from physics.ground.mesh import Mesh, Part, box, disc, frustum, join
 from physics.street.tree_shapes import (
     SHRUB_TWIGS,
     SPECIES,
@@ -23,6 +23,7 @@ from physics.street.tree_shapes import (
     crown,
     crown_core,
     crown_twigs,
+    leafy,
     tree_trunk,
 )
 from physics.street.vehicles import vehicle_parts
@@ -176,14 +177,15 @@ def tree(size: Size, paint: int) -> tuple[Part, ...]:
     """Return a tree; `paint` selects the species."""
     species = SPECIES[paint % len(SPECIES)]
     whole = crown(species, size[2])
-    core = crown_core(whole)
+    leaves = leafy(species, whole)
+    core = crown_core(leaves)
     stem = tree_trunk(species, size[2], 0.5 * size[0])
     parts = [
         Part(stem, BARK, "bark"),
         Part(whole.mesh, None, species.cover, whole.shade, detail="plain"),
     ]
     for distance, look in TREE_TWIGS.items():
-        twigs = crown_twigs(whole, *look)
+        twigs = crown_twigs(leaves, *look)
         parts.append(Part(core.mesh, None, species.cover, core.shade, detail=distance))
         parts.append(
             Part(twigs.mesh, None, species.leaves, twigs.shade, detail=distance, spots=twigs.spots)
@@ -229,16 +231,29 @@ def rack(size: Size) -> tuple[Part, ...]:
 
 
 def scooter(size: Size) -> tuple[Part, ...]:
+    """Return a scooter. Its stem and bar are thinner and brighter where textures are drawn.
+
+    Detectors of people take a broad dark T over two wheels for a person.
+    """
     length, depth, h = size
     front = 0.5 * length - 0.12
-    stem = box((0.05, 0.05, h - 0.1), (front - 0.06, 0.0, 0.5 * h + 0.05), skip=("bottom",))
-    stem = stem.tilted(-0.1, (front, 0.0, 0.1))
-    dark = [box((0.05, depth, 0.04), (front - 0.14, 0.0, h))]
-    dark += [
+    deck = box((length - 0.4, 0.16, 0.06), (0.0, 0.0, 0.17))
+    wheels = [
         box((0.22, 0.06, 0.22), (x, 0.0, 0.11), skip=("bottom", "top")) for x in (front, -front)
     ]
-    return Part(join([box((length - 0.4, 0.16, 0.06), (0.0, 0.0, 0.17)), stem]), None), Part(
-        join(dark), _DARK
+
+    def stem(wide: float) -> Mesh:
+        bar = box((wide, wide, h - 0.1), (front - 0.06, 0.0, 0.5 * h + 0.05), skip=("bottom",))
+        return bar.tilted(-0.1, (front, 0.0, 0.1))
+
+    bar = box((0.05, depth, 0.04), (front - 0.14, 0.0, h))
+    thin = [stem(0.035), box((0.03, 0.8 * depth, 0.025), (front - 0.14, 0.0, h))]
+    return (
+        Part(join([deck, stem(0.05)]), None, detail="plain"),
+        Part(join([bar, *wheels]), _DARK, detail="plain"),
+        Part(deck, None, detail="textured"),
+        Part(join(wheels), _DARK, detail="textured"),
+        Part(join(thin), ZINC, "metal-brushed", detail="textured"),
     )
 
 
@@ -317,7 +332,12 @@ def fence(size: Size) -> tuple[Part, ...]:
         box((0.06, 0.06, h), (s * (0.5 * length - 0.3), 0.0, 0.5 * h), skip=("bottom", "top"))
         for s in (-1, 1)
     ]
-    return Part(join(mesh), None, "wood-upright"), Part(join([*feet, *posts]), WHITE)
+    # Detectors of people take a bright panel between white posts for a person.
+    return (
+        Part(join(mesh), None, "wood-upright"),
+        Part(join([*feet, *posts]), WHITE, detail="plain"),
+        Part(join([*feet, *posts]), ZINC, "metal-brushed", detail="textured"),
+    )
 
 
 def car(size: Size) -> tuple[Part, ...]:

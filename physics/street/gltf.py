@@ -54,11 +54,10 @@ def as_gltf(
             barrier.y_m,
             surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size),
         )
-        red, white = props.barrier_meshes(barrier)
-        parts.add("barriers", "barrier:red", red.moved(at, barrier.heading_rad), props.PROP_RED)
-        parts.add(
-            "barriers", "barrier:white", white.moved(at, barrier.heading_rad), props.PROP_WHITE
-        )
+        names = ("red", "white", "posts")
+        for name, part in zip(names, props.barrier_parts(barrier), strict=True):
+            mesh = part.mesh.moved(at, barrier.heading_rad)
+            parts.add("barriers", f"barrier:{name}", mesh, part.colour or props.PROP_RED)
     for prop, z in grounded_obstacles(obstacles, surface):
         parts.add_prop("obstacles", prop, z)
     for part in robot:

@@ -16,6 +16,8 @@ from physics.street.furniture_shapes import METAL, WHITE, Size
 
 _RUBBER: Final = (0.07, 0.07, 0.08)
 _RED: Final = (0.82, 0.10, 0.09)
+_CONCRETE: Final = (0.50, 0.50, 0.48)
+_FRAME: Final = (0.33, 0.24, 0.16)
 _PAPER: Final = (0.90, 0.88, 0.80)
 _WHEEL_SIDES: Final = 10
 """Corners of a wheel."""
@@ -89,7 +91,7 @@ def sandwich_board(size: Size) -> tuple[Part, ...]:
                 (foot + side * 0.020, 0.0, (0.78 - 0.17 * k) * tall),
             )
             text_lines.append(box(*line, skip=("bottom", "top")).tilted(-side * lean, pivot))
-    return Part(join(boards), WHITE), Part(join(faces), None), Part(join(text_lines), _PAPER)
+    return Part(join(boards), _FRAME), Part(join(faces), None), Part(join(text_lines), _PAPER)
 
 
 def construction_fence(size: Size) -> tuple[Part, ...]:
@@ -115,10 +117,10 @@ def construction_fence(size: Size) -> tuple[Part, ...]:
         for s in (-1, 1)
     ]
     return (
-        Part(join(fields[::2]), _RED),
-        Part(join(fields[1::2]), WHITE),
+        Part(join(fields[1::2]), _RED),
+        Part(join(fields[::2]), WHITE),
         Part(join(bars), None),
-        Part(join(feet), _RUBBER),
+        Part(join(feet), _CONCRETE),
     )
 
 

@@ -11,11 +11,12 @@ import shapely
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.scenario import Barrier
-from physics.ground.mesh import Mesh, box, join
+from physics.ground.mesh import Mesh, Part, box, join
 from physics.ground.tiles import Key, grown_box, tile_at, tile_bounds
 
 PROP_RED: Final = (0.82, 0.10, 0.09)
 PROP_WHITE: Final = (0.93, 0.93, 0.91)
+_STEEL: Final = (0.78, 0.79, 0.80)
 POLE: Final = (0.22, 0.24, 0.25)
 LAMPS: Final = {True: (0.10, 0.85, 0.35), False: (0.95, 0.12, 0.08)}
 """sRGB colour of the lit lamp: True is walk, False is stop."""
@@ -24,13 +25,16 @@ _BOARD_M: Final = 0.35
 """Length in metres of the red and white fields of a barrier."""
 
 
-def barrier_meshes(barrier: Barrier) -> tuple[Mesh, Mesh]:
-    """Return the red and white parts of a barrier about its foot, blocking the x direction."""
+def barrier_parts(barrier: Barrier) -> tuple[Part, ...]:
+    """Return a barrier about its foot, blocking the x direction: red, white and posts."""
     count = max(2 * round(barrier.length_m / _BOARD_M / 2.0) + 1, 3)
     step = barrier.length_m / count
     red: list[Mesh] = []
     white: list[Mesh] = []
-    for low, high in ((0.45, 0.68), (0.77, 1.0)):
+    posts: list[Mesh] = []
+    # Red above white, and posts away from the ends: detectors take an end of equal fields on a post
+    # for a person.
+    for first, (low, high) in enumerate(((0.45, 0.68), (0.77, 1.0))):
         height = (high - low) * barrier.height_m
         for k in range(count):
             centre = (
@@ -39,12 +43,15 @@ def barrier_meshes(barrier: Barrier) -> tuple[Mesh, Mesh]:
                 0.5 * (low + high) * barrier.height_m,
             )
             board = box((0.5 * barrier.thickness_m, step, height), centre, skip=("left", "right"))
-            (red if k % 2 == 0 else white).append(board)
+            (red if (k + first) % 2 == 0 else white).append(board)
     for side in (-1, 1):
-        y = side * (0.5 * barrier.length_m - 0.15)
-        white.append(box((0.05, 0.05, 0.9 * barrier.height_m), (0.0, y, 0.45 * barrier.height_m)))
-        white.append(box((4.0 * barrier.thickness_m, 0.10, 0.06), (0.0, y, 0.03)))
-    return join(red), join(white)
+        y = side * (0.5 * barrier.length_m - min(0.45, 0.2 * barrier.length_m))
+        posts.append(box((0.05, 0.05, 0.9 * barrier.height_m), (0.0, y, 0.45 * barrier.height_m)))
+        posts.append(box((4.0 * barrier.thickness_m, 0.10, 0.06), (0.0, y, 0.03)))
+    return tuple(
+        Part(join(meshes), colour)
+        for meshes, colour in ((red, PROP_RED), (white, PROP_WHITE), (posts, _STEEL))
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ area, the ground.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -119,6 +119,7 @@ class ScanSurface(PlaceSurface):
         mesh = self.scan.mesh
         rows = self._triangles_of.get(key, np.zeros(0, dtype=np.intp))
         labels = self._labels_of(mesh, rows)
+        holes = self._holes(key)
         found: dict[str, NDArray[Any]] = {}
         for label, number in LABELS.items():
             here = rows[labels == number]
@@ -126,7 +127,9 @@ class ScanSurface(PlaceSurface):
             if len(here):
                 vertices, triangles, used = _picked(mesh.vertices, mesh.triangles[here])
                 parts.append((vertices, triangles, mesh.colours[used]))
-            parts += self._patched(key, label, rows[labels != LABELS["building"]])
+            if label in holes:
+                ground = mesh.triangles[rows[labels != LABELS["building"]]]
+                parts.append(self._patched(holes[label], mesh.colours[ground.ravel()]))
             if parts:
                 starts = np.cumsum([0, *(len(part[0]) for part in parts)])
                 triangles = np.concatenate(
@@ -136,29 +139,24 @@ class ScanSurface(PlaceSurface):
                 found[f"{label}-colours"] = np.concatenate([part[2] for part in parts])
         return found
 
-    def _patched(
-        self, key: Key, label: str, ground: NDArray[np.intp]
-    ) -> list[tuple[Floats, Ints, NDArray[np.uint8]]]:
-        """Return the ground of an area where the scan has none, in the mean colour of the tile's
-        ground."""
+    def _holes(self, key: Key) -> dict[str, Ints]:
+        """Return the squares of areas in a tile where the scan has no ground, by label."""
         cells = self._cells_of(key)
         kinds = self._kinds_at(cells.middles)
-        grid = self.scan.heights
-        measured = grid.measured[cells.corners[:, 0, 1], cells.corners[:, 0, 0]]
+        measured = self.scan.heights.measured[cells.corners[:, 0, 1], cells.corners[:, 0, 0]]
         names = np.array([_SURFACE_LABELS[kind] for kind in (*_KINDS, _GROUND)])
-        here = ~measured & (kinds < len(_KINDS)) & (names[kinds] == label)
-        if not here.any():
-            return []
-        vertices, triangles = self._lattice(cells.corners[here])
-        mesh = self.scan.mesh
-        colour = (
-            mesh.colours[mesh.triangles[ground].ravel()].mean(axis=0)
-            if len(ground)
-            else 255.0 * np.array(surface_look("sidewalk")[1])
-        )
-        return [
-            (vertices, triangles, np.tile(np.rint(colour).astype(np.uint8), (len(vertices), 1)))
-        ]
+        hole = ~measured & (kinds < len(_KINDS))
+        corners, of_label = cells.corners[hole], names[kinds[hole]]
+        return {label: corners[of_label == label] for label in np.unique(of_label).tolist()}
+
+    def _patched(
+        self, squares: Ints, colours: NDArray[np.uint8]
+    ) -> tuple[Floats, Ints, NDArray[np.uint8]]:
+        """Return the ground of squares in the mean of (N, 3) colours."""
+        vertices, triangles = self._lattice(squares)
+        look = np.array(surface_look("sidewalk")[1])
+        colour = colours.mean(axis=0) if len(colours) else 255.0 * look
+        return vertices, triangles, np.tile(np.rint(colour).astype(np.uint8), (len(vertices), 1))
 
     def _labels_of(self, mesh: ScanMesh, rows: NDArray[np.intp]) -> NDArray[np.uint8]:
         """Return the label of each triangle: its own, or by area and height."""
@@ -174,7 +172,8 @@ class ScanSurface(PlaceSurface):
         """Return the heights above the ground of the lowest and highest corner of triangles."""
         corners = mesh.vertices[mesh.triangles[rows]].astype(float)
         above = corners[..., 2] - self.heights(corners[..., :2].reshape(-1, 2)).reshape(-1, 3)
-        return above.min(axis=1), above.max(axis=1)
+        a, b, c = above.T
+        return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
 
     def _kinds_at(self, xy: Floats) -> NDArray[np.intp]:
         """Return the number in `_KINDS` of the area at (N, 2) points, `len(_KINDS)` without one."""
@@ -220,11 +219,11 @@ class ScanSurface(PlaceSurface):
         grid = self.scan.heights
         rows, columns = grid.heights.shape
         wide = max(round(_BLOCK_M / grid.step_m), 1)
-        corners = np.concatenate(list(self._squares(key, wide, rows - 1, columns - 1)))
+        corners = self._squares(key, wide, rows - 1, columns - 1)
         return _Cells(corners, grid.origin + grid.step_m * 0.5 * corners.sum(axis=1))
 
-    def _squares(self, key: Key, wide: int, rows: int, columns: int) -> Iterator[Ints]:
-        """Yield (N, 2, 2) columns and rows of the first and last corner of squares."""
+    def _squares(self, key: Key, wide: int, rows: int, columns: int) -> Ints:
+        """Return (N, 2, 2) columns and rows of the first and last corner of squares."""
         grid = self.scan.heights
         x0, y0, x1, y1 = tile_bounds(key)
         (i0, j0), (i1, j1) = (
@@ -242,13 +241,7 @@ class ScanSurface(PlaceSurface):
         middles = grid.origin + grid.step_m * 0.5 * squares.sum(axis=1)
         whole = (squares[:, 1] - squares[:, 0] == wide).all(axis=1)
         fine = shapely.contains_xy(self._near_areas, middles[:, 0], middles[:, 1]) | ~whole
-        yield squares[~fine].astype(np.int32)
-        for square in squares[fine]:
-            (a, b), (c, d) = square.tolist()
-            grids = np.meshgrid(np.arange(a, c), np.arange(b, d))
-            cell = np.stack([part.ravel() for part in grids], axis=1)
-            yield np.stack([cell, cell + 1], axis=1).astype(np.int32)
-        yield np.zeros((0, 2, 2), dtype=np.int32)
+        return np.concatenate([squares[~fine], _divided(squares[fine])]).astype(np.int32)
 
     def _lattice(self, squares: Ints) -> tuple[Floats, Ints]:
         """Return vertices and triangles of squares, divided as in `Terrain`."""
@@ -292,6 +285,17 @@ def posterized(patches: Sequence[ScannedPatch]) -> list[tuple[Mesh, Colour, str]
             part = Mesh(vertices, mesh.normals[used], triangles)
             found.append((part, (red, green, blue), label))
     return found
+
+
+def _divided(squares: Ints) -> Ints:
+    """Return (N, 2, 2) corners of the cells of the height grid in squares, by square and row."""
+    first, size = squares[:, 0], squares[:, 1] - squares[:, 0]
+    counts = size.prod(axis=1)
+    owner = np.repeat(np.arange(len(squares)), counts)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    row, column = np.divmod(number, size[owner, 0])
+    cell = first[owner] + np.stack([column, row], axis=1)
+    return np.stack([cell, cell + 1], axis=1)
 
 
 def _middles(mesh: ScanMesh, rows: NDArray[np.intp]) -> Floats:

@@ -27,8 +27,13 @@ _SHARPNESS: Final = 16.0
 """Exponent of the power mean that joins the clumps; larger values give deeper creases."""
 
 
-_CORE: Final = 0.70
+_CORE: Final = 0.66
 """Size of the core behind the twigs, as a fraction of the crown."""
+_TWIGS_WIDE: Final = 0.6, 0.15
+"""Share of the radius of a closed crown, and share of the height, whose sum is the radius of twigs.
+
+Detectors of people take small narrow crowns on thin trunks for people.
+"""
 Distance = Literal["near", "far"]
 """Distance at which a crown is drawn with its own number of twigs."""
 TREE_TWIGS: Final[Mapping[Distance, tuple[int, float]]] = {"near": (80, 0.50), "far": (24, 0.76)}
@@ -125,6 +130,14 @@ class Twigs:
     mesh: Mesh
     shade: Floats
     spots: Floats
+
+
+def leafy(species: Species, whole: Crown) -> Crown:
+    """Return the wider crown over which the twigs of a species are spread."""
+    share, more = _TWIGS_WIDE
+    wider = max(share + more / species.wide, 1.0)
+    at = whole.mesh.vertices * (wider, wider, 1.0)
+    return Crown(Mesh(at, whole.mesh.normals, whole.mesh.triangles), whole.shade)
 
 
 def crown_core(whole: Crown) -> Crown:

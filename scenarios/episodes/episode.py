@@ -228,6 +228,11 @@ class Episode:
         """Return the arrivals and departures of the crowd so far."""
         return self._open.entrances
 
+    @property
+    def state_hash(self) -> str:
+        """Return the hash of the simulated states so far."""
+        return self._open.scorer.state_hash
+
     def eyes(self, spec: CameraSpec) -> AbstractContextManager[ViewCamera]:
         """Create a further camera, for viewing."""
         return self._open.eyes(spec)

@@ -130,6 +130,8 @@ def observed_replay(
 ) -> tuple[Episode, RecordedAnswers]:
     """Return a new Episode that observes with a manifest at the recorded rate, and the answers.
 
+    It records only the state hash.
+
     manifest: sensors of the observations; its rate is that of the record.
     """
     setup = original.record.setup
@@ -143,8 +145,12 @@ def observed_replay(
         real_time=setup.real_time,
     )
     of_replay = RunSetup.of(options, gait_hash=setup.gait_hash)
-    episode = Episode(original.scenario, manifest, options, setup=of_replay)
+    episode = Episode(original.scenario, manifest, options, through=_only_hash, setup=of_replay)
     return episode, RecordedAnswers(original.log)
+
+
+def _only_hash(stage: StagedScenario) -> None:
+    stage.scorer.only_hash()
 
 
 def replay_state_hash(

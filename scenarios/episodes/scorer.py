@@ -54,10 +54,16 @@ class Scorer:
         self._red_lights: list[RedLightEntry] = []
         self._verdict = Verdict()
         self._measures: Sequence[str] = tuple(METRICS)
+        self._hashes = False
 
     def skip_measures(self) -> None:
         """Record no measures from now on, so that there is no result: only the referee judges."""
         self._measures = ()
+
+    def only_hash(self) -> None:
+        """Record only the state hash, so that there is no result. Call it before the first Step."""
+        self._measures, self._hashes = (), True
+        self._recorder = Recorder(self._clock.tick_s, self._footprint_m, ())
 
     def measure_briefly(self) -> None:
         """Record only what the measures of a search need. Call it before the first Step."""
@@ -71,10 +77,17 @@ class Scorer:
         """Return whether the episode fails or breaks a rule, whatever follows."""
         return bool(self._failures) or self._monitor.rule_is_broken
 
+    @property
+    def state_hash(self) -> str:
+        """Return the hash of the simulated states so far."""
+        return self._recorder.hash.hexdigest()
+
     def score(self, step: Step) -> Verdict:
         """Return the referee's verdict on the next Step, and record both."""
         verdict = self._verdict = self._referee.judge(step)
         if not self._measures:
+            if self._hashes:
+                self._recorder.add(step, verdict)
             return verdict
         self._recorder.add(step, verdict, self._traffic.see(step))
         self._monitor.see(step)
@@ -89,7 +102,7 @@ class Scorer:
         return msgspec.structs.replace(
             begun,
             ticks=self._recorder.ticks,
-            state_hash=self._recorder.hash.hexdigest(),
+            state_hash=self.state_hash,
             failures=tuple(self._failures),
             walked_into=tuple(self._walked_into),
             red_light_entries=tuple(self._red_lights),
@@ -101,7 +114,7 @@ class Scorer:
 
         begun: the record from the start of the episode.
         commands: all answers of the policy.
-        Raises UsageError after `skip_measures`.
+        Raises UsageError after `skip_measures` and `only_hash`.
         """
         if not self._measures:
             raise UsageError(

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from logging import WARNING
 from typing import Any, ClassVar, Final, NamedTuple, cast
 
@@ -32,7 +32,6 @@ from bridge.ros2.commands import (
     Received,
     Remarks,
     fault_of_form,
-    hash_fault,
     judged,
     plan_points,
 )
@@ -44,12 +43,14 @@ from bridge.session import Session, open_session
 from cosim.core.clock import Clock
 from cosim.core.errors import EngineError, MachineError, PolicyError, UsageError
 from cosim.core.log_event import log_event
+from cosim.core.progress import ignore
 from cosim.core.state import STILL, Command, WaypointCommand
 from cosim.episode.interfaces import Observation
 from cosim.episode.policy_caller import PolicyCaller, Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.options import PolicyHost, PolicyProcess
-from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, ROS2_SCHEME, TAKEN, Ros2Settings
+from cosim.spec.ros2 import CMD_VEL, PLAN, ROS2_SCHEME, TAKEN, Ros2Settings
+from scenarios.runs.ros2_diagnosis import diagnosis, two_publishers, unreadable
 
 JOINED_S: Final = 1.0
 """Time without new publishers and subscriptions after which all nodes count as started."""
@@ -59,6 +60,8 @@ SETTLE_S: Final = 0.3
 """Time in seconds for nodes to notice that /clock was set back."""
 GONE_S: Final = 3.0
 """Time in seconds without a publisher of /cmd_vel after which the node counts as lost."""
+HINT_S: Final = 5.0
+"""Time in seconds after which the run reports why it waits."""
 HOLD_S: Final = 0.5
 """Simulated time in seconds for which the rule `rate` repeats a command."""
 _SILENT_PERIODS: Final = 2.0
@@ -84,9 +87,11 @@ class Ros2Policy:
     """Policy that is a ROS 2 node, reached over a Zenoh session that the first episode opens.
 
     took_ms: Time of each answer of the episode.
+    hears_wait: Called with the reasons for which the policy waits.
     """
 
     def __init__(self, name: str, settings: Ros2Settings) -> None:
+        self.hears_wait: Callable[[str], None] = ignore
         self.settings = settings
         self.manifest = settings.manifest(name)
         self.took_ms: list[float] = []
@@ -96,7 +101,10 @@ class Ros2Policy:
         self._absent_s: float | None = None
         self._plan: Received | None = None
         self._remarks = Remarks()
+        self._hints: set[str] = set()
+        self._sent: set[str] = set()
         self._controller: _Controller | None = None
+        self._present: Mapping[bytes, Endpoint] = {}
         self._stream: messages.EpisodeStream | None = None
         self._last: tuple[Command, int] | None = None
         self._waits_s = 0.0
@@ -109,11 +117,14 @@ class Ros2Policy:
         self._stream = messages.EpisodeStream(episode_id, seed, elapsed_s)
         self._controller = None
         self._last = self._absent_s = None
+        self._hints.clear()
+        self._sent.clear()
         self.took_ms = []
         self._report_repeated()
         self._await_controller(node)
+        self._present = self._drivers(node)
         for topic, sent in self._stream.begun():
-            node.publish(topic, sent)
+            self._publish(node, topic, sent)
         time.sleep(SETTLE_S)
         self._inbox.take_all()
         self._plan = None
@@ -128,7 +139,7 @@ class Ros2Policy:
         if self.settings.wait != "rate":
             self._refuse_another(node, self._inbox.take_all())
         for topic, sent in stream.observed(seen, node.has_subscriber):
-            node.publish(topic, sent)
+            self._publish(node, topic, sent)
         now_ns = stream.time_ns(seen.tick)
         if first:
             self._waits_s = time.monotonic()
@@ -166,6 +177,10 @@ class Ros2Policy:
             self._session, self._node = session, node
         return self._node
 
+    def _publish(self, node: Ros2Node, topic: str, sent: Any) -> None:
+        node.publish(topic, sent)
+        self._sent.add(topic)
+
     def _take_plan(self, got: Received) -> None:
         """Hold a plan until the next answer; one that is too long does not replace another."""
         if (fault := self._fault_of_form(got, PLAN)) is None:
@@ -179,7 +194,8 @@ class Ros2Policy:
         allowed_s = self._allowed_s(first)
         while True:
             if (left_s := began_s + allowed_s - time.monotonic()) <= 0.0:
-                raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
+                raise self._no_command(node, allowed_s)
+            self._hint(node, allowed_s - left_s, "a command", self._nothing_came)
             node.wait_for(lambda: len(self._inbox), min(left_s, _LOOK_S))
             while (got := self._inbox.take()) is not None:
                 if (command := self._accepted(node, got, now_ns)) is not None:
@@ -199,7 +215,8 @@ class Ros2Policy:
         self._refuse_gone(node)
         allowed_s = self._allowed_s(self._last is None)
         if time.monotonic() - self._waits_s > allowed_s:
-            raise PolicyFault(f"gave no command for {allowed_s:.0f} s: {self._diagnosis(node)}")
+            raise self._no_command(node, allowed_s)
+        self._hint(node, time.monotonic() - self._waits_s, "a command", self._nothing_came)
         command, tick = self._last or (STILL, at_tick)
         return command if Clock().time_s(at_tick - tick) <= HOLD_S else STILL
 
@@ -213,13 +230,25 @@ class Ros2Policy:
     def _refuse_gone(self, node: Ros2Node) -> None:
         """Raise PolicyFault if no node has published /cmd_vel for a while."""
         now_s = time.monotonic()
-        if node.publishers_of(CMD_VEL):
+        if there := self._drivers(node):
             self._absent_s = None
+            self._refuse_replaced(there)
         elif self._absent_s is None:
             self._absent_s = now_s
         elif now_s - self._absent_s > GONE_S:
             name = "the node" if self._controller is None else self._controller.by
             raise PolicyFault(f"is gone: {name} published {CMD_VEL}, and has left")
+
+    def _refuse_replaced(self, there: Mapping[bytes, Endpoint]) -> None:
+        """Raise PolicyFault if other publishers have taken the place of those of the episode: they
+        lack the observation.
+
+        there: Publishers by gid.
+        """
+        if self._present and not self._present.keys() & there.keys():
+            by = next(iter(self._present.values())).in_words
+            names = [end.in_words for end in there.values()]
+            raise PolicyFault(self._replaced(by, by if by in names else names[0]))
 
     def _allowed_s(self, first: bool) -> float:
         """Return the timeout of an answer, before that of the run."""
@@ -249,6 +278,8 @@ class Ros2Policy:
             self._refuse_another(node, [got])
             if self._controller is None and got.sender:
                 self._controller = _Controller(got.sender, got.by)
+                there = self._drivers(node)
+                self._present = {gid: end for gid, end in there.items() if gid == got.sender}
         return found.command
 
     def _refuse_another(self, node: Ros2Node, received: Iterable[Received]) -> None:
@@ -272,19 +303,23 @@ class Ros2Policy:
         if controller is not None and self._has_left(node, controller.gid):
             new = [end for end in there if end.in_words != controller.by] or there
             return self._replaced(controller.by, new[0].in_words)
-        return f"is {_two(there[0], there[1])}"
+        return f"is {two_publishers(there[0], there[1])}"
 
     def _has_left(self, node: Ros2Node, gid: bytes) -> bool:
         """Return whether the token of a publisher is gone, or disappears now."""
         node.wait_for(lambda: gid not in node.publishers_of(CMD_VEL), _LEAVING_S)
         return gid not in node.publishers_of(CMD_VEL)
 
-    @staticmethod
-    def _replaced(by: str, other: str) -> str:
-        return (
-            f"is gone: {by} published {CMD_VEL} and has left, and {other} publishes it now. An "
-            "episode has one publisher: restart a node between runs"
+    def _replaced(self, by: str, other: str) -> str:
+        """Return what is wrong with a publisher that has taken the place of another."""
+        assert self._stream is not None
+        at_s = Clock().time_s(self._stream.tick)
+        what = (
+            f"{by} left and came back at {at_s:.2f} s"
+            if by == other
+            else f"{by} published {CMD_VEL} and has left, and {other} publishes it now"
         )
+        return f"is gone: {what}. An episode has one publisher: restart a node between runs"
 
     def _another(self, node: Ros2Node, got: Received) -> str:
         """Return what is wrong with a command of another publisher: the first one has left, or
@@ -295,7 +330,7 @@ class Ros2Policy:
             return self._replaced(by, got.by)
         there = node.publishers_of(CMD_VEL)
         if got.sender in there:
-            return f"is {_two(there[gid], there[got.sender])}"
+            return f"is {two_publishers(there[gid], there[got.sender])}"
         return (
             f"is two publishers of {CMD_VEL}, {by} and {got.by}: stop one, or mix their commands "
             "in a node of your own"
@@ -335,7 +370,7 @@ class Ros2Policy:
         def ready() -> bool:
             now_s = time.monotonic()
             several = len(node.publishers_of(CMD_VEL)) > 1
-            if not self._controllers(node) or (several and not self._attached):
+            if not self._drivers(node) or (several and not self._attached):
                 return False
             if now_s - began_s > SETTLED_S:
                 return True
@@ -346,79 +381,49 @@ class Ros2Policy:
             there = list(node.publishers_of(CMD_VEL).values())
             waited_s = time.monotonic() - began_s
             if len(there) > 1 and not self._attached and waited_s > min(SETTLED_S, allowed_s):
-                raise PolicyFault(f"is {_two(there[0], there[1])}")
+                raise PolicyFault(f"is {two_publishers(there[0], there[1])}")
             if waited_s > allowed_s:
-                raise PolicyFault(f"is missing after {allowed_s:.0f} s: {self._diagnosis(node)}")
+                why = self._diagnosis(node, self._remarks.words) or "nodes still come and go"
+                raise PolicyFault(f"is missing after {allowed_s:.0f} s: {why}")
+            self._hint(node, waited_s, "a node")
             node.wait_for_tokens(_LOOK_S)
-        if len(there := self._controllers(node)) > 1:
-            self._remark(Fault(CMD_VEL, "publishers", f"there are {_two(there[0], there[1])}"))
+        if len(there := list(self._drivers(node).values())) > 1:
+            words = f"there are {two_publishers(there[0], there[1])}"
+            self._remark(Fault(CMD_VEL, "publishers", words))
+            self.hears_wait(words)
 
-    def _controllers(self, node: Ros2Node) -> list[Endpoint]:
-        """Return the publishers of /cmd_vel with a type that is read."""
-        return [end for end in node.publishers_of(CMD_VEL).values() if not self._unreadable(end)]
+    def _drivers(self, node: Ros2Node) -> dict[bytes, Endpoint]:
+        """Return the publishers of /cmd_vel with a type that is read, by gid."""
+        there = node.publishers_of(CMD_VEL)
+        distro = self.settings.distro
+        return {gid: end for gid, end in there.items() if not unreadable(end, distro)}
 
-    def _unreadable(self, end: Endpoint) -> str:
-        """Return why the commands of a publisher cannot be read, "" if they can."""
-        if end.type not in COMMAND_TYPES:
-            types = " or ".join(COMMAND_TYPES)
-            return f"{end.in_words} publishes {CMD_VEL} as {end.type}: publish {types}"
-        wanted = type_hash(end.type, self.settings.distro)
-        if end.hash and end.hash != wanted:
-            return f"{end.in_words} {hash_fault(end.type, end.hash, wanted)}"
-        return ""
+    def _no_command(self, node: Ros2Node, allowed_s: float) -> PolicyFault:
+        """Return the error that no command came in time."""
+        why = self._diagnosis(node, self._remarks.words) or self._nothing_came
+        return PolicyFault(f"gave no command for {allowed_s:.0f} s: {why}")
 
-    def _diagnosis(self, node: Ros2Node) -> str:
-        """Return why there is no command, as far as the nodes around and their messages show."""
-        there = node.others
-        runs = {
-            end.session
-            for end in there
-            if end.kind == "MP" and end.topic.endswith(messages.EPISODE)
-        }
-        others = [end for end in there if end.session not in runs]
-        settings = self.settings
-        here = full_topic(settings.namespace, CMD_VEL)
-        found = self._remarks.words
-        for end in others:
-            if end.kind != "MP" or not end.topic.endswith(CMD_VEL):
-                continue
-            if end.domain not in (-1, settings.domain):
-                found.append(
-                    f"{end.in_words} publishes {end.topic} in domain {end.domain}, and this "
-                    f"episode is in domain {settings.domain}: set ROS_DOMAIN_ID={settings.domain} "
-                    f"or --ros2-domain"
-                )
-            elif end.topic != here:
-                found.append(f"{end.in_words} publishes {end.topic}, not {here}: remap it")
-            elif words := self._unreadable(end):
-                found.append(words)
-        if found:
-            return "; ".join(dict.fromkeys(found))
-        if not others:
-            return (
-                f"no ROS 2 node is at {settings.where} in any domain: nodes of rmw_zenoh connect "
-                f"there, and those on DDS need zenoh-bridge-ros2dds and --ros2-dialect ros2dds"
-            )
-        if not node.publishers_of(CMD_VEL):
-            names = ", ".join(sorted({end.in_words for end in others})[:8])
-            return f"none of the nodes {names} publishes {here} in domain {settings.domain}"
-        answered = "no command came with the stamp of the observation"
-        return (
-            answered
-            if settings.wait == "stamped"
-            else f"no message of at most {LARGEST_B} bytes came on {here}"
-        )
+    @property
+    def _nothing_came(self) -> str:
+        """Why there is no command if nothing is wrong with the nodes around."""
+        if self.settings.wait == "stamped":
+            return "no command came with the stamp of the observation"
+        return f"no message came on {full_topic(self.settings.namespace, CMD_VEL)}"
 
+    def _diagnosis(self, node: Ros2Node, faults: Iterable[str]) -> str:
+        return diagnosis(node, self.settings, faults, self._sent)
 
-def _two(one: Endpoint, other: Endpoint) -> str:
-    """Name two publishers of commands, with a remedy."""
-    names = one.in_words, other.in_words
-    if names[0] == names[1]:
-        names = (f"{names[0]} of session {one.session[:8]}", f"of session {other.session[:8]}")
-    return (
-        f"two publishers of {CMD_VEL}, {names[0]} and {names[1]}: stop one, or mix their commands "
-        "in a node of your own"
-    )
+    def _hint(self, node: Ros2Node, waited_s: float, waits_for: str, otherwise: str = "") -> None:
+        """Report why the run waits, once it has waited for a while, and each reason once.
+
+        otherwise: Reason if nothing is wrong with the nodes around.
+        """
+        if waited_s < HINT_S:
+            return
+        words = self._diagnosis(node, self._remarks.kinds) or otherwise
+        if words and words not in self._hints:
+            self._hints.add(words)
+            self.hears_wait(f"waits for {waits_for}: {words}")
 
 
 def _report(words: str) -> None:
@@ -443,6 +448,9 @@ class Ros2Driver(PolicyCaller):
             return {}
         median, most = np.quantile(self._ros2.took_ms, [0.5, 0.95])
         return {"answer_median_ms": float(median), "answer_p95_ms": float(most)}
+
+    def on_wait(self, hears: Callable[[str], None]) -> None:
+        self._ros2.hears_wait = hears
 
     def close(self) -> None:
         self._ros2.close()

@@ -85,6 +85,8 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
         try:
             job = decode_job(wire.receive())
         except EOFError:
+            if drivers is not None:
+                drivers.close()  # an open session would keep this process alive
             return
         with suppress(OSError):  # the policy may have deleted it
             os.chdir(home)
@@ -281,6 +283,7 @@ def run_job(
         from scenarios.episodes.demonstrator import Demonstrator
 
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
+    driver.on_wait(lambda reason: say(Waits(name, reason)))
     watcher = _Watcher(job, say)
     watches: list[Watch] = [watcher.watch]
     if commands is not None:

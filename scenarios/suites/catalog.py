@@ -88,25 +88,27 @@ def holding(scenario_id: str) -> Suite:
 def one_scenario(
     name: str, suite: str | None = None, which: str | None = None
 ) -> tuple[Suite, int]:
-    """Find one scenario by its id, or by the path of its file: the suite with it alone, and of how
-    many it is one.
+    """Find one scenario by its id, or by its suite: the suite with it alone, and of how many it is
+    one.
 
+    name: id of a scenario, name of a shipped suite, path of a file, or a run folder
     suite: where to look for the id; by default in the shipped suites.
-    which: of a file or a run folder, the id or the number, counted from 1; by default the first.
+    which: of all but an id: the id or the number, counted from 1; by default the first.
 
     Raises UsageError with the valid choices, SpecError for a file with faults.
     """
-    if not name.endswith((".json", ".toml")) and not _is_run(name):
+    if not name.endswith((".json", ".toml")) and not _is_run(name) and name not in SUITES:
         if which is not None:
             raise UsageError(
-                f"--scenario chooses from a file, and '{name}' is a scenario's id: leave "
-                f"--scenario out"
+                f"--scenario chooses from a suite or a file, and '{name}' is not a suite's name; "
+                f"for a scenario's id, leave --scenario out. Suites: {', '.join(SUITES)}"
             )
         whole = holding(name) if suite is None else load_suite(suite)
         return msgspec.structs.replace(whole, scenarios=select_scenarios(whole, [name])), 1
     if suite is not None:
         raise UsageError(
-            f"{name} is a file: leave --suite out, and choose one of its scenarios by --scenario"
+            f"{name} is a suite or a file: leave --suite out, and choose one of its scenarios by "
+            "--scenario"
         )
     if not name.endswith(".toml"):
         whole = load_suite(name)

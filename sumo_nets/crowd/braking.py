@@ -13,7 +13,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cosim.core.geometry import Circle, Floats, Polyline, Pose, boxes_overlap, headings_from_sumo
+from cosim.core.geometry import (
+    Circle,
+    Floats,
+    Polyline,
+    Pose,
+    boxes_overlap,
+    heading_from_sumo,
+    hypot,
+)
 from sumo_nets.engine import NearVehicles, Sumo
 
 MARGIN_M: Final = 0.3
@@ -33,6 +41,8 @@ _SWINGS_M: Final = 1.0
 _AHEAD_M: Final = 60.0
 """Length of a path beyond the end of a vehicle's lane, metres."""
 _SAMPLE_M: Final = 0.4
+_ROUNDING_M: Final = 1e-6
+"""Tolerance for rounding, metres."""
 _ROUND_M: Final = 5.0
 """A vehicle's front is searched on its path within this distance of SUMO's position, metres."""
 _BOUND: Final = 31
@@ -115,7 +125,7 @@ class BrakingForRobot:
         if path is not None and path.lane == lane and path.clear.holds(*robot[:2]):
             return None
         length_m, width_m = self._size_m(name)
-        heading = float(headings_from_sumo(near.angle_deg[row]))
+        heading = heading_from_sumo(float(near.angle_deg[row]))
         ahead = np.array([math.cos(heading), math.sin(heading)])
         front: Floats = near.xy[row]
         back = front - length_m * ahead
@@ -193,9 +203,15 @@ class BrakingForRobot:
 
 def _approaching(near: NearVehicles, robot: Pose) -> list[int]:
     """Return the rows of the vehicles whose braking distance reaches a robot."""
-    gap = near.xy - robot[:2]
-    reach_m = _NEAR_M + near.mps * (_REACTION_S + near.mps / (2.0 * _BRAKES_MPS2))
-    rows: list[int] = np.flatnonzero(np.hypot(gap[:, 0], gap[:, 1]) < reach_m).tolist()
+    x_m, y_m, _ = robot
+    moved_m = math.hypot(x_m - near.from_xy[0], y_m - near.from_xy[1]) + _ROUNDING_M
+    rows = []
+    for row, (away_m, mps) in enumerate(zip(near.away_m.tolist(), near.mps.tolist(), strict=True)):
+        reach_m = _NEAR_M + mps * (_REACTION_S + mps / (2.0 * _BRAKES_MPS2))
+        if away_m < reach_m + moved_m:
+            at_x, at_y = near.xy[row].tolist()
+            if hypot(at_x - x_m, at_y - y_m) < reach_m:
+                rows.append(row)
     return rows
 
 

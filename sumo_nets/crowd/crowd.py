@@ -173,9 +173,9 @@ class SumoCrowd(Crowd):
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
                 self._gaps.keep(persons)
-                seen = _seen(persons, engine.persons_waiting_s(persons.names))
+                seen = _seen(persons, engine.persons_waiting_s(persons))
                 self._pedestrians.roll(x_m, y_m, seen, self._waits_at_red)
-                seen = _seen(vehicles, engine.vehicles_waiting_s(vehicles.names))
+                seen = _seen(vehicles, engine.vehicles_waiting_s(vehicles))
                 self._drivers.roll(x_m, y_m, seen)
             stands = outline_mps(robot.v_mps, robot.w_radps, self._half_m) < ROBOT_STANDS_MPS
             self._stood_ticks = self._stood_ticks + 1 if stands else 0
@@ -221,9 +221,10 @@ class SumoCrowd(Crowd):
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
+        self._mirrored: list[str] = []
         self._poses = PoseFilter(TICK_MS / 1000, self._standing)
         self._shown = ShownPeople(TICK_MS / 1000)
-        self._sized = NO_VEHICLES.ids, NO_VEHICLES.size
+        self._sized = NO_VEHICLES.ids, NO_VEHICLES.size, NO_VEHICLES.speed
         if self._spec.vehicles:
             self._drivers.fill(x_m, y_m)
             for _ in range(round(_WARM_UP_S * 1000 / TICK_MS)):
@@ -255,22 +256,25 @@ class SumoCrowd(Crowd):
         return people, Drivers(*logged, rng_vehicles)
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
-        present = {actor.id for actor in actors}
-        for name in sorted(self._actors.keys() - present):
-            self._actors.pop(name).remove()
+        names = [actor.id for actor in actors]
+        if names != self._mirrored:
+            self._mirrored = names
+            for name in sorted(self._actors.keys() - set(names)):
+                self._actors.pop(name).remove()
+            for name in names:
+                if name not in self._actors:
+                    self._actors[name] = Proxy(
+                        sumo, self._walks, base=name, kind="event", serial=self._serial
+                    )
         for actor in actors:
-            if actor.id not in self._actors:
-                self._actors[actor.id] = Proxy(
-                    sumo, self._walks, base=actor.id, kind="event", serial=self._serial
-                )
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
     def _read(
         self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None
     ) -> Street:
-        persons = self._reader.persons_near(x_m, y_m, self._spec.radius_m + LEAVE_MARGIN_M)
-        vehicles = self._reader.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
-        self._found = persons, vehicles
+        reach_m = self._spec.radius_m + LEAVE_MARGIN_M
+        self._found = self._reader.near(x_m, y_m, reach_m, VEHICLE_REACH_M)
+        persons, vehicles = self._found
         people = self._people(persons, cast, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
@@ -291,11 +295,13 @@ class SumoCrowd(Crowd):
         boxes."""
         if near.names != self._sized[0]:
             sizes = [self._drivers.size_m(name) for name in near.names]
-            self._sized = near.names, write_protected_copy(sizes, shape=(len(sizes), 2))
-        size = self._sized[1]
+            size = write_protected_copy(sizes, shape=(len(sizes), 2))
+            self._sized = near.names, size, 0.5 * size[:, 0]
+        _, size, half_m = self._sized
         heading = headings_from_sumo(near.angle_deg)
-        ahead = np.column_stack([np.cos(heading), np.sin(heading)])
-        xy = near.xy - 0.5 * size[:, :1] * ahead
+        xy = near.xy.copy()
+        xy[:, 0] -= half_m * np.cos(heading)
+        xy[:, 1] -= half_m * np.sin(heading)
         return Vehicles(
             near.names, write_protect(xy), write_protect(heading), write_protect(near.mps), size
         )

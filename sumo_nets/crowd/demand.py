@@ -17,7 +17,7 @@ from cosim.spec.scenario import CrowdSpec
 from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
 from sumo_nets.crowd.following_gaps import FollowingGaps
-from sumo_nets.crowd.free_space import EntrySpot, LocalWalkableArea, Spots
+from sumo_nets.crowd.free_space import EntrySpot, LocalWalkableArea, Ring, Spots
 from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
 from sumo_nets.crowd.proxy import ROUND_THE_CORNER_M
@@ -136,19 +136,19 @@ class Pedestrians:
         """
         person, radius_m = self._engine.person, self._spec.radius_m
         fellows = self._together.group_of
-        present = sorted(self.ages.keys() & set(person.getIDList()))
+        here = self.ages.keys() & set(person.getIDList())
+        present = sorted(here)
         self._together.forget(present)
-        removed: set[str] = set()
         for name in present:
-            here = seen.get(name)
-            if name in removed:
+            one = seen.get(name)
+            if one is not None and one.waiting_s <= STUCK_S:
                 continue
-            if here is None or (
-                here.waiting_s > STUCK_S and not any(at_red(fellow) for fellow in fellows(name))
+            if name in here and (
+                one is None or not any(at_red(fellow) for fellow in fellows(name))
             ):
-                removed.update(fellows(name))
-                self._remove(name)
-        away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
+                self._remove(name, here)
+        hypot = math.hypot
+        away_m = {name: hypot(x - x_m, y - y_m) for name, (x, y, _) in seen.items()}
         inside = [name for name, far_m in away_m.items() if far_m < radius_m]
         low_m = min(max(SIGHT_M, radius_m - ENTER_M), radius_m - 10.0)
         missing = self.wanted(x_m, y_m) - len(inside)
@@ -161,16 +161,17 @@ class Pedestrians:
             for name in far:
                 if len(fellows(name)) <= spare:
                     spare -= len(fellows(name))
-                    self._remove(name)
+                    self._remove(name, here)
         self._together.keep(seen)
         self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
 
-    def _remove(self, name: str) -> None:
-        """Remove a person that is still in the simulation, with its group."""
-        if name in self._engine.person.getIDList():
+    def _remove(self, name: str, here: set[str]) -> None:
+        """Remove a person with its group. here: persons in the simulation; it is updated."""
+        if name in here:
             for fellow in self._together.leave(name):
                 self._entrances.people[self._engine.simulation.getTime()].append(fellow)
                 self._engine.person.remove(fellow)
+                here.discard(fellow)
 
     def _margin_m(self, port: Port) -> float:
         return (
@@ -182,15 +183,19 @@ class Pedestrians:
     def _enter(
         self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]
     ) -> None:
-        if count <= 0 or not (ring := self._ring(x_m, y_m, low_m)):
+        if count <= 0 or 2 * count < self._groups.coming.size:
+            return
+        ring, at_edge = self._rings(x_m, y_m, low_m)
+        spots = len(ring) + len(at_edge)
+        if not spots:
             return
         taken = np.array([(p.x_m, p.y_m) for p in seen.values()], dtype=float).reshape(-1, 2)
         for _ in range(4 * count):
             group = self._groups.coming
             if 2 * count < group.size:
                 return
-            spots, place = ring[int(self._rng.integers(len(ring)))]
-            spot = spots[place]
+            pick = int(self._rng.integers(spots))
+            spot = ring[pick] if pick < len(ring) else at_edge[pick - len(ring)]
             forward = bool(self._rng.random() < 0.5)
             drawn_mps = float(self._rng.uniform(*group.pace_mps))
             width_m = self._widths_m[spot.edge]
@@ -222,12 +227,10 @@ class Pedestrians:
             if count <= 0:
                 return
 
-    def _ring(self, x_m: float, y_m: float, low_m: float) -> list[tuple[Spots, tuple[int, int]]]:
-        """Return the spots where persons may enter; at the edge of a scan also in sight."""
-        far_m = self._spec.radius_m
-        found = [(self._spots, spot) for spot in self._spots.ring(x_m, y_m, low_m, far_m)]
-        near = self._edge_spots.ring(x_m, y_m, FIRST_FILL_CLEAR_M, low_m)
-        return found + [(self._edge_spots, spot) for spot in near]
+    def _rings(self, x_m: float, y_m: float, low_m: float) -> tuple[Ring, Ring]:
+        """Return the spots where persons may enter; those at the edge of a scan may be in sight."""
+        ring = self._spots.ring(x_m, y_m, low_m, self._spec.radius_m)
+        return ring, self._edge_spots.ring(x_m, y_m, FIRST_FILL_CLEAR_M, low_m)
 
     def _one_way(self, walk: list[str], forward: bool) -> list[str]:
         """Return a walk with a unique direction for SUMO.
@@ -364,8 +367,8 @@ class Drivers:
             for _ in range(missing if ring else 0):
                 self._enter(ring)
 
-    def _enter(self, ring: list[tuple[int, int]]) -> None:
-        spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
+    def _enter(self, ring: Ring) -> None:
+        spot = ring[int(self._rng.integers(len(ring)))]
         route = self._route(spot.edge)
         kinds = list(VEHICLE_TYPES)
         kind = kinds[

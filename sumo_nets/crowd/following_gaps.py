@@ -6,12 +6,13 @@ held up or in a crowd. With wide gaps, people in crowds could not step aside, an
 
 from __future__ import annotations
 
+from itertools import repeat
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, headings_from_sumo
-from sumo_nets.crowd.separation import pairs_within
 from sumo_nets.engine import NearPersons, Sumo
 
 HELD_UP_MPS: Final = 0.5
@@ -53,17 +54,16 @@ class FollowingGaps:
         if len(self._gaps_m) > 2 * len(here):
             self._gaps_m = {name: self._gaps_m[name] for name in here}
             self._share = {name: self._share[name] for name in here if name in self._share}
-        pairs = pairs_within(near.xy, CROWDED_M)
-        others = np.bincount(pairs.ravel(), minlength=len(near.names))
+        others = _others_within(near.xy, CROWDED_M)
         shares = np.where(
             others >= CROWDED, _IN_CROWD, np.where(near.mps < HELD_UP_MPS, _HELD_UP, 1.0)
         )
         waiting = []
-        for row, (name, share) in enumerate(zip(near.names, shares.tolist(), strict=True)):
-            now = self._share.get(name, 1.0)
-            if share < now and name in self._gaps_m:
-                self._set(name, share)
-            elif share > now:
+        now = map(self._share.get, near.names, repeat(1.0))
+        for row, (share, next_share) in enumerate(zip(now, shares.tolist(), strict=True)):
+            if next_share < share and near.names[row] in self._gaps_m:
+                self._set(near.names[row], next_share)
+            elif next_share > share:
                 waiting.append(row)
         for row in self._with_room(near, waiting, shares):
             self._set(near.names[row], float(shares[row]))
@@ -89,3 +89,13 @@ class FollowingGaps:
         need_m = _LENGTH_M + np.array(gaps_m)[:, None] + _SPARE_M
         taken = (ahead > 1e-6) & (ahead < need_m) & (aside < _ASIDE_M)
         return [row for row, full in zip(rows, taken.any(axis=1).tolist(), strict=True) if not full]
+
+
+def _others_within(xy: Floats, reach_m: float) -> NDArray[np.intp]:
+    """Return the number of other points within `reach_m` of each point (N, 2), as (N,)."""
+    x, y = xy.T.copy()
+    dx, dy = x[:, None] - x, y[:, None] - y
+    dx *= dx
+    dy *= dy
+    dx += dy
+    return np.asarray(np.count_nonzero(dx <= reach_m * reach_m, axis=1) - 1)

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import StreetMap
@@ -60,6 +61,10 @@ class InnerGround:
         return xy
 
 
+Rows = NDArray[np.intp]
+_NO_ROWS: Final = np.zeros(0, dtype=np.intp)
+
+
 class EntrySpot(NamedTuple):
     """A pose on the middle line of an edge, heading along it. share: share of the edge's length
     before it."""
@@ -93,26 +98,23 @@ class Spots:
             self._low = np.minimum.reduceat(whole, starts)
             self._high = np.maximum.reduceat(whole, starts)
 
-    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
-        """Return the spots whose distance from (x_m, y_m) is in [low_m, high_m] metres.
-
-        Each is a pair of line index and spot index.
-        """
+    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> Ring:
+        """Return the spots whose distance from (x_m, y_m) is in [low_m, high_m] metres."""
         if not self._lines:
-            return []
+            return Ring(self, _NO_ROWS, _NO_ROWS, _NO_ROWS)
         gap_m = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
         lines = np.flatnonzero((gap_m * gap_m).sum(axis=1) <= high_m * high_m + 1.0)
+        if not len(lines):
+            return Ring(self, lines, lines, lines)
         poses = [self._on(number)[1] for number in lines.tolist()]
-        numbers = np.repeat(lines, [len(on) for on in poses])
-        places = np.concatenate([np.arange(len(on)) for on in poses] or [numbers])
-        gap = np.concatenate([on[:, :2] for on in poses] or [np.zeros((0, 2))]) - (x_m, y_m)
-        here = ((gap * gap).sum(axis=1) <= high_m * high_m) & (
-            np.hypot(gap[:, 0], gap[:, 1]) >= low_m
-        )
-        return list(zip(numbers[here].tolist(), places[here].tolist(), strict=True))
+        starts = np.cumsum([0, *map(len, poses)])
+        gap = np.concatenate(poses)[:, :2] - (x_m, y_m)
+        dx, dy = gap.T.copy()
+        here = (dx * dx + dy * dy <= high_m * high_m) & (np.hypot(dx, dy) >= low_m)
+        return Ring(self, lines, starts, np.flatnonzero(here))
 
-    def __getitem__(self, spot: tuple[int, int]) -> EntrySpot:
-        number, k = spot
+    def spot(self, number: int, k: int) -> EntrySpot:
+        """Return the spot `k` of a line."""
         shares, poses = self._on(number)
         return EntrySpot(self._lines[number][0], float(shares[k]), Pose(*poses[k].tolist()))
 
@@ -126,3 +128,25 @@ class Spots:
             poses = np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])])
             self._made[number] = s / line.length_m, poses
         return self._made[number]
+
+
+class Ring:
+    """Entry spots at some distances from a point, as a sequence.
+
+    lines: (L,) lines with spots. starts: (L + 1,) number of spots on the lines before each.
+    here: (N,) numbers of the spots of the ring among all on these lines.
+    """
+
+    def __init__(self, spots: Spots, lines: Rows, starts: Rows, here: Rows) -> None:
+        self._spots = spots
+        self._lines = lines
+        self._starts = starts
+        self._here = here
+
+    def __len__(self) -> int:
+        return len(self._here)
+
+    def __getitem__(self, k: int) -> EntrySpot:
+        number = int(self._here[k])
+        line = int(np.searchsorted(self._starts, number, side="right")) - 1
+        return self._spots.spot(int(self._lines[line]), number - int(self._starts[line]))

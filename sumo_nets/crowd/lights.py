@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
-from cosim.core.geometry import Floats
+from cosim.core.geometry import Floats, hypot
 from cosim.core.state import Signal
 from cosim.place import overlay
 from cosim.place.street_map import Lane, SignalPlan, StreetMap
@@ -69,10 +70,7 @@ class Signals:
 
     def near(self, x_m: float, y_m: float) -> Mapping[str, Signal]:
         """Return the current signals within about _NEAR_M of a point."""
-        if (
-            self._centre is None
-            or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M
-        ):
+        if self._centre is None or hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M:
             self._centre = (x_m, y_m)
             gap = self._xy - (x_m, y_m)
             self._near = [
@@ -89,14 +87,12 @@ class Signals:
 
     def red(self, crossings: Sequence[str]) -> list[int]:
         """Return the indices of those `crossings` with a signal that forbids walking."""
-        if self._signalised.isdisjoint(crossings):
+        signalised = self._signalised.intersection(crossings)
+        if not signalised:
             return []
         now_s = self._lights.now_s()
-        return [
-            i
-            for i, one in enumerate(crossings)
-            if one in self._signalised and not self._state(one, now_s).walk
-        ]
+        red = {one for one in signalised if not self._state(one, now_s).walk}
+        return [i for i, one in enumerate(crossings) if one in red] if red else []
 
     def is_red(self, crossing: str) -> bool:
         """Return whether a crossing has a signal that forbids walking."""
@@ -232,28 +228,39 @@ class WaitingSpots:
             for crossing, (x_m, y_m) in zip(crossings, xy.tolist(), strict=True)
         ]
         if new := [key for key in keys if key not in self._spots]:
-            self._find(new)
+            self._spots.update((key, key[1:]) for key in new)
+            if aside := self._not_waiting(new):
+                self._find(aside)
         return np.array([self._spots[key] for key in keys]).reshape(-1, 2)
 
+    def _not_waiting(self, new: list[_Key]) -> list[_Key]:
+        """Return the keys of persons that are not on ground to wait on. Most are on it, and on one
+        corner, which GEOS tests much faster than it computes distances."""
+        _, x_m, y_m = zip(*new, strict=True)
+        ends = [self._corners(crossing) for crossing, _, _ in new]
+        on_first = shapely.intersects_xy(_array([first for _, (first, _) in ends]), x_m, y_m)
+        grounds = [
+            self._standing(corners[0 if on else 1])
+            if corners and (on or len(corners) > 1)
+            else None
+            for (corners, _), on in zip(ends, on_first.tolist(), strict=True)
+        ]
+        waiting = shapely.contains_xy(_array(grounds), x_m, y_m).tolist()
+        return [key for key, waits in zip(new, waiting, strict=True) if not waits]
+
     def _find(self, new: list[_Key]) -> None:
-        """Compute waiting positions that are not in the cache."""
+        """Compute waiting positions of persons elsewhere."""
         xy = np.array([key[1:] for key in new])
         ends = [self._corners(crossing) for crossing, _, _ in new]
         outlines = np.array([outline for _, outline in ends], dtype=object)
-        # Most people are on a corner, which GEOS tests much faster than it computes distances.
-        on = shapely.intersects_xy(outlines, xy[:, :1], xy[:, 1:])
-        away_m = np.where(on, 0.0, 1.0)
-        off = ~on.any(axis=1)
-        if off.any():
-            away_m[off] = shapely.distance(
-                outlines[off], np.array(shapely.points(xy[off]))[:, None]
-            )
+        away_m = shapely.distance(outlines, np.array(shapely.points(xy))[:, None])
         last = (away_m[:, 1] < away_m[:, 0]).tolist()
-        grounds = [
-            self._standing(corners[k]) if corners else None
-            for (corners, _), k in zip(ends, last, strict=True)
-        ]
-        ground = np.array(grounds, dtype=object)
+        ground = _array(
+            [
+                self._standing(corners[k]) if corners else None
+                for (corners, _), k in zip(ends, last, strict=True)
+            ]
+        )
         aside = ~(
             shapely.contains_xy(ground, *xy.T)
             | shapely.is_missing(ground)
@@ -262,7 +269,7 @@ class WaitingSpots:
         if aside.any():
             ways = shapely.shortest_line(shapely.points(xy[aside]), ground[aside])
             xy[aside] = shapely.get_coordinates(ways)[1::2]
-        self._spots.update(zip(new, map(tuple, xy.tolist()), strict=True))
+            self._spots.update(zip(new, map(tuple, xy.tolist()), strict=True))
 
     def _corners(self, crossing: str) -> tuple[list[str], list[shapely.Geometry | None]]:
         """Return the corners at the ends of a crossing and two outlines, None without a corner."""
@@ -292,3 +299,10 @@ class WaitingSpots:
             shapely.prepare(ground)
             self._ground[corner] = ground
         return self._ground[corner]
+
+
+def _array(geometries: list[shapely.Geometry | None]) -> NDArray[np.object_]:
+    """Return geometries as an array (N,)."""
+    array = np.empty(len(geometries), dtype=object)
+    array[:] = geometries
+    return array

@@ -11,14 +11,51 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
 import shapely
 from shapely.geometry import LineString
 
-from cosim.core.geometry import Circle, Pose, heading_to_sumo
+from cosim.core.geometry import Circle, Floats, Pose, heading_to_sumo
 from cosim.place.street_map import Located, StreetMap
 
 if TYPE_CHECKING:
     from sumo_nets.engine import Sumo
+
+
+_Segments = tuple[tuple[float, float, float, float, float], ...]
+"""Straight pieces of lines: start x, y; direction x, y; length, in metres."""
+
+
+def _distance_m(pieces: _Segments, x_m: float, y_m: float) -> float:
+    """Return the distance of a point from the nearest of these pieces, metres."""
+    least_m2 = math.inf
+    for start_x, start_y, along_x, along_y, length_m in pieces:
+        dx, dy = x_m - start_x, y_m - start_y
+        along_m = dx * along_x + dy * along_y
+        beyond_m = along_m if along_m < 0.0 else along_m - length_m if along_m > length_m else 0.0
+        aside_m = dy * along_x - dx * along_y
+        far_m2 = beyond_m * beyond_m + aside_m * aside_m
+        if far_m2 < least_m2:
+            least_m2 = far_m2
+    return math.sqrt(least_m2)
+
+
+class LocalLead(NamedTuple):
+    """What `SidewalkLead.metres` compares within LOCAL_M of a point.
+
+    own, others: pieces of the sidewalk's and of the other lanes' lines that are near.
+    width_m: width of the sidewalk.
+    """
+
+    around: Circle
+    own: _Segments
+    others: _Segments
+    width_m: float
+
+    def metres(self, x_m: float, y_m: float) -> float:
+        """Return the lead at a point, accurate to rounding."""
+        own_m = _distance_m(self.own, x_m, y_m)
+        return min(_distance_m(self.others, x_m, y_m) - own_m, self.width_m - 2.0 * own_m)
 
 
 class SidewalkLead:
@@ -29,6 +66,7 @@ class SidewalkLead:
         self._engine = engine
         self._internal = internal
         self._lines: dict[tuple[str, str], tuple[shapely.Geometry, shapely.Geometry]] = {}
+        self._pieces: dict[tuple[str, str], tuple[Floats, Floats]] = {}
 
     def metres(self, first: str, second: str, x_m: float, y_m: float) -> float:
         """Return by how much `first` is nearer to a point on it than any other lane that SUMO
@@ -38,19 +76,34 @@ class SidewalkLead:
         sidewalk's sides, and negative where another lane is nearer. It changes by at most 2 m per
         metre.
         """
+        at = shapely.points(x_m, y_m)
+        sidewalk, rest = self._compared(first, second)
+        own_m = float(shapely.distance(sidewalk, at))
+        return min(float(shapely.distance(rest, at)) - own_m, self._width_m(first) - 2.0 * own_m)
+
+    def around(self, first: str, second: str, x_m: float, y_m: float) -> LocalLead:
+        """Return what is compared within LOCAL_M of a point."""
+        if (first, second) not in self._pieces:
+            own, rest = self._compared(first, second)
+            self._pieces[first, second] = _pieces(own), _pieces(rest)
+        own_pieces, others = self._pieces[first, second]
+        return LocalLead(
+            Circle(x_m, y_m, LOCAL_M),
+            _pieces_near(own_pieces, x_m, y_m),
+            _pieces_near(others, x_m, y_m),
+            self._width_m(first),
+        )
+
+    def _compared(self, first: str, second: str) -> tuple[shapely.Geometry, shapely.Geometry]:
+        """Return the line of the sidewalk, and those of the other lanes."""
         if (first, second) not in self._lines:
             inside = self._internal.get(self._engine.edge.getToJunction(first), ())
             own, *others = [line for edge in (first, second, *inside) for line in self._of(edge)]
             self._lines[first, second] = own, shapely.multilinestrings(others)
-        at = shapely.Point(x_m, y_m)
-        sidewalk, rest = self._lines[first, second]
-        own_m = shapely.distance(sidewalk, at)
-        return float(
-            min(
-                shapely.distance(rest, at) - own_m,
-                self._engine.lane.getWidth(f"{first}_0") - 2.0 * own_m,
-            )
-        )
+        return self._lines[first, second]
+
+    def _width_m(self, sidewalk: str) -> float:
+        return self._engine.lane.getWidth(f"{sidewalk}_0")
 
     def _of(self, edge: str) -> list[LineString]:
         """Return the lines of an edge's lanes, the sidewalk first."""
@@ -58,6 +111,30 @@ class SidewalkLead:
         return [
             LineString([point[:2] for point in self._engine.lane.getShape(lane)]) for lane in lanes
         ]
+
+
+LOCAL_M: Final = 5.0
+"""Distance from a point within which the lines near it are compared without a search, metres."""
+
+
+def _pieces(lines: shapely.Geometry) -> Floats:
+    """Return the straight pieces of lines, (N, 5); see `_Segments`."""
+    parts = [shapely.get_coordinates(line) for line in shapely.get_parts(lines)]
+    starts = np.concatenate([points[:-1] for points in parts])
+    steps = np.concatenate([np.diff(points, axis=0) for points in parts])
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    long = lengths > 0.0
+    return np.column_stack([starts, steps / np.maximum(lengths, 1e-9)[:, None], lengths])[long]
+
+
+def _pieces_near(pieces: Floats, x_m: float, y_m: float) -> _Segments:
+    """Return the pieces that can be the nearest ones within LOCAL_M of a point."""
+    dx, dy = x_m - pieces[:, 0], y_m - pieces[:, 1]
+    along = dx * pieces[:, 2] + dy * pieces[:, 3]
+    beyond = along - np.clip(along, 0.0, pieces[:, 4])
+    far_m = np.hypot(beyond, dy * pieces[:, 2] - dx * pieces[:, 3])
+    near = far_m <= far_m.min(initial=np.inf) + 2.0 * LOCAL_M + _ROUNDING_M
+    return tuple(map(tuple, pieces[near].tolist()))
 
 
 KEEP_ROUTE = 3
@@ -76,6 +153,8 @@ metres."""
 LEAD_MIN_M = 0.01
 """The lines of a proxy's own place must be nearer than others by this distance, metres."""
 
+_TIE_M: Final = 1e-6
+"""A lead this close to LEAD_MIN_M is computed by GEOS, metres."""
 _ROUNDING_M: Final = 0.001
 """Tolerance of distances, metres."""
 
@@ -164,10 +243,10 @@ class Walks:
         if lines is None:
             return x_m, y_m
         own, others = lines
-        to_own = shapely.get_coordinates(shapely.shortest_line(shapely.Point(x_m, y_m), own))
+        to_own = shapely.get_coordinates(shapely.shortest_line(shapely.points(x_m, y_m), own))
         for share in NUDGES:
             x, y = (to_own[0] + share * (to_own[1] - to_own[0])).tolist()
-            if shapely.distance(own, at := shapely.Point(x, y)) + LEAD_MIN_M < shapely.distance(
+            if shapely.distance(own, at := shapely.points(x, y)) + LEAD_MIN_M < shapely.distance(
                 others, at
             ):
                 return x, y
@@ -267,7 +346,11 @@ class Proxy:
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
         self._outline: shapely.Geometry | None = None
+        self._border: Floats | None = None
+        self._near_border: tuple[Circle, _Segments] = Circle(), ()
         self._inside = self._compared = Circle()
+        self._compared_walk: Walk | None = None
+        self._lead: LocalLead | None = None
         self._leads = False
 
     def update(self, pose: Pose, *, let_past: bool = False) -> None:
@@ -320,15 +403,21 @@ class Proxy:
         """Return whether SUMO will assign the proxy to the first sidewalk of its walk."""
         if place.edge != walk.first or self._inside.radius_m == 0.0:
             return False
-        if walk != self._walk or not self._compared.holds(x_m, y_m):
-            lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - LEAD_MIN_M
+        if walk != self._compared_walk:
+            self._compared_walk, self._compared, self._lead = walk, Circle(), None
+        if not self._compared.holds(x_m, y_m):
+            if self._lead is None or not self._lead.around.holds(x_m, y_m):
+                self._lead = self._walks.lead.around(walk.first, walk.second, x_m, y_m)
+            lead_m = self._lead.metres(x_m, y_m) - LEAD_MIN_M
+            if abs(lead_m) < _TIE_M:
+                lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - LEAD_MIN_M
             self._leads = lead_m > 0.0
-            self._compared = Circle(x_m, y_m, abs(lead_m) / 2.0)
+            self._compared = Circle(x_m, y_m, max(abs(lead_m) - _TIE_M, 0.0) / 2.0)
         return self._leads
 
     def _locate(self, x_m: float, y_m: float) -> Located:
         """Locate a position on the map; cached while the body is on the same walkable piece."""
-        if self._inside.holds(x_m, y_m):
+        if self._inside.holds(x_m, y_m) or self._is_still_inside(x_m, y_m):
             return self._place
         inside = self._piece is not None and shapely.contains_xy(self._piece, x_m, y_m)
         if not inside:
@@ -339,15 +428,37 @@ class Proxy:
                 piece = street_map.strips.get(place.edge) or street_map.corners[place.edge]
                 self._piece = piece.polygon
                 self._outline = shapely.boundary(piece.polygon)
+                self._border = None
                 shapely.prepare(self._piece)
                 inside = shapely.contains_xy(self._piece, x_m, y_m)
         room_m = 0.0
         if inside:
             room_m = max(
-                float(shapely.distance(self._outline, shapely.Point(x_m, y_m))) - _ROUNDING_M, 0.0
+                float(shapely.distance(self._outline, shapely.points(x_m, y_m))) - _ROUNDING_M, 0.0
             )
         self._inside = Circle(x_m, y_m, room_m)
         return self._place
+
+    def _is_still_inside(self, x_m: float, y_m: float) -> bool:
+        """Return whether a position is surely on the present piece, and update the disk inside.
+
+        It is where its distance from the outline and the disk's radius exceed the way from the
+        disk's centre.
+        """
+        if self._piece is None or self._inside.radius_m == 0.0:
+            return False
+        if self._border is None:
+            self._border = _pieces(self._outline)
+            self._near_border = Circle(), ()
+        if not self._near_border[0].holds(x_m, y_m):
+            near = _pieces_near(self._border, x_m, y_m)
+            self._near_border = Circle(x_m, y_m, LOCAL_M), near
+        room_m = _distance_m(self._near_border[1], x_m, y_m) - _ROUNDING_M
+        way_m = math.hypot(x_m - self._inside.x_m, y_m - self._inside.y_m)
+        if room_m < _TIE_M or way_m >= self._inside.radius_m + room_m:
+            return False
+        self._inside = Circle(x_m, y_m, room_m)
+        return True
 
 
 def junction_of(internal: str) -> str:

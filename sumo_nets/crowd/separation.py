@@ -69,12 +69,16 @@ class NearPairs:
         firm: (N,) whether a person does not give way.
         """
         at = _points(xy)
-        if len(at) != len(self._at) or np.abs(at - self._at).max(initial=0.0) > 0.49 * _MARGIN_M:
+        if len(at) != len(self._at) or (
+            np.maximum.reduce(np.abs(at - self._at), initial=0.0) > 0.49 * _MARGIN_M
+        ):
             self._search(at)
-        gap = at.take(self._one) - at.take(self._other)
+        gap = at.take(self._one)
+        gap -= at.take(self._other)
         x_m, y_m = gap.real, gap.imag
-        far_m2 = x_m * x_m + y_m * y_m
-        if far_m2.min(initial=np.inf) < SHOULDERS_M * SHOULDERS_M:
+        far_m2 = x_m * x_m
+        far_m2 += y_m * y_m
+        if 1 in (far_m2 < SHOULDERS_M * SHOULDERS_M).tobytes():
             near = far_m2 <= _NEAR_M * _NEAR_M
             one, other = self._one[near], self._other[near]
             moves = ~(firm[one] & firm[other])

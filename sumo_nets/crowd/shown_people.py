@@ -69,6 +69,8 @@ class PoseFilter:
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
     _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _near: NearPairs = field(default_factory=NearPairs)
+    _firm: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    _others: int = 0
 
     def update(
         self,
@@ -88,7 +90,9 @@ class PoseFilter:
         others: (K, 2) positions of people that are moved elsewhere, metres.
         """
         row, new = self._rows.of(ids)
-        before, facing, motion = self._xy[row], self._heading[row], self._motion[row]
+        before, facing, motion = self._xy, self._heading, self._motion
+        if not isinstance(row, slice):
+            before, facing, motion = before[row], facing[row], motion[row]
         if new:
             before[new] = xy[new]
             facing[new] = [facing_of(ids[i]) for i in new]
@@ -99,20 +103,26 @@ class PoseFilter:
         gap = xy - before
         distance = np.hypot(gap[:, 0], gap[:, 1])
         reach_m = MAX_SPEED_MPS * self.period_s
-        shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
+        gap *= (reach_m / np.maximum(distance, reach_m))[:, None]
+        shown = before + gap
         stand = speed < PERSON_STANDS_MPS
         shown = self._separated(before, shown, others, stand)
         shown = self._around_obstacles(before, shown, body, stand)
-        velocity = (shown - before) / self.period_s
+        velocity = shown - before
+        velocity /= self.period_s
         if new:
             velocity[new] = motion[new]
-        motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
+        change = velocity - motion
+        change *= min(self.period_s / LOOK_AHEAD_S, 1.0)
+        motion = motion + change
 
-        moving = np.hypot(motion[:, 0], motion[:, 1]) > TURNING_SPEED_MPS
-        aim = np.where(moving, np.arctan2(motion[:, 1], motion[:, 0]), facing)
+        east, north = motion[:, 0], motion[:, 1]
+        moving = np.hypot(east, north) > TURNING_SPEED_MPS
+        aim = np.where(moving, np.arctan2(north, east), facing)
         turn_rad = MAX_TURN_RADPS * self.period_s
         turn = np.minimum(np.maximum(wrap_angles(aim - facing), -turn_rad), turn_rad)
-        facing = wrap_angles(facing + turn)
+        turn += facing
+        facing = wrap_angles(turn)
 
         if ids:
             self._xy = shown
@@ -137,7 +147,10 @@ class PoseFilter:
         round_both = self.standing.stepped_around(before, past, stand)
         if round_both is past:
             return past
-        stays = (round_both != past).any(axis=1) & approaches_body(before, round_both, body)
+        nearer = approaches_body(before, round_both, body)
+        if not nearer.any():
+            return round_both
+        stays = (round_both != past).any(axis=1) & nearer
         return np.where(stays[:, None], before, round_both)
 
     def _separated(
@@ -145,16 +158,17 @@ class PoseFilter:
     ) -> Floats:
         """Keep people apart. others: (K, 2) positions of people who do not give way, metres."""
         count = len(shown)
-        firm = np.zeros(count + len(others), dtype=bool)
-        firm[count:] = True
+        if len(self._firm) != count + len(others) or len(others) != self._others:
+            self._others = len(others)
+            self._firm = np.arange(count + len(others)) >= count
         wanted = np.concatenate([shown, others]) if len(others) else shown
-        pairs = self._near.of(wanted, firm)
+        pairs = self._near.of(wanted, self._firm)
         if not len(pairs[0]):
             return shown
         before = np.concatenate([before, others])
         stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
         reach_m = MAX_SPEED_MPS * self.period_s
-        return separated_positions(before, wanted, firm, reach_m, stand, pairs)[:count]
+        return separated_positions(before, wanted, self._firm, reach_m, stand, pairs)[:count]
 
 
 _NO_VALUES: Final = np.zeros(0)
@@ -167,6 +181,8 @@ class ShownPeople:
     def __init__(self, tick_s: float) -> None:
         self._strides = Strides(tick_s)
         self._cast: tuple[tuple[str, ...], list[tuple[str, PersonKind, Age]]] | None = None
+        self._walk = b""
+        self._doing: tuple[Doing, ...] = ()
 
     def together(
         self,
@@ -190,8 +206,10 @@ class ShownPeople:
             all_ages = [*(ages[name] for name in names), *(a.age for a in cast)]
             self._kind = write_protected_copy(kinds, np.int8)
             self._age = write_protected_copy(all_ages, np.int8)
-        doing = tuple(map(_DOING.__getitem__, (speed > PERSON_STANDS_MPS).tolist()))
-        paces = speed
+        if (walk := (speed > PERSON_STANDS_MPS).tobytes()) != self._walk:
+            self._walk = walk
+            self._doing = tuple(map(_DOING.__getitem__, walk))
+        doing, paces = self._doing, speed
         if cast:
             doing += tuple([a.doing for a in cast])
             added = np.array([_columns(a) for a in cast])

@@ -67,15 +67,12 @@ def reference_hashes() -> dict[str, str]:
             "--no-warnings",
         ]
         engine.start([*arguments, "--seed", "7", "--no-step-log"])
-        reader = engine.NearReader(_WALKERS)
         try:
             for _ in range(2 * _SECONDS):
                 sumo.simulationStep()
-                traffic = (
-                    reader.vehicles_near(0.0, 0.0, 1e3),
-                    reader.persons_near(0.0, 0.0, 1e3),
-                )
-                for one in traffic:
+                reader = engine.NearReader(_WALKERS)  # these persons enter on their own
+                persons, vehicles = reader.near(0.0, 0.0, 1e3, 1e3)
+                for one in (vehicles, persons):
                     seen.update(
                         "".join(one.names).encode() + np.column_stack([one.xy, one.mps]).tobytes()
                     )

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -248,9 +249,7 @@ def test_shards_that_are_merged_are_the_run(desk: Path, cosim: Cosim, whole_run:
     assert (desk / "merged/run.json").read_bytes() == (whole_run / "run.json").read_bytes()
 
 
-@pytest.mark.parametrize(
-    "how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda how: how.name
-)
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=lambda how: how.name)
 def test_an_interrupted_run_is_finished_by_resume(
     desk: Path, cosim: Cosim, unbroken: bytes, how: signal.Signals
 ) -> None:
@@ -262,36 +261,53 @@ def test_an_interrupted_run_is_finished_by_resume(
         run.send_signal(how)
         said = run.communicate(timeout=PATIENCE_S)[1]
         if how != signal.SIGKILL:
-            assert run.returncode == 130
-            assert (
-                f"--out {out.name} --resume" in said
-                and "1 of 2 episodes are finished and stored" in said
-            )
+            assert run.returncode == 130 and says_stopped(said, out.name), said
         kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
         wait_until(lambda: not alive(out))
-    if how == signal.SIGTERM:
-        return  # it was stopped as by Ctrl-C
     again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
     assert again.returncode == 0, again.stderr
     assert (out / "episodes/t-0/record.json").stat().st_mtime_ns == kept
     assert (out / "results.csv").read_bytes() == unbroken
 
 
-@pytest.mark.parametrize("when", ["its process starts", "its first episode starts"])
-def test_a_run_killed_at_its_start_leaves_no_false_crash(
-    desk: Path, cosim: Cosim, unbroken: bytes, when: str
-) -> None:
-    """A kill while the first environment process comes up loses nothing, and resuming gives the
-    same table."""
-    out = desk / when.replace(" ", "-")
-    with held_before(desk, "t-0") as waits, running(desk, *HELD, out.name) as run:
-        wait_until(lambda: children(run.pid))
-        left = children(run.pid)
-        if when == "its first episode starts":
+def test_sigterm_stops_a_run_as_ctrl_c_does(desk: Path, cosim: Cosim) -> None:
+    """The same exit code and words, and no environment process is left."""
+    out = desk / "terminated"
+    with held_before(desk, "t-1") as waits, ThreadPoolExecutor(1) as beside:
+
+        def terminate() -> None:
             wait_until(waits)
-        run.kill()
-        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in left))
-    assert not list(out.glob("episodes/*/record.json"))
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        sent = beside.submit(terminate)
+        said = cosim("run", *HELD, out.name, cwd=desk)
+        sent.result()
+        assert said.returncode == 130 and says_stopped(said.stderr, out.name), said
+        wait_until(lambda: not alive(out))
+
+
+def says_stopped(said: str, out: str) -> bool:
+    """Whether a run of two episodes says that it was stopped in the second one, and the remedy."""
+    return f"--out {out} --resume" in said and "1 of 2 episodes are finished and stored" in said
+
+
+def test_a_run_killed_at_its_start_leaves_no_false_crash(
+    desk: Path, cosim: Cosim, unbroken: bytes
+) -> None:
+    """A kill while the first environment process comes up, or before its first answer, loses
+    nothing. The run resumed after both gives the same table."""
+    out = desk / "killed-at-its-start"
+    for when in ("its process starts", "its first episode starts"):
+        more = ["--resume"] if out.exists() else []
+        with held_before(desk, "t-0") as waits, running(desk, *HELD, out.name, *more) as run:
+            wait_until(lambda: children(run.pid))
+            left = children(run.pid)
+            if when == "its first episode starts":
+                wait_until(waits)
+            run.kill()
+            for pid in left:
+                wait_until(lambda pid=pid: not Path(f"/proc/{pid}").exists())
+        assert not list(out.glob("episodes/*/record.json")), when
     again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
     assert again.returncode == 0, again.stderr
     assert (out / "results.csv").read_bytes() == unbroken
@@ -466,9 +482,9 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
         assert sum(words in fault for fault in faults) == 1, (words, faults)
 
 
-def test_the_doctor_finds_every_engine_well(desk: Path, fresh_cosim: Cosim) -> None:
+def test_the_doctor_finds_every_engine_well(desk: Path, cosim: Cosim) -> None:
     """`cosim doctor` draws a frame, walks people, asks a director, and says so."""
-    said = fresh_cosim("doctor", cwd=desk)
+    said = cosim("doctor", cwd=desk)
     assert said.returncode == 0, said.stdout
     assert said.stdout.count("ok") >= 6 and "failed" not in said.stdout
 

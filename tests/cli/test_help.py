@@ -51,7 +51,7 @@ def test_every_command_has_an_example_of_itself(words: tuple[str, ...]) -> None:
     assert own, f"no example in the help of {' '.join(words)}"
     options = {option for parameter in COMMANDS[words].params for option in parameter.opts}
     for example in own:
-        assert set(re.findall(r"(?<!\S)--?[a-z][a-z-]*", example)) <= options, example
+        assert set(re.findall(r"(?<!\S)--?[a-z][a-z0-9-]*", example)) <= options, example
 
 
 @pytest.mark.parametrize("words", [(), ("city",), ("map",), *COMMANDS], ids=" ".join)

@@ -13,8 +13,10 @@ from cosim.core.geometry import (
     Polyline,
     box_disk_gap,
     boxes_overlap,
+    heading_from_sumo,
     heading_to_sumo,
     headings_from_sumo,
+    hypot,
     wrap_angle,
     wrap_angles,
 )
@@ -40,6 +42,13 @@ def test_sumo_angles_are_clockwise_from_north() -> None:
     assert math.isclose(headings_from_sumo(90.0), 0.0)
     for degrees in (0.0, 45.0, 200.0, 359.0):
         assert math.isclose(heading_to_sumo(headings_from_sumo(degrees)), degrees, abs_tol=1e-9)
+
+
+@given(st.floats(-1000, 1000), st.floats(-1000, 1000))
+def test_single_lengths_and_angles_have_the_bits_of_arrays(x: float, y: float) -> None:
+    """A length and a heading of SUMO are the same to the bit, one by one and as an array."""
+    assert hypot(x, y) == np.hypot(np.array([x]), np.array([y]))[0]
+    assert heading_from_sumo(x) == headings_from_sumo([x])[0]
 
 
 def test_a_polyline_is_measured_along_itself() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import msgspec
 import numpy as np
@@ -18,9 +18,11 @@ from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Barrier, City, CityMap, CrowdSpec
 from cosim.spec.sensors import ScanSpec
 from physics.dynamics.bodies import PERSON_HEIGHT_M, VEHICLE_HEIGHT_M, Bodies, building_boxes
+from physics.dynamics.client import BulletClient
 from physics.ground.tiles import tiles_within
 from physics.robots.kinematics import attitude
 from physics.sensors.caster import RayCaster, sensor_frame
+from physics.sensors.triangles import TriangleRays
 from physics.street.furniture import Prop, solids_of
 from physics.street.scan_surface import ScanSurface
 from physics.street.street_surface import StreetSurface
@@ -195,6 +197,30 @@ def test_a_scan_equals_the_rays_of_the_physics() -> None:
     assert same.mean() > 0.99
     near = np.isfinite(got)
     assert near.sum() > 100 and got[near].min() < 3.0
+
+
+def test_rays_of_arrays_have_the_bits_of_the_rays_of_pybullet() -> None:
+    """20,000 rays, more than one call of Bullet takes, against a scan of which a tile was removed
+    and added again."""
+    surface, (at, _) = poses_in("scan", np.random.default_rng(0))
+    meshes = [
+        mesh
+        for key in tiles_within(at.x_m, at.y_m, RANGE_M)
+        for chunk in [surface.chunk(key)]
+        for mesh in (*(patch.mesh for patch in chunk.ground), *chunk.standing)
+    ]
+    draws = np.random.default_rng(1)
+    begin = np.array([at.x_m, at.y_m, 1.0]) + draws.normal(0.0, 0.2, (20_000, 3))
+    end = begin + draws.normal(0.0, [10.0, 10.0, 2.0], begin.shape)
+    with closing(TriangleRays()) as rays, closing(BulletClient()) as bullet:
+        rays.remove(rays.add(meshes[0]))
+        for mesh in meshes:
+            rays.add(mesh)
+            bullet.add_concave(mesh)
+        got = rays.hit_shares(begin, end)
+        want = [bullet.hit_shares(begin[i : i + 10_000], end[i : i + 10_000]) for i in (0, 10_000)]
+    assert np.array_equal(got, np.concatenate(want))
+    assert 5_000 < np.isfinite(got).sum() < 19_000
 
 
 def test_neither_the_robot_nor_what_is_out_of_range_has_returns() -> None:

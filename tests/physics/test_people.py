@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, Age, People
 from cosim.people.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
-from physics.people.appearance import companion_of, family_of, look_of
+from physics.people.appearance import Look, companion_of, family_of, look_of
 from physics.people.body import COATS, SkinnedBody, body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
@@ -22,6 +25,7 @@ from physics.people.families import FAMILIES, skeleton
 from physics.people.figure import MESH_LEVELS
 from physics.people.gaits import CYCLE_FRAMES
 from physics.people.gestures import SEAT_M, SEATED_BACK_M
+from physics.people.parts import _quaternions
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, forward, rodrigues
 from physics.people.wardrobe import ALL, CLOTHES, SEASONS, season_of
@@ -166,6 +170,21 @@ def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
         assert at["left_ankle"][2] == pytest.approx(rest[INDEX["left_ankle"], 2], abs=0.02)
 
 
+def test_parts_turn_by_the_quaternions_of_scipy() -> None:
+    """Random rotations, half turns and no turn give the same bits; nobody gives no rows."""
+    exact = [np.eye(3), *(np.diag(signs) for signs in np.eye(3) * 2.0 - 1.0)]
+    drawn = Rotation.random(2000, random_state=np.random.default_rng(0)).as_matrix()
+    turns = np.concatenate([exact, drawn])
+    x = turns[..., 0] / np.linalg.norm(turns[..., 0], axis=-1, keepdims=True)
+    z = np.cross(x, turns[..., 1])
+    z /= np.linalg.norm(z, axis=-1, keepdims=True)
+    rigid = np.stack([x, np.cross(z, x), z], axis=-1)
+    wanted = Rotation.from_matrix(rigid, assume_valid=True).as_quat()
+    assert {*np.abs(wanted).argmax(axis=1).tolist()} == {0, 1, 2, 3}
+    assert np.array_equal(_quaternions(turns), wanted)
+    assert _quaternions(np.zeros((0, 13, 3, 3))).shape == (0, 13, 4)
+
+
 def test_looks_hang_on_name_and_age_alone() -> None:
     """The same name looks the same in another process, another seed dresses it anew at the same
     stature."""
@@ -185,6 +204,37 @@ def test_looks_hang_on_name_and_age_alone() -> None:
     assert (
         sum(look_of(*n, 7).colours.tobytes() != look_of(*n).colours.tobytes() for n in names) == 60
     )
+
+
+def test_outfit_colours_patterns_and_girth_are_independent() -> None:
+    """Of 4,000 names, every pair of outfit, colours, beard and girth is spread as if drawn by two
+    dice (chi-squared test): wearers of an outfit have all its colours equally often."""
+    looks = [look_of(f"p{i}", Age.ADULT, 3, crowd=False) for i in range(4000)]
+    men = [one for one in looks if ALL[one.outfit].family == "man"]
+
+    def classes(values: Sequence[object]) -> np.ndarray:
+        return np.unique(np.array([str(one) for one in values]), return_inverse=True)[1]
+
+    def darker(one: Look, coat: str) -> int:
+        return int(one.colours[COATS.index(coat)].astype(int).sum())
+
+    girth = np.argsort(np.argsort([one.girth_m for one in men])) * 8 // len(men)
+    draws = {
+        "outfit": classes([one.outfit for one in men]),
+        "girth": girth,
+        "beard": classes([one.patterns[COATS.index("skin")] for one in men]),
+        **{
+            coat: np.argsort(np.argsort([darker(one, coat) for one in men])) * 8 // len(men)
+            for coat in ("shoes", "bag", "cap", "metal", "skin")
+        },
+    }
+    for one, other in itertools.combinations(draws, 2):
+        table = np.zeros((draws[one].max() + 1, draws[other].max() + 1))
+        np.add.at(table, (draws[one], draws[other]), 1.0)
+        expected = table.sum(axis=1, keepdims=True) * table.sum(axis=0) / table.sum()
+        chi2 = float(((table - expected) ** 2 / expected).sum())
+        free = (table.shape[0] - 1) * (table.shape[1] - 1)
+        assert abs(chi2 - free) < 5.0 * np.sqrt(2.0 * free), (one, other)
 
 
 def test_sixty_outfits_follow_the_season() -> None:

@@ -20,7 +20,7 @@ from cosim.spec.weather import CLEAR, SNOW_GRIP, WEATHERS, WET_GRIP
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.cameras.gl.variants import Variant
-from physics.cameras.gl.weather import look_of, weathered_sky
+from physics.cameras.gl.weather import lit_share, look_of, weathered_sky
 from physics.dynamics.bullet import p
 from physics.dynamics.world import BulletWorld
 from physics.street.street_surface import StreetSurface
@@ -164,3 +164,22 @@ def test_lamps_light_the_ground_at_night(
     ground = np.isin(lit.labels, [LABELS[name] for name in ("road", "sidewalk", "verge")])
     gain = lit.rgb[ground].mean(axis=1) - dark.rgb[ground].mean(axis=1)
     assert gain.mean() > 5.0 and np.quantile(gain, 0.95) > 25.0
+
+
+@needs_gl
+@pytest.mark.engine
+def test_fewer_windows_are_lit_late_at_night(world: BulletWorld) -> None:
+    """Pixels of walls are lit at 21:00 and dark at 4:30, hardly any the other way round."""
+    assert lit_share(4.5) < 0.1 < lit_share(23.0) < lit_share(21.0) and lit_share(
+        24.0
+    ) == lit_share(0)
+    walls = []
+    for hour in (21.0, 4.5):
+        with GlCamera(world, SPEC, light=Light(hour=hour, day_of_year=15)) as camera:
+            frame = camera.render(*moment(world, 3))
+        assert frame.labels is not None
+        walls.append(frame.rgb[frame.labels == LABELS["building"]].astype(int).min(axis=1))
+    only_evening, only_morning = (
+        int((one - other > 60).sum()) for one, other in (walls, walls[::-1])
+    )
+    assert only_evening > 50 and only_evening > 10 * only_morning

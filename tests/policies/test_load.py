@@ -139,6 +139,15 @@ def test_a_policy_that_cannot_be_loaded_is_named_with_the_reason(desk: Path, nam
     assert "'mine:Mine'" in str(caught.value) and told in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"), [("ros2", "ros2:"), ("zenoh", "zenoh:NAME")], ids=["ros2", "zenoh"]
+)
+def test_a_policy_elsewhere_is_a_valid_choice(name: str, meant: str) -> None:
+    """A name without its colon gets the one that is meant, and all choices are listed."""
+    with pytest.raises(UsageError, match=rf"Valid choices: cadrl, .* Did you mean {meant}\?"):
+        load_policy(name)
+
+
 def test_loading_leaves_the_process_where_it_is(desk: Path) -> None:
     """A module that changes the folder changes no relative path of the run."""
     (desk / "mine.py").write_text("import os; os.chdir('/')" + GOOD.format(fields=""))

@@ -241,9 +241,10 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 2250, among them"),
         (
             ("look", "t-0", "--suite", "tiny.json", "--scenario", "2"),
-            "--scenario chooses from a file",
+            "--scenario chooses from a suite or a file",
         ),
-        (("look", "tiny.json", "--suite", "tiny.json"), "tiny.json is a file: leave --suite out"),
+        (("look", "tiny.json", "--suite", "tiny.json"), "or a file: leave --suite out"),
+        (("look", "unit", "--scenario", "999"), "unknown scenario '999'. Valid choices: 330"),
         (("look", "tiny.json", "--scenario", "t-9"), "unknown scenario 't-9'. Valid choices: t-0"),
         (
             ("look", "tiny.json", "--scenario", "2"),

@@ -57,7 +57,7 @@ def test_a_cheat_solves_no_event(cheat: str, request: pytest.FixtureRequest) -> 
 @pytest.mark.engine
 def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: Cosim) -> None:
     """It has failed, hit nobody, and covered nothing of its route; its run has no rates and ends
-    with 1."""
+    with 1; resumed, it does not repeat the episode, and says how that is done."""
     way = event_way("obstructing", "one", at_m=11.0)
     suite = Suite(name="one", version="1", scenarios=(way,))
     write_suite(suite, tmp_path / "one.json")
@@ -68,6 +68,10 @@ def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: 
     assert not table[["success", "spl", "route_completion"]].iloc[0].any()
     assert table[["pedestrian_collision", "left_lane"]].isna().all(axis=None)
     assert "no rates: 1 crashed" in " ".join(ran.stdout.split())
+    again = cosim(*words, "--resume", cwd=tmp_path)
+    assert again.returncode == 1
+    assert "1 of them crashed, which is a result: --resume does not repeat them" in again.stderr
+    assert f"another run with --scenario {way.id} and another --out" in again.stderr
 
 
 @pytest.mark.engine
@@ -77,6 +81,14 @@ def test_legs_gain_a_cheat_nothing(robot: str, request: pytest.FixtureRequest) -
     if robot == "walker":
         request.getfixturevalue("walker_weights")
     options = EpisodeOptions(seed=0, robot=robot)
-    for policy, kinds in (("straight", ("obstructing", "gesturing")), ("stop", ("frontal",))):
-        table = cosim.run("reactive", policy, scenarios=scenarios_of(kinds, 1), options=options)
+    for policy, places_m, time_s in (
+        ("straight", {"obstructing": 11.0, "gesturing": 11.0}, 45.0),
+        ("stop", {"frontal": 21.0}, 10.0),
+    ):
+        ways = [
+            event_way(kind, kind, at_m=at_m, length_m=at_m + 9.0, time_s=time_s)
+            for kind, at_m in places_m.items()
+        ]
+        suite = Suite(name="legs", version="1", scenarios=tuple(ways))
+        table = cosim.run(suite, policy, options=options)
         assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0

@@ -84,12 +84,14 @@ class Wars(NamedTuple):
     """The runs of a hosting, at the same time.
 
     hanging: of behaviours that are ended by a timeout, which is short
+    seeing: of those that need a picture, beside an honest policy with a camera
     harmful: of those that harm the run folder; in a sandbox, where none can, they are in `others`
     others: of the others, whose timeouts are so long that a slow machine misses none
     """
 
     others: War
     hanging: War
+    seeing: War
     harmful: War | None
 
     @property
@@ -126,13 +128,14 @@ def prepare(desk: Path, names: Sequence[str], mark: str) -> dict[str, str]:
     return {MARK: mark, "PYTHONPATH": path}
 
 
-def war(desk: Path, names: tuple[str, ...], *options: str, jobs: int = 2) -> War:
+def war(desk: Path, names: tuple[str, ...], *options: str, jobs: int) -> War:
     """Run behaviours by some processes at a time; a run of hanging ones has short timeouts."""
     mark = f"hostile-{uuid.uuid4()}"
     hangs = HANGING[0] in names
     answer_s, start_s = (ANSWER_S, START_S) if hangs else (PATIENCE_S, PATIENCE_S)
     timeout = ("--answer-timeout", f"{answer_s:g}", "--start-timeout", f"{start_s:g}")
-    words = ("--policy", f"{OF}:Hostile", "--jobs", str(jobs), "--seed", str(SEED), "--out", "run")
+    kind = "SeeingHostile" if names == SEEING else "Hostile"
+    words = ("--policy", f"{OF}:{kind}", "--jobs", str(jobs), "--seed", str(SEED), "--out", "run")
     code = _WATCHED.format(tick_s=answer_s)
     done = subprocess.run(
         [sys.executable, "-c", code, "run", "hostile.json", *words, *timeout, *options],
@@ -151,12 +154,17 @@ def war(desk: Path, names: tuple[str, ...], *options: str, jobs: int = 2) -> War
     return War(desk / "run", names, said, records, lost, mark)
 
 
-_ALWAYS = ("--camera", "bullet", "--log-json", "log.jsonl")
-HOSTINGS = {"in-process": (*_ALWAYS, "--frames", "0.25"), "isolated": (*_ALWAYS, "--isolated")}
+_ALWAYS = ("--log-json", "log.jsonl")
+HOSTINGS = {"in-process": _ALWAYS, "isolated": (*_ALWAYS, "--isolated")}
+SIGHT = {
+    "in-process": ("--camera", "bullet", "--frames", "0.25"),
+    "isolated": ("--camera", "bullet"),
+}
 BOXED = {f"isolated: {kind}" for kind in KINDS}
 HANGING = tuple(name for name, deed in DEEDS.items() if deed.hangs)
 HARMFUL = tuple(name for name, deed in DEEDS.items() if deed.harms_folder)
-OTHERS = tuple(name for name in DEEDS if name not in HANGING + HARMFUL)
+SEEING = ("honest", *(name for name, deed in DEEDS.items() if deed.sees))
+OTHERS = tuple(name for name in DEEDS if name not in HANGING + HARMFUL + SEEING[1:])
 
 
 @pytest.fixture(scope="module", params=HOSTINGS)
@@ -169,15 +177,19 @@ def wars(hosting: str, tmp_path_factory: pytest.TempPathFactory) -> Wars:
     options = HOSTINGS[hosting]
     isolated = hosting == "isolated"
     # Most of the time of those that hang is waiting, in which the others run.
-    runs = [(OTHERS + HARMFUL if isolated else OTHERS, 2), (HANGING, 2)]
-    runs += [] if isolated else [(("honest", *HARMFUL), 1)]
+    runs = [
+        (OTHERS + HARMFUL if isolated else OTHERS, 2, options),
+        (HANGING, 2, options),
+        (SEEING, 1, (*options, *SIGHT[hosting])),
+    ]
+    runs += [] if isolated else [(("honest", *HARMFUL), 1, options)]
     with ThreadPoolExecutor(len(runs)) as pool:
         begun = [
-            pool.submit(war, tmp_path_factory.mktemp("war"), names, *options, jobs=jobs)
-            for names, jobs in runs
+            pool.submit(war, tmp_path_factory.mktemp("war"), names, *words, jobs=jobs)
+            for names, jobs, words in runs
         ]
-    others, hanging, *harmful = [one.result() for one in begun]
-    return Wars(others, hanging, *(harmful or [None]))
+    others, hanging, seeing, *harmful = [one.result() for one in begun]
+    return Wars(others, hanging, seeing, *(harmful or [None]))
 
 
 def with_mark(mark: str) -> list[int]:
@@ -264,8 +276,8 @@ def test_pictures_are_kept_as_they_were_drawn(hosting: str, wars: Wars) -> None:
     record names the renderer."""
     if hosting == "isolated":
         return
-    assert wars.others.records["honest"].setup.renderer == renderer_of("bullet")
-    episodes = wars.others.folder / "episodes"
+    assert wars.seeing.records["honest"].setup.renderer == renderer_of("bullet")
+    episodes = wars.seeing.folder / "episodes"
     honest, blackened = (
         [path.read_bytes() for path in sorted((episodes / name / "frames").glob("*.png"))]
         for name in ("honest", "scribbles")
@@ -292,7 +304,7 @@ def test_isolated_or_not_an_episode_is_the_same_to_the_bit(
     table = suite_run.run(
         suite, Honest(), out=tmp_path / "run", options=EpisodeOptions(seed=SEED, camera="bullet")
     )
-    honest = wars.others.records["honest"]
+    honest = wars.seeing.records["honest"]
     assert table["policy_runs"].tolist() == ["in-process"]
     assert table["state_hash"].tolist() == [honest.state_hash]
     assert {"answer_median_ms", "answer_p95_ms"} <= honest.clock.keys()

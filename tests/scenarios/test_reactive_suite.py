@@ -222,10 +222,13 @@ def test_a_redraw_has_the_same_slots_with_other_draws(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_cheats_are_driven_on_a_redraw(
-    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    cosim: Cosim,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ) -> None:
     """A pair of `overtaking` is drawn with other seeds and keeps its claims; who never slows down
-    solves at most its decoy."""
+    solves at most its decoy. One cheat is driven, two with --whole."""
     out = tmp_path / "redraw.json"
     said = cosim("suite", "build", "reactive", str(out), "--redraw", "1", "--only", "*taking-7002")
     assert said.returncode == 0 and "version 2.0-redraw-1" in said.stdout, said.stderr
@@ -235,18 +238,24 @@ def test_cheats_are_driven_on_a_redraw(
     assert all(one.route != shipped[one.id].route for one in suite.scenarios)
     for claim in ("decoys", "exclusive", "limits", "proofs", "obstacles"):
         assert list(CLAIMS[claim](Read(suite, read_proofs(out), out))) == []
-    cheats = {name: CHEATS[name] for name in ("swerve-left", "stop-every-2-m")}
+    more = ("stop-every-2-m",) if request.config.getoption("--whole") else ()
+    cheats = {name: CHEATS[name] for name in ("swerve-left", *more)}
     monkeypatch.setattr(measure, "CHEATS", cheats)
     said = cosim("bench", "exploit", "--cheats", "--suite", str(out), "--out", str(tmp_path / "e"))
     assert said.returncode == 0 and "swerve-left" in said.stdout, said.stderr
-    assert len((tmp_path / "e" / "evaluations.jsonl").read_text().splitlines()) == 4
+    assert len((tmp_path / "e" / "evaluations.jsonl").read_text().splitlines()) == 2 * len(cheats)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Take two swerves by default, three with --whole."""
+    if "cheat" in metafunc.fixturenames:
+        rows = [("7007", "swerve-fast-left"), ("7012", "swerve-right")]
+        if metafunc.config.getoption("--whole"):
+            rows.append(("7010", "swerve-wide-left"))
+        metafunc.parametrize(("number", "cheat"), rows)
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize(
-    ("number", "cheat"),
-    [("7007", "swerve-fast-left"), ("7010", "swerve-wide-left"), ("7012", "swerve-right")],
-)
 def test_a_swerve_away_from_who_cuts_in_solves_the_decoy_alone(number: str, cheat: str) -> None:
     """It reaches both goals without a failure, but did not give way in the event."""
     name = f"overtaking-{number}"

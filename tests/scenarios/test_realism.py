@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose
-from cosim.core.state import LABELS, Frame, People, RobotState, Street
+from cosim.core.state import LABELS, Age, Frame, People, RobotState, Street
+from cosim.people.gait import stature_m
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City
 from physics.cameras.gl.camera import GlCamera
 from physics.cameras.view import robot_shot, shot
 from physics.dynamics.world import BulletWorld
 from physics.ground.tiles import tiles_within
+from physics.people.appearance import companion_of
 from scenarios.places.nets import surface_of_place
 from scenarios.suites.catalog import load_suite
 from scenarios.tools.bench.detectors import (
@@ -36,6 +38,7 @@ from scenarios.tools.bench.realism import (
     Things,
     count_boxes,
     count_classes,
+    heads_with_companions,
     seen_people,
 )
 from tests.conftest import Cosim
@@ -173,6 +176,40 @@ def test_people_are_found_in_the_labels() -> None:
 
 
 @pytest.mark.engine
+def test_umbrellas_are_not_counted_to_people() -> None:
+    """In rain, the box of a person with an umbrella ends near the head, as detectors' boxes do."""
+    surface = surface_of_place(City(seed=7, size_m=300.0))
+    strip = max(
+        (one for one in surface.street_map.strips.values() if one.kind == "sidewalk"),
+        key=lambda one: one.length_m,
+    )
+    (x0, y0), (x1, y1) = strip.line[0][:2], strip.line[-1][:2]
+    heading = float(np.arctan2(y1 - y0, x1 - x0))
+    at = np.array([x0, y0]) + 9.0 * np.array([np.cos(heading), np.sin(heading)])
+    name = next(
+        name
+        for name in (f"a{k}" for k in range(50))
+        if companion_of(name, surface.seed, True) == "umbrella"
+    )
+    scenario = load_suite(CITY).scenarios[0].in_weather("rain")
+    people = People.of((name,), at[None], [heading], [0.0], ("stand",))
+    heads_m = heads_with_companions(people, surface, scenario)
+    with (
+        BulletWorld(surface) as world,
+        GlCamera(world, CAMERA, depth=True, weather=scenario.conditions) as camera,
+    ):
+        robot: RobotState = world.place(Pose(x0, y0, heading))
+        frame = camera.render(robot, Street(0, people))
+        taken = robot_shot(surface, COURIER, CAMERA, robot)
+    whole = seen_people(frame, people, taken).boxes[0]
+    (box,) = seen_people(frame, people, taken, heads_m).boxes
+    metre = (box[3] - box[1]) / stature_m(name, Age.ADULT)
+    assert heads_m[0] == pytest.approx(surface.heights(at[None])[0] + stature_m(name, Age.ADULT))
+    assert box[3] == whole[3] and whole[1] < box[1] - 0.15 * metre
+    assert box[2] - box[0] < whole[2] - whole[0]
+
+
+@pytest.mark.engine
 def test_what_a_false_box_shows_is_named() -> None:
     """Boxes on a tree's crown, on its trunk and on the sky are told apart."""
     surface = surface_of_place(City(seed=7, size_m=300.0))
@@ -204,22 +241,26 @@ def test_what_a_false_box_shows_is_named() -> None:
 
 @pytest.mark.engine
 def test_the_command_counts_and_writes_pictures(cosim: Cosim, tmp_path: Path) -> None:
-    """A frame of a city gives a table, a picture of each detector and the numbers as JSON."""
+    """A frame of a city gives a table, a picture of each detector and weather, and JSON."""
     weights = make_weights(tmp_path, FASTEST_DET)
     out = tmp_path / "out"
     before = tmp_path / "before.json"
     common = ("bench", "realism", "--frames", "1", "--weights", str(weights))
-    done = cosim(*common, "--out", str(out))
+    done = cosim(*common, "--out", str(out), "--weather", "clear", "--weather", "night")
     assert done.returncode == 0, done.stderr
-    (found,) = json.loads((out / "realism.json").read_text())
+    found, dark = json.loads((out / "realism.json").read_text())
+    assert (found["weather"], dark["weather"]) == ("clear", "night")
+    assert "long-horizon, val, night" in " ".join(done.stdout.split())
     assert found["frames"] == {"all": 1} and 0.3 < found["iou"]["walkable"] <= 1.0
     assert set(found["detected"]) == {"YOLOX-nano", "FastestDet"} and found["split"] == "val"
-    assert len(list(out.glob("*.png"))) == 2
+    assert len(list(out.glob("*.png"))) == 4
     assert f"{found['iou']['sky']:.2f}" in done.stdout
     before.write_text("[{}]")
     refused = cosim(*common, "--compare", str(before))
     assert refused.returncode == 2 and "is no realism.json" in refused.stderr
     refused = cosim(*common, "--split", "held-out")
     assert refused.returncode == 2 and "Valid choices: test, val" in refused.stderr
+    refused = cosim(*common, "--weather", "hail")
+    assert refused.returncode == 2 and "Valid choices: clear, dusk" in refused.stderr
     refused = cosim("bench", "realism", "--weights", str(tmp_path / "none"))
     assert refused.returncode == 2 and "no folder" in refused.stderr

@@ -13,8 +13,10 @@ import msgspec
 import numpy as np
 import pytest
 import shapely
+from rich.console import Console
 from shapely.geometry import LineString, box
 
+from cosim.cli.suites import print_names
 from cosim.core.errors import RunError, SpecError, UsageError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.progress import ignore
@@ -343,6 +345,19 @@ def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
         )
     assert not list(tmp_path.iterdir())
     assert "robot   scout  0.50 x 0.40 m, travels at 2 m/s" in cosim("list").stdout
+
+
+def test_a_faulty_row_of_the_robot_table_does_not_hide_the_rest_of_the_list(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`list` marks the row, prints all others, and ends with the row's fault."""
+    faulty = dataclasses.replace(ROBOTS["courier"], name="tank", length_m=-1.0)
+    monkeypatch.setattr(table, "ROBOTS", {"tank": faulty, **ROBOTS})
+    with pytest.raises(SpecError, match="robot 'tank': length_m"):
+        print_names(Console(width=200))
+    said = capsys.readouterr().out
+    assert "robot   tank  cannot be used" in said
+    assert "robot   scout  0.50" in said and "goal    final_point" in said
 
 
 WHEELED = [name for name, one in ROBOTS.items() if isinstance(one.drive, Skid)]

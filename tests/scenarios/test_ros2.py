@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,11 +26,13 @@ from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.ros2 import CMD_VEL, Ros2Settings
+from scenarios.ipc.child_process import ENDING_S
+from scenarios.ipc.messages import Done, Message, Waits
 from scenarios.runs.run import run
 from scenarios.tools.viewing.bag import write_bag
 from tests.conftest import ROOT
 from tests.support.plain import free_port
-from tests.support.ros2_peer import Seen, heading_of, steer
+from tests.support.ros2_peer import Peer, Seen, heading_of, steer
 
 pytestmark = pytest.mark.engine
 SEEDED = EpisodeOptions(seed=1)
@@ -64,6 +68,21 @@ def node_at(endpoint: str) -> Iterator[None]:
             process.kill()
 
 
+@contextmanager
+def idle_at(endpoint: str) -> Iterator[None]:
+    """A node that joins the run, and publishes /cmd_vel without sending anything."""
+    there: list[Peer] = []
+    joins = threading.Thread(
+        target=lambda: there.append(Peer(endpoint, name="idle", reads=False)), daemon=True
+    )
+    joins.start()
+    try:
+        yield
+    finally:
+        for one in there:
+            one.close()
+
+
 @pytest.fixture(scope="module")
 def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the rule as a policy of this process."""
@@ -74,14 +93,26 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_node_drives_as_the_same_rule_in_this_process(here: Path, tmp_path: Path) -> None:
     """Two runs of a node in its own process have the state hash and the commands of the rule as a
-    policy of this process, and say how they waited."""
+    policy of this process, say how they waited, and end soon after their last episode. A second
+    publisher, which is silent, is shown."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     at = Connection(role="coordinator", listen=endpoint, guests=("ros2",))
     host = PolicyHost(ros2=Ros2Settings(connection=at, camera="none", odometry="exact"))
     chosen = {"scenarios": [NAME], "options": SEEDED}
     with node_at(endpoint):
         for name in ("one", "two"):
-            table = run("unit", "ros2:", host=host, out=tmp_path / name, **chosen)  # type: ignore[arg-type]
+            told: list[tuple[Message, float]] = []
+
+            def tell(message: Message, told: list[tuple[Message, float]] = told) -> None:
+                told.append((message, time.monotonic()))
+
+            with idle_at(endpoint) if name == "two" else nullcontext():
+                table = run("unit", "ros2:", host=host, out=tmp_path / name, tell=tell, **chosen)  # type: ignore[arg-type]
+                over_s = time.monotonic()
+            (done_s,) = [at_s for message, at_s in told if isinstance(message, Done)]
+            assert over_s - done_s < 0.9 * ENDING_S, "its process was killed"
+            reasons = [message.reason for message, _ in told if isinstance(message, Waits)]
+            assert sum("two publishers of /cmd_vel" in one for one in reasons) == (name == "two")
             assert table["policy_runs"].tolist() == ["ros2, next"]
             assert table["status"].tolist() == ["done"], table["reason"].tolist()
     folders = [run / "episodes" / NAME for run in (here, tmp_path / "one", tmp_path / "two")]

@@ -50,7 +50,7 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
     ours = set(sumo.person.getIDList()[::2])
     reader = NearReader(ours)
     for reach_m in (60.0, 75.0, 500.0):
-        near = reader.persons_near(x_m, y_m, reach_m)
+        near, _ = reader.near(x_m, y_m, reach_m, 100.0)
         away_m = {name: math.dist(sumo.person.getPosition(name), (x_m, y_m)) for name in ours}
         assert list(near.names) == sorted(
             name for name, far_m in away_m.items() if far_m <= reach_m
@@ -60,15 +60,50 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
                 k
             ] == sumo.person.getSpeed(name)
             assert near.ahead[k] == sumo.person.getNextEdge(name)
-    assert 0 < len(reader.persons_near(x_m, y_m, 60.0).names) < len(near.names) == len(ours)
-    cars = reader.vehicles_near(x_m, y_m, 100.0)
+    assert 0 < len(reader.near(x_m, y_m, 60.0, 100.0)[0].names) < len(near.names) == len(ours)
+    _, cars = reader.near(x_m, y_m, 60.0, 100.0)
     assert (
         0
         < len(cars.names)
-        <= len(reader.vehicles_near(x_m, y_m, 1000.0).names)
+        <= len(reader.near(x_m, y_m, 60.0, 1000.0)[1].names)
         == len(sumo.vehicle.getIDList())
     )
     assert np.hypot(*(cars.xy - (x_m, y_m)).T).max() <= 100.0
+
+
+@pytest.mark.engine
+def test_the_people_shown_are_those_that_sumo_lists(crowd: SumoCrowd) -> None:
+    """At each of 60 ticks, in which people arrive and enter, exactly SUMO's persons are shown."""
+    at = Pose(*crowd.street.people.xy.mean(axis=0).tolist(), 0.0)
+    shown = []
+    for _ in range(60):
+        reply = EventReply(episode="", tick=crowd.street.tick, states=(), actors=())
+        street = crowd.step(RobotState(at), reply, absent=True)
+        listed = [name for name in sumo.person.getIDList() if name[0] == "c"]
+        assert list(street.people.ids) == sorted(
+            name for name in listed if math.dist(sumo.person.getPosition(name), at[:2]) <= 100.0
+        )
+        shown.append(street.people.ids)
+    assert len(set(shown)) > 1
+
+
+@pytest.mark.engine
+def test_a_lead_computed_from_near_lines_is_the_lead(
+    crowd: SumoCrowd, street_map: StreetMap
+) -> None:
+    """Within LOCAL_M of a point, the lines near it give the same lead as all lines."""
+    walks = Walks(sumo, street_map)
+    rng = np.random.default_rng(6)
+    sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
+    for strip in sidewalks[:40]:
+        middle = Polyline(strip.line).at(rng.uniform(0.0, strip.length_m))
+        walk = walks.choose(strip.id, middle)
+        if walk is not None:
+            lead = walks.lead.around(walk.first, walk.second, *middle[:2])
+            for _ in range(5):
+                x_m, y_m = (np.array(middle[:2]) + rng.uniform(-3.5, 3.5, 2)).tolist()
+                whole_m = walks.lead.metres(walk.first, walk.second, x_m, y_m)
+                assert lead.metres(x_m, y_m) == pytest.approx(whole_m, abs=1e-9)
 
 
 @pytest.mark.engine

@@ -68,7 +68,10 @@ class Hanging(Honest):
 
 
 class Hostile(Honest):
-    """Does in its second answer, or in another call, what its episode is named for."""
+    """Does in its second answer, or in another call, what its episode is named for. It drives
+    without a camera, so that its processes start fast."""
+
+    manifest = Manifest("honest", rate_hz=4.0, camera=None, odometry="wheel")
 
     def reset(self, episode_id: str, seed: int) -> None:
         self.name = json.loads(_HERE.with_name("names.json").read_text())[episode_id]
@@ -90,11 +93,23 @@ class Hostile(Honest):
 
     def act(self, seen: Observation) -> Any:
         self.count += 1
-        command = super().act(seen)
+        command = self.honest_command(seen)
         if self.deed.call == "every act" or (self.count == 2 and self.deed.call == "act"):
             answer = self.deed.does(self, seen)
             return command if answer is None else answer
         return command
+
+    def honest_command(self, seen: Observation) -> Command:
+        return Command(1.0, 0.0)
+
+
+class SeeingHostile(Hostile):
+    """The same with a camera."""
+
+    manifest = Honest.manifest
+
+    def honest_command(self, seen: Observation) -> Command:
+        return Honest.act(self, seen)
 
 
 class Leaves(Honest):
@@ -467,6 +482,7 @@ class Deed(NamedTuple):
     call: the call of the policy in which it happens
     attempts: how often the episode is run in the simulator's process
     harms_folder: whether it harms the run folder, so that it has a run of its own
+    sees: whether it needs a picture, so that its run has a camera
     hangs: whether a timeout ends it, so that its run has short ones
     """
 
@@ -476,6 +492,7 @@ class Deed(NamedTuple):
     call: str = "act"
     attempts: int = 1
     harms_folder: bool = False
+    sees: bool = False
     hangs: bool = False
 
 
@@ -526,8 +543,8 @@ DEEDS = {
     ),
     "answers-twice": Deed(_answers_twice, DONE, DONE),
     # It changes what is in its process.
-    "scribbles": Deed(_scribbles, DONE, DONE),
-    "changes-its-manifest": Deed(_changes_its_manifest, DONE, DONE),
+    "scribbles": Deed(_scribbles, DONE, DONE, sees=True),
+    "changes-its-manifest": Deed(_changes_its_manifest, DONE, DONE, sees=True),
     "patches-the-referee": Deed(_patches_the_referee, FORGED, DONE),
     "patches-numpy": Deed(_patches_numpy, BLAMED, DONE, attempts=2),
     "patches-time": Deed(_patches_time, BLAMED, DONE, attempts=2),
@@ -560,7 +577,7 @@ DEEDS = {
     "floods-and-dies": Deed(_floods_and_dies, f"{_ITSELF} ended with exit code 5", _ENDED),
     "closes-its-output": Deed(_closes_its_output, DONE, DONE),
     "writes-garbage": Deed(_writes_garbage, _ITSELF, _ENDED, attempts=2),
-    "overwrites-shared-memory": Deed(_overwrites_shared_memory, DONE, DONE),
+    "overwrites-shared-memory": Deed(_overwrites_shared_memory, DONE, DONE, sees=True),
     "closes-descriptors": Deed(_does(lambda: os.closerange(0, 1024)), _ITSELF, _ENDED, attempts=2),
     # It ends, stops or multiplies processes.
     "dies-and-leaves-processes": Deed(

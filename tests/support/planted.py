@@ -75,7 +75,7 @@ class Right:
 
     def slower(self, people: Tracks) -> float:
         x, y = people.positions_m.T
-        return 0.7 if ((x > 0.0) & (x < 5.0) & (np.abs(y) < 1.0)).any() else 1.0
+        return 0.8 if ((x > 0.0) & (x < 5.0) & (np.abs(y) < 1.0)).any() else 1.0
 
     def goal_rad(self, goal: PointGoal) -> float:
         return max(min(goal.bearing_rad, 1.0), -1.0)

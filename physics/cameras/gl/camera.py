@@ -28,7 +28,7 @@ from physics.cameras.gl.readback import SinglePicture
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shadows import ShadowMaps, ShadowSeat, shadow_layers
 from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
-from physics.cameras.gl.weather import SNOW_EXPOSURE, Look, look_of, weathered_sky
+from physics.cameras.gl.weather import Look, exposed, look_of, weathered_sky
 from physics.cameras.view import Shot, View
 from physics.dynamics.world import BulletWorld
 from physics.people.wardrobe import season_of
@@ -60,11 +60,12 @@ class GlCamera(WorldCamera):
         self._look: Look | None = None
         if scan is None:
             self._sky = weathered_sky(light, weather, seed)
-            self._look = look_of(weather, self._sky, seed, light.shadows)
+            hour = light.hour if weather.sun_deg is None else None
+            self._look = look_of(weather, self._sky, seed, light.shadows, hour)
         else:
             self._sky = scan_sky(light, scan.facts, seed)
         contact = light.shadows and self._look is not None
-        bright = 1.0 if self._look is None else 1.0 + SNOW_EXPOSURE * weather.snow
+        bright = 1.0 if self._look is None else exposed(weather)
         self._light = lighting_of(self._sky, self._splats is None, contact, bright)
         self._season = season_of(light.day_of_year, light.latitude_deg)
         self._rain = weather.rain_mm_h > 0.0

@@ -55,13 +55,14 @@ _LAMPLIGHT: Final = "6.0e-3, 4.8e-3, 3.0e-3"
 _VERTEX: Final = f"""
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
 in vec3 thing_at; in vec4 thing_turn; in vec4 thing_paint;
-out vec3 at; out vec3 normal; out vec3 albedo; out vec3 spot; out vec3 side;
+out vec3 at; out vec3 normal; out vec3 in_map; out vec3 albedo; out vec3 spot; out vec3 side;
 flat out float label; flat out float shines; flat out float cover;
 vec3 turned(vec3 v) {{ return v + 2.0 * cross(thing_turn.xyz, cross(thing_turn.xyz, v) + thing_turn.w * v); }}
 void main() {{
     at = thing_at + turned(in_at);
     side = unpacked(in_normal);
     normal = turned(side);
+    in_map = on_map(at, normal);
     bool own = in_colour.a > 0.75;
     vec3 colour = own ? in_colour.rgb : thing_paint.rgb;
     int layer = int(in_normal.w * 255.0 + 0.5);
@@ -77,7 +78,7 @@ void main() {{
 """
 
 _FRAGMENT: Final = f"""
-in vec3 at; in vec3 normal; in vec3 albedo; in vec3 spot; in vec3 side;
+in vec3 at; in vec3 normal; in vec3 in_map; in vec3 albedo; in vec3 spot; in vec3 side;
 flat in float label; flat in float shines; flat in float cover;
 void main() {{
     if (shines > 0.5) {{ glow(albedo, label); return; }}
@@ -90,18 +91,19 @@ void main() {{
     }} else if (shines < -0.5) {{
         own = vec3({_LAMPLIGHT}) * colour * (1.6 * side_light.w);
     }}
-    show_linear(colour, own, n, at, label);
+    show_linear(colour, own, n, at, label, sunlit_on(in_map));
 }}
 """
 
 _CUT_VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
 in vec3 thing_at; in vec4 thing_turn; in vec4 thing_paint;
-out vec3 at; out vec3 normal; out vec3 spot; flat out vec4 albedo_label; out float shade;
+out vec3 at; out vec3 normal; out vec3 in_map; out vec3 spot; flat out vec4 albedo_label; out float shade;
 vec3 turned(vec3 v) { return v + 2.0 * cross(thing_turn.xyz, cross(thing_turn.xyz, v) + thing_turn.w * v); }
 void main() {
     at = thing_at + turned(in_at);
     normal = turned(unpacked(in_normal));
+    in_map = on_map(at, normal);
     int layer = int(in_normal.w * 255.0 + 0.5);
     shade = in_colour.r;
     spot = vec3(in_colour.gb, layer);
@@ -122,11 +124,12 @@ vec4 leaf() {
 """
 
 _CUT_FRAGMENT: Final = f"""{_CUT}
-in vec3 at; in vec3 normal; flat in vec4 albedo_label; in float shade;
+in vec3 at; in vec3 normal; in vec3 in_map; flat in vec4 albedo_label; in float shade;
 void main() {{
     vec3 colour = albedo_label.rgb * decoded(leaf().rgb) * shade;
     // Leaves let light through, so the side away from the sun is lit, too.
-    show_linear(colour, vec3(0.0), normalize(normal + 0.6 * sun.xyz), at, albedo_label.a);
+    show_linear(colour, vec3(0.0), normalize(normal + 0.6 * sun.xyz), at, albedo_label.a,
+        sunlit_on(in_map));
 }}
 """
 

@@ -24,6 +24,8 @@ It hides the edge of the drawn world, as in the bullet camera.
 
 LAMPS_SPREAD: Final = 0.55
 """Share of the lamplight of `physics.cameras.sky` that comes from single lamps."""
+NIGHT_EXPOSURE: Final = 2.4
+"""Relative increase of the exposure in a street with lamps."""
 _ABOVE: Final = np.array([0.0, 0.0, 1.0])
 
 
@@ -98,7 +100,7 @@ def lighting_of(
         sky.fog_colour,
         _horizon(sky),
         sky.fog_per_m,
-        sky.exposure * bright * (1.0 + 0.7 * sky.lamps),
+        sky.exposure * bright * (1.0 + NIGHT_EXPOSURE * sky.lamps),
         sky.lamps,
         sky.shadows or contact,
         haze,

@@ -397,11 +397,8 @@ class GlScene:
         z = self._surface.foot(
             barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m)
         )
-        red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
-        form = self._fence_forms.id(
-            ("barrier", *size), lambda: [Part(red, props.PROP_RED), Part(white, props.PROP_WHITE)]
-        )
+        form = self._fence_forms.id(("barrier", *size), lambda: props.barrier_parts(barrier))
         rows = instances(
             (barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"]
         )

@@ -14,6 +14,9 @@ fragment shader   Calls `show(albedo, normal, at, label)` once, or `glow(colour,
                   at: as in the vertex shader
                   label: float, an id of cosim.core.state.LABELS
                   `show_linear` takes a linear albedo and a radiance emitted by the surface.
+                  Its optional sixth argument is the share of sunlight. It saves time where the
+                  vertex shader computes it (`sunlit`), or its point on the shadow maps (`on_map`,
+                  for `sunlit_on` in the fragment shader).
                   sRGB textures are decoded when they are read.
                   The shadow pass skips it: do not write depth. Code that discards has a shadow
                   shader that discards, too.
@@ -36,7 +39,8 @@ Uniform block `Scene` (binding SCENE_BINDING, one per pass and picture, from `Sc
     vec4 fog               rgb linear; w extinction per metre
     vec4 haze              start in metres, share per metre, maximum share
     vec4 anchor            xy in world metres (float32: for patterns, not for geometry)
-    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half width and height
+    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half width and
+                           height; w of ahead: width of a pixel at a distance of 1 m, metres
     vec4 backdrop          with layers: rgb linear, all around the horizon; w layer of the sky
 
 With `Variant.LAYERS` one draw fills layers of array textures, one for each picture. The attribute
@@ -128,25 +132,28 @@ _OF_PICTURE: Final = "".join(
 """Values of one block under the names that they have without layers."""
 
 _VERTEX = """
+invariant gl_Position;  // the same depth in all programs
 vec3 unpacked(vec4 normal) { return normal.xyz * (255.0 / 127.0) - 1.0; }
 vec4 in_picture(vec4 clip) { return clip; }
 vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
 """
 
-_LAYERS_VERTEX: Final = f"""
+_SEATS: Final = f"""
 layout(std430, binding = {SEATS_BINDING}) readonly buffer Seats {{ ivec2 seats[]; }};
 in int seat;
 flat out int picture;
 ivec2 block_layer = seats[seat];
 #define PICTURE block_layer.x
-{_OF_PICTURE}
-vec3 unpacked(vec4 normal) {{ return normal.xyz * (255.0 / 127.0) - 1.0; }}
-vec4 in_picture(vec4 clip) {{
+{_OF_PICTURE}"""
+_LAYERS_VERTEX: Final = """
+invariant gl_Position;
+vec3 unpacked(vec4 normal) { return normal.xyz * (255.0 / 127.0) - 1.0; }
+vec4 in_picture(vec4 clip) {
     gl_Layer = block_layer.y;
     picture = block_layer.x;
     return clip;
-}}
-vec4 project(vec3 at) {{ return in_picture(clip_from_at * vec4(at, 1.0)); }}
+}
+vec4 project(vec3 at) { return in_picture(clip_from_at * vec4(at, 1.0)); }
 """
 _LAYERS_FRAGMENT: Final = f"flat in int picture;\n#define PICTURE picture\n{_OF_PICTURE}"
 
@@ -155,34 +162,39 @@ vec3 decoded(vec3 c) { return c * (c * (c * 0.305306011 + 0.682171111) + 0.01252
 """
 """Conversion of sRGB to linear by a cubic, accurate to about one 8-bit level."""
 
-_FRAGMENT = """
-out vec4 pixel;
+_SHADOW = """
 #ifdef LAYERS
 layout(binding = 6) uniform sampler2DArrayShadow still_shadow;
 layout(binding = 7) uniform sampler2DArrayShadow moving_shadow;
 #define STILL(p) texture(still_shadow, vec4((p).xy, eye.w, (p).z))
-#define MOVING(p) texture(moving_shadow, vec4((p).xy, float(picture), (p).z))
+#define MOVING(p) texture(moving_shadow, vec4((p).xy, float(PICTURE), (p).z))
 #else
 layout(binding = 6) uniform sampler2DShadow still_shadow;
 layout(binding = 7) uniform sampler2DShadow moving_shadow;
 #define STILL(p) texture(still_shadow, p)
 #define MOVING(p) texture(moving_shadow, p)
 #endif
-
-#ifdef WEATHER
-WEATHER_CODE
-#endif
-float sunlit(vec3 at, vec3 normal) {
+vec3 on_map(vec3 at, vec3 normal) { return (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz; }
+float sunlit_on(vec3 on_map) {
 #ifdef SHADOWS
-    vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
-    vec2 off = abs(in_map.xy - 0.5);
+    vec2 off = abs(on_map.xy - 0.5);
     float inside = clamp((0.5 - max(off.x, off.y)) * 20.0, 0.0, 1.0);
-    float lit = min(STILL(in_map), MOVING(in_map));
+    float lit = min(STILL(on_map), MOVING(on_map));
     return 1.0 - sun.w * inside * (1.0 - lit);
 #else
     return 1.0;
 #endif
 }
+float sunlit(vec3 at, vec3 normal) { return sunlit_on(on_map(at, normal)); }
+"""
+"""Share of sunlight at a point, for both shaders. `on_map` is linear, so it can be interpolated."""
+
+_FRAGMENT = """
+out vec4 pixel;
+
+#ifdef WEATHER
+WEATHER_CODE
+#endif
 
 vec3 on_curve(vec3 light) {
     // The ACES curve (Narkowicz's fit) in sRGB, which reaches white at 1.96, as a polynomial of
@@ -207,11 +219,11 @@ void glow(vec3 colour, float label) {
     pixel = vec4(mix(decoded(colour) * 1.3 / sun_light.w, fog.rgb, fogged()), label / 255.0);
 }
 
-void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
+void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label, float lit_by_sun) {
     float raised = smoothstep(0.35, 0.75, normal.z);
     float facing = max(dot(normal, sun.xyz), 0.0);
     vec3 light = side_light.rgb + normal.z * tilt_light.rgb + abs(normal.z) * flat_light.rgb;
-    light += sun_light.rgb * (facing * sunlit(at, normal));
+    light += sun_light.rgb * (facing * lit_by_sun);
     float gloss = 0.0, lit = in_contact(at, normal);
 #ifdef WET
     float pool = puddle(at, label);
@@ -239,13 +251,17 @@ void glow(vec3 colour, float label) {
     pixel = vec4(mix(colour, on_screen(fog.rgb), fogged()), label / 255.0);
 }
 
-void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
+void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label, float lit_by_sun) {
     float facing = max(dot(normal, sun.xyz), 0.0);
     vec3 light = side_light.rgb + normal.z * tilt_light.rgb + abs(normal.z) * flat_light.rgb;
-    light += sun_light.rgb * (facing * sunlit(at, normal));
+    light += sun_light.rgb * (facing * lit_by_sun);
     pixel = vec4(on_screen(mix(albedo * light + own, fog.rgb, fogged())), label / 255.0);
 }
 #endif
+
+void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
+    show_linear(albedo, own, normal, at, label, sunlit(at, normal));
+}
 
 void show(vec3 albedo, vec3 normal, vec3 at, float label) {
     show_linear(decoded(albedo), vec3(0.0), normal, at, label);
@@ -310,15 +326,18 @@ def programs(
     """
     variant = Variant(shadows)
     layers = Variant.LAYERS in variant
-    block = _BLOCKS if layers else _BLOCK
-    head = block + variant.defines + (_LAYERS_FRAGMENT if layers else "")
-    head += BLOCK if variant & Variant.WEATHER else ""
-    before = block + _DECODED + (_LAYERS_VERTEX if layers else _VERTEX)
+    head = (_BLOCKS if layers else _BLOCK) + variant.defines
+    before = head + (_SEATS if layers else "") + _DECODED + _SHADOW
+    before += _LAYERS_VERTEX if layers else _VERTEX
+    head += _LAYERS_FRAGMENT if layers else ""
+    weather = BLOCK if variant & Variant.WEATHER else ""
     return Programs(
         context.program(
             vertex_shader=before + vertex,
             fragment_shader=head
+            + weather
             + _DECODED
+            + _SHADOW
             + _FRAGMENT.replace("WEATHER_CODE", _WEATHER)
             + fragment,
         ),

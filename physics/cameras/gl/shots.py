@@ -52,6 +52,7 @@ class Shots:
         self.lattice = [Lattice((i, j), tuple(at), tuple(middle)) for (i, j), at, middle in rows]
         self._half = np.array([one.half_picture for one in taken])
         self._axes = np.array([one.axes for one in taken])
+        self._pixel = 2.0 * self._half[:, 1] / [one.size[1] for one in taken]
         columns = []
         for one, (x, y, _), (_, tall) in zip(
             taken, self.eye.tolist(), self._half.tolist(), strict=True
@@ -83,6 +84,7 @@ class Shots:
         rows[:, 1, :2] = self.anchor
         rows[:, 2:, :3] = self._axes
         rows[:, 2:4, 3] = self._half
+        rows[:, 4, 3] = self._pixel
         return rows
 
     def sees(self, whose: NDArray[np.intp], xy: Floats, margin_m: float) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from physics.cameras.gl.cloth import FRAGMENT
+from physics.cameras.gl.cloth import FRAGMENT, TEXELS_PER_M
 from physics.cameras.gl.shading import Pass, Programs, programs
 from physics.people.body import COATS, FarBody, SkinnedBody
 
@@ -62,14 +62,14 @@ _TUBE_LAYOUT: Final = (
     *("in_middle", "in_ahead", "in_side", "in_ring", "in_joints", "in_weights", "in_coat"),
 )
 _SKIN: Final = (
-    f"const int TRIM = {COATS.index('trim')};\n"
+    f"const int TRIM = {COATS.index('trim')};\nconst float TEXELS_PER_M = {TEXELS_PER_M};\n"
     + """
 layout(binding = 0) uniform sampler2D posed;
 layout(binding = 1) uniform sampler2D dyed;
 in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
 in int person; in int dress; in float girth; in float tall;
-out vec3 at; out vec3 normal; out vec3 own; out float unshaded;
-flat out vec3 albedo; flat out vec3 trim; flat out ivec2 worn;
+// packed, because triangles are small: setting up outputs costs as much as pixels
+out vec4 at_unshaded; out vec4 normal_ahead; out vec4 own; flat out vec4 albedo_coat; flat out vec4 trim_map;
 vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
 void pose(int bones) {
     for (int k = 0; k < bones; k++) {
@@ -79,12 +79,17 @@ void pose(int bones) {
         z += in_weights[k] * texelFetch(posed, ivec2(column + 2, person), 0);
     }
     vec4 dye = texelFetch(dyed, ivec2(int(in_coat.x), dress), 0);
-    albedo = dye.rgb;
-    trim = texelFetch(dyed, ivec2(TRIM, dress), 0).rgb;
-    worn = ivec2(int(in_coat.x), int(dye.a * 255.0 + 0.5));
+    albedo_coat = vec4(dye.rgb, in_coat.x);
+    trim_map = vec4(texelFetch(dyed, ivec2(TRIM, dress), 0).rgb, floor(dye.a * 255.0 + 0.5));
 }
 vec3 moved(vec3 v) { return vec3(dot(x.xyz, v), dot(y.xyz, v), dot(z.xyz, v)); }
 vec3 placed(vec3 v) { return vec3(x.w, y.w, z.w) + moved(v); }
+void finish(vec3 at, vec3 normal, vec3 modelled, float unshaded) {
+    at_unshaded = vec4(at, unshaded);
+    normal_ahead = vec4(normal, modelled.x * tall);
+    gl_Position = project(at);
+    own = vec4(modelled.yz * tall, sunlit(at, normal), log2(max(gl_Position.w * ahead.w * TEXELS_PER_M, 1.0)));
+}
 """
 )
 
@@ -93,11 +98,8 @@ in vec3 in_at; in vec4 in_normal;
 void main() {
     pose(4);
     vec3 outward = in_normal.xyz * (255.0 / 127.0) - 1.0;
-    at = placed(in_at + outward * (in_normal.w * girth));
-    normal = moved(outward);
-    own = in_at * tall;
-    unshaded = float(in_coat.y) / 255.0;
-    gl_Position = project(at);
+    vec3 at = placed(in_at + outward * (in_normal.w * girth));
+    finish(at, moved(outward), in_at, float(in_coat.y) / 255.0);
 }
 """
 
@@ -128,11 +130,9 @@ void main() {
     // a ribbon lies where the tube is nearest, and is shaded as if it were round
     corner += before * (thick * ribbon * RAISED);
     way = normalize(way + ribbon * before);
-    own = (in_middle + in_ahead * (corner.x / length(in_ahead)) + in_side * (corner.y / length(in_side))) * tall;
-    unshaded = float(in_coat.w) / 255.0;
-    at = middle + ahead_ * corner.x + side * corner.y;
-    normal = ahead_ * way.x + side * way.y;
-    gl_Position = project(at);
+    vec3 modelled = in_middle + in_ahead * (corner.x / length(in_ahead)) + in_side * (corner.y / length(in_side));
+    vec3 at = middle + ahead_ * corner.x + side * corner.y;
+    finish(at, ahead_ * way.x + side * way.y, modelled, float(in_coat.w) / 255.0);
 }
 """
 

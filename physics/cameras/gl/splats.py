@@ -37,6 +37,8 @@ _LEAST_KEY: Final = 251904
 _MOST_KEY: Final = 65535
 _KEY_BITS: Final = 16
 _VIEW_ROWS: Final = 5
+_CHUNK: Final = 16_384
+"""Splats that are packed at once, which fit into the processor's cache."""
 _LOOP_MAX: Final = 65000
 """Number of iterations after which llvmpipe may end the loops of an invocation."""
 
@@ -62,16 +64,15 @@ def cholesky(covariances: NDArray[np.float32]) -> NDArray[np.float64]:
 
     Flat splats have zeros.
     """
-    xx, xy, xz, yy, yz, zz = covariances.astype(np.float64).T
+    xx, xy, xz, yy, yz, zz = np.ascontiguousarray(covariances.T, dtype=np.float64)
     least = 1e-12 * np.maximum(xx + yy + zz, 1e-30)
-    found = np.zeros((len(xx), 6))
-    found[:, 0] = np.sqrt(np.maximum(xx, least))
-    found[:, 1] = xy / found[:, 0]
-    found[:, 2] = np.sqrt(np.maximum(yy - found[:, 1] ** 2, least))
-    found[:, 3] = xz / found[:, 0]
-    found[:, 4] = (yz - found[:, 1] * found[:, 3]) / found[:, 2]
-    found[:, 5] = np.sqrt(np.maximum(zz - found[:, 3] ** 2 - found[:, 4] ** 2, 0.0))
-    return found
+    a = np.sqrt(np.maximum(xx, least))
+    b = xy / a
+    c = np.sqrt(np.maximum(yy - b**2, least))
+    d = xz / a
+    e = (yz - b * d) / c
+    f = np.sqrt(np.maximum(zz - d**2 - e**2, 0.0))
+    return np.stack([a, b, c, d, e, f], axis=1)
 
 
 def packed_splats(splats: Splats) -> NDArray[np.float32]:
@@ -79,7 +80,9 @@ def packed_splats(splats: Splats) -> NDArray[np.float32]:
     rows = np.zeros((len(splats), 12), dtype=np.float32)
     rows[:, :3] = splats.centres
     rows.view(np.uint32)[:, 3] = np.ascontiguousarray(splats.rgba).view("<u4")[:, 0]
-    rows[:, 4:10] = cholesky(splats.covariances)[:, (0, 1, 2, 3, 4, 5)]
+    for first in range(0, len(rows), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        rows[part, 4:10] = cholesky(splats.covariances[part])
     rows[:, 10] = splats.ground
     return rows
 

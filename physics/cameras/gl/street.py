@@ -14,6 +14,7 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from physics.cameras.gl import corners, walls
+from physics.cameras.gl.context import is_card
 from physics.cameras.gl.instances import MATERIALS, POOLED, Forms, Material, ThingArrays
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.pool import Draws, MeshPool, Part, Pool
@@ -134,7 +135,10 @@ class StreetDrawing:
             )
         for material in _OPAQUE:
             self._draw_fences(material, stage, style, part)
-        self._draw_tiles("walls", stage, style, part)
+        if stage == "colour":
+            self._draw_walls(style, part)
+        else:
+            self._draw_tiles("walls", stage, style, part)
         self._draw_tiles("ground", stage, style, part)
         if not style.splats:
             self._draw_tiles("scan", stage, style, part)
@@ -177,6 +181,26 @@ class StreetDrawing:
                 arrays = self._scenes[i].fence_arrays
                 array = arrays.of(material, stage != "colour", style.variant)
                 self._draws.draw(array, step, i, i + 1)
+
+    def _draw_walls(self, style: Style, part: Part) -> None:
+        """Draw the picture of walls, which hide one another, and shade only what is seen.
+
+        The depth comes first on a software renderer, which spends its time on shading.
+        """
+        gl = self._context
+        step = _STEP["colour", "walls"]
+        if is_card(gl) or not self._draws.count(step, part.first, part.end):
+            self._draw_tiles("walls", "colour", style, part)
+            return
+        frame = gl.fbo
+        frame.color_mask = False, False, False, False
+        frame.use()
+        self._draws.draw(self._tile_array("walls", style)[1], step, part.first, part.end)
+        frame.color_mask = True, True, True, True
+        frame.use()
+        gl.depth_func = "<="
+        self._draw_tiles("walls", "colour", style, part)
+        gl.depth_func = "<"
 
     def _draw_tiles(self, kind: TileKind, stage: Pass, style: Style, part: Part) -> None:
         step = _STEP["colour" if stage == "colour" else "still", kind]

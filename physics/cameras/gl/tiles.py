@@ -21,12 +21,13 @@ _TINTED: Final = 128
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
 in vec2 middle; in vec2 middle_in_world;
-out vec3 at; out vec3 normal; out vec2 spot; flat out vec3 tint; flat out vec2 layer_label;
+out vec3 at; out vec3 normal; out vec3 in_map; out vec2 spot; flat out vec3 tint; flat out vec2 layer_label;
 void main() {
     int layer = int(in_normal.w * 255.0 + 0.5);
     float label = in_colour.a * 255.0;
     at = in_at + vec3(middle, 0.0);
     normal = unpacked(in_normal);
+    in_map = on_map(at, normal);
     tint = label > 127.5 ? tint_of(in_colour.rgb, layer) : vec3(1.0);
     float side = layers[layer].w;
     spot = fract(middle_in_world / side) + in_at.xy / side;
@@ -36,11 +37,11 @@ void main() {
 """
 
 _FRAGMENT: Final = """
-in vec3 at; in vec3 normal; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
+in vec3 at; in vec3 normal; in vec3 in_map; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
 void main() {
     vec4 seen = texture(surfaces, vec3(spot, layer_label.x), -0.5);
     vec3 albedo = decoded(seen.rgb) * mix(vec3(1.0), tint, seen.a);
-    show_linear(albedo, vec3(0.0), normal, at, layer_label.y);
+    show_linear(albedo, vec3(0.0), normal, at, layer_label.y, sunlit_on(in_map));
 }
 """
 

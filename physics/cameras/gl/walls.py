@@ -56,26 +56,28 @@ LAYOUT: Final = (
     "in_kind",
     "in_fronts",
 )
-_LIT_SHARE: Final = 0.35
-_OPEN_SHARE: Final = 0.6
-"""Share of the ground floors, from door to door, that are lit at night."""
-_LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
-"""Radiance of a lit window, in the units of physics.cameras.sky, about 60 candela per square
+LIT_SHARE: Final = 0.35
+"""Share of the windows that are lit in the dark where the hour is not of the night."""
+_OPEN: Final = 1.7
+"""Ground floors, from door to door, that are lit, for each window that is."""
+_LAMPLIGHT: Final = "0.96e-3, 0.72e-3, 0.42e-3"
+"""Radiance of a lit window, in the units of physics.cameras.sky, about 36 candela per square
 metre.
 """
 
-_COOL_LIGHT: Final = "1.1e-3, 1.2e-3, 1.3e-3"
+_COOL_LIGHT: Final = "0.66e-3, 0.72e-3, 0.78e-3"
 """Radiance of a window that is lit by a fluorescent or LED lamp."""
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
 in vec2 middle;
-out vec3 at; out vec3 normal; out vec2 spot; out vec2 cells;
+out vec3 at; flat out vec3 normal; out vec3 in_map; out vec2 spot; out vec2 cells;
 flat out vec4 tint; flat out vec4 kind; flat out vec4 fronts; flat out vec3 doors;
 void main() {
     int layer = int(in_normal.w * 255.0 + 0.5);
     at = in_at + vec3(middle, 0.0);
     normal = unpacked(in_normal);
+    in_map = on_map(at, normal);
     tint = vec4(in_colour.a > 0.5 ? tint_of(in_colour.rgb, layer) : vec3(1.0), layer);
     spot = in_spot.xy / layers[layer].w;
     cells = in_spot.zw;
@@ -90,7 +92,7 @@ void main() {
 _FRAGMENT: Final = f"""
 layout(binding = {FACADES_UNIT}) uniform sampler2DArray facades;
 layout(binding = {FINISH_UNIT}) uniform sampler2DArray finish;
-in vec3 at; in vec3 normal; in vec2 spot; in vec2 cells;
+in vec3 at; flat in vec3 normal; in vec3 in_map; in vec2 spot; in vec2 cells;
 flat in vec4 tint; flat in vec4 kind; flat in vec4 fronts; flat in vec3 doors;
 float chance(vec2 cell, float of) {{
     vec2 p = fract((cell + of) * vec2(0.1031, 0.1030));
@@ -113,13 +115,18 @@ void main() {{
     vec3 own = vec3(0.0);
 #ifdef NIGHT
     float shop = chance(vec2(floor((cell.x + 0.5) / max(doors.x, 1.0)), 3.0), kind.w + fronts.w);
-    float lit = (ground_floor ? shop < {_OPEN_SHARE} : fract(drawn * 29.0) < {_LIT_SHARE}) ? side_light.w : 0.0;
+#ifdef WEATHER
+    float share = surface.w;
+#else
+    float share = {LIT_SHARE};
+#endif
+    float lit = (ground_floor ? shop < {_OPEN} * share : fract(drawn * 29.0) < share) ? side_light.w : 0.0;
     vec3 room = vec3(0.25) + 2.5 * decoded(bay.rgb);
     vec3 lamp = mix(vec3({_LAMPLIGHT}), vec3({_COOL_LIGHT}), step(0.75, fract((ground_floor ? shop : drawn) * 53.0)));
     lamp *= ground_floor ? 0.7 + 0.6 * fract(shop * 31.0) : 0.25 + fract(drawn * 71.0);
     own = none ? own : lamp * room * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
 #endif
-    show_linear(albedo, own, normal, at, {LABELS["building"]}.0);
+    show_linear(albedo, own, normal, at, {LABELS["building"]}.0, sunlit_on(in_map));
 }}
 """
 

@@ -16,6 +16,7 @@ from cosim.spec.scenario import Light
 from cosim.spec.weather import Weather, direction_at
 from physics.cameras.gl.lamps import Lamps
 from physics.cameras.gl.variants import Variant
+from physics.cameras.gl.walls import LIT_SHARE
 from physics.cameras.gl.weather_shaders import LAMPS_MAX, WEATHER_BINDING
 from physics.cameras.sky import Sky, sky_of
 from physics.cameras.sun import sun_direction
@@ -26,10 +27,17 @@ _ROWS: Final = 64
 _PEOPLE_ROW: Final = 4 + 3 * LAMPS_MAX
 _FULL_RAIN_MM_H: Final = 20.0
 _FULL_SNOW_MM_H: Final = 2.0
-_NIGHT_NOISE: Final = 5.0e-4
+_NIGHT_NOISE: Final = 2.0e-4
 """Sensor noise at night: variance of a pixel per light, where 1 is the white level."""
-SNOW_EXPOSURE: Final = 0.45
+_SNOW_EXPOSURE: Final = 0.45
 """Relative increase of the exposure on snow, which would otherwise be grey."""
+_WET_EXPOSURE: Final = 0.3
+"""The same on wet ground, which is darker than dry ground."""
+_LIT_BY_HOUR: Final = (
+    *((0.0, 0.14), (1.5, 0.06), (4.5, 0.04), (6.5, 0.28), (8.0, 0.35)),
+    *((16.0, 0.35), (18.0, 0.45), (21.0, 0.52), (22.5, 0.38), (24.0, 0.14)),
+)
+"""Share of lit windows by hour; an assumption."""
 _GLOW_FROM_PER_M: Final = 0.004
 """Extinction from which fog glows around the sun, 1/m."""
 
@@ -70,10 +78,24 @@ def weathered_sky(light: Light, weather: Weather, seed: int) -> Sky:
     return sky_of(weathered(light, weather), seed, to_sun, weather.fog_top_m)
 
 
-def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None:
+def exposed(weather: Weather) -> float:
+    """Return the factor of the exposure on ground that is brighter or darker than dry ground."""
+    return 1.0 + _SNOW_EXPOSURE * weather.snow + _WET_EXPOSURE * weather.wetness
+
+
+def lit_share(hour: float) -> float:
+    """Return the share of windows that are lit at an hour of the night."""
+    hours, shares = zip(*_LIT_BY_HOUR, strict=True)
+    return float(np.interp(hour % 24.0, hours, shares))
+
+
+def look_of(
+    weather: Weather, sky: Sky, seed: int, shadows: bool, hour: float | None = None
+) -> Look | None:
     """Return what weather and night change in pictures besides the sky; None without a change.
 
     shadows: shadow maps are drawn
+    hour: of a night; None where the weather makes the night, at any hour
     """
     glows = sky.fog_per_m > _GLOW_FROM_PER_M and float(sky.sun_colour.max()) > 0.0
     variant = Variant.NONE
@@ -83,15 +105,16 @@ def look_of(weather: Weather, sky: Sky, seed: int, shadows: bool) -> Look | None
     if not (variant or weather.precipitates or glows):
         return None
     variant |= Variant.WEATHER | (Variant.SHADOWS if shadows else Variant.NONE)
+    share = LIT_SHARE if hour is None else lit_share(hour)
     rain = min(weather.rain_mm_h / _FULL_RAIN_MM_H, 1.0) ** 0.5
-    drops = max(0.0, 1.6 * rain - 0.5)
+    drops = max(0.0, 2.0 * rain - 1.0)
     bloom = 0.03 + 0.10 * sky.lamps * (1.0 + rain)
     # Air scatters the light of lamps towards the eye; rain and snow as the fog of their visibility.
     scattering = sky.lamps * min(0.6 * sky.fog_per_m, 0.02)
     clear = 1.0 if weather.cloud_cover is None else 1.0 - weather.cloud_cover
     return Look(
         variant,
-        (weather.wetness, weather.puddles, weather.snow, 0.0),
+        (weather.wetness, weather.puddles, weather.snow, share),
         (rain, min(weather.snow_mm_h / _FULL_SNOW_MM_H, 1.0), drops, bloom),
         (scattering, sky.lamps * clear, float(glows), 0.0),
         _NIGHT_NOISE * sky.lamps,

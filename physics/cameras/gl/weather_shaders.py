@@ -187,10 +187,10 @@ vec3 wetted(vec3 light, vec3 at, vec3 ray, float label, float far) {
     vec3 bounced = reflect(ray, normal);
     bounced.z = abs(bounced.z) + 0.003;
     float grazing = 1.0 - clamp(dot(-ray, normal), 0.0, 1.0);
-    float share = (0.02 + 0.98 * pow(grazing, 5.0)) * mix(0.55 * surface.x, 1.0, pool);
+    float share = (0.02 + 0.98 * pow(grazing, 5.0)) * mix(0.28 * surface.x, 0.85, pool);
     share *= label < 3.5 ? 1.0 : 0.35;
     float scale = log2(max(float(textureSize(air, 0).y) / 240.0, 1.0));
-    vec3 image = mirrored(at + vec3(0.0, 0.0, 0.02), normalize(bounced), mix(2.2, 0.3, pool) + scale);
+    vec3 image = mirrored(at + vec3(0.0, 0.0, 0.02), normalize(bounced), mix(3.4, 0.3 + 1.7 * falling.x, pool) + scale);
     return mix(light, image, clamp(share, 0.0, 0.9));
 }
 """
@@ -233,7 +233,7 @@ vec3 rained(vec3 light, vec2 flat_ray, float far, vec3 around) {
         float wide = max(0.0011, 0.55 * pixel_tan * away);
         float aside = (fract(at.x / 0.045) - 0.2 - 0.6 * fract(drawn * 37.0)) * 0.045;
         float body = fading(wide, 0.0, abs(aside)) * smoothstep(0.0, 0.05, along) * fading(length_m, length_m - 0.06, along);
-        float share = body * min(0.0011 / wide, 1.0) * 0.75;
+        float share = body * min(0.0011 / wide, 1.0) * 0.55;
         light = mix(light, around, share);
     }
     return light;

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from cosim.core.errors import MapError, SpecError, UsageError
 from cosim.core.geometry import Floats
 from cosim.core.progress import Progress
-from cosim.core.state import LABELS, Frame, People
+from cosim.core.state import LABELS, Frame, People, PersonKind
+from cosim.people.gait import stature_m
 from cosim.policies.follow.networks import ESPNET_GRAPH
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.graph import Graph
@@ -33,9 +34,13 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import CrowdSpec, Scenario, Split
+from cosim.spec.weather import CLEAR
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, robot_shot
 from physics.ground.tiles import tiles_within
+from physics.people.appearance import look_of
+from physics.people.wardrobe import ALL as ALL_OUTFITS
+from physics.people.wardrobe import season_of
 from physics.street.furniture import Prop
 from physics.street.surface import Surface, grounded_obstacles
 from scenarios.episodes.episode import Episode
@@ -94,6 +99,8 @@ _SEEN: Final = 0.7
 _ADULT_M: Final = 1.7
 _APART_M: Final = 0.9
 """Largest distance on the ground between a person and pixels of it, in metres."""
+_BODY_M: Final = 0.45
+"""The same for the body of a person with a companion, such as an umbrella."""
 _PICTURES: Final = 12
 """Number of pictures that are written."""
 _STREET_INPUT: Final = PictureInput(
@@ -140,7 +147,7 @@ class Detections:
 
 @dataclass
 class Realism:
-    """Counts over the frames of a place.
+    """Counts over the frames of a place in a weather; "clear" is each scenario's own.
 
     frames: number of frames of each condition.
     detected: counts by detector and condition.
@@ -150,6 +157,7 @@ class Realism:
 
     place: str
     split: Split = "val"
+    weather: str = CLEAR
     frames: Counter[str] = field(default_factory=Counter)
     detected: dict[str, dict[str, Detections]] = field(
         default_factory=lambda: {
@@ -159,6 +167,11 @@ class Realism:
     common: Counter[str] = field(default_factory=Counter)
     joined: Counter[str] = field(default_factory=Counter)
     labelled: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def called(self) -> str:
+        """Name of place, split and weather, for columns and files."""
+        return called(self.place, self.split, self.weather)
 
     @property
     def iou(self) -> dict[str, float]:
@@ -187,13 +200,14 @@ class Picture(NamedTuple):
 def measure_realism(
     places: Sequence[str],
     splits: Sequence[Split],
+    weathers: Sequence[str],
     frames: int,
     appearance: Appearance,
     weights: Path | None,
     out: Path | None,
     progress: Progress,
 ) -> list[Realism]:
-    """Return the counts of each place and split; the place "" is generated cities.
+    """Return the counts of each place, split and weather; the place "" is generated cities.
 
     frames: number of frames of each, fewer if its routes are too short.
     weights: folder of the networks' files, by default as for the policy `follow`.
@@ -202,11 +216,12 @@ def measure_realism(
     street = network_graph(ESPNET_GRAPH, weights)
     graphs = {name: network_graph(one.file, weights) for name, one in DETECTORS.items()}
     found = []
-    for place, split in itertools.product(places, splits):
-        counts = Realism(place or CITY, split)
+    for place, split, weather in itertools.product(places, splits, weathers):
+        counts = Realism(place or CITY, split, weather)
         each = max(1, frames // _PICTURES)
-        name = f"{counts.place}-{split}"
-        for picture in _pictures(place, split, frames, appearance, progress):
+        name = counts.called.replace(", ", "-")
+        options = EpisodeOptions(appearance=appearance, weather=weather)
+        for picture in _pictures(place, split, frames, options, progress):
             number = counts.frames[ALL]
             rgb, labels = picture.frame.rgb, picture.frame.labels
             counts.frames.update(picture.conditions)
@@ -227,11 +242,17 @@ def measure_realism(
     return found
 
 
+def called(place: str, split: str, weather: str) -> str:
+    """Return the name of a place's counts; a clear day is not named."""
+    return ", ".join([place, split] + [weather] * (weather != CLEAR))
+
+
 def as_json(one: Realism) -> dict[str, Any]:
     """Return the counts of a place as values of JSON."""
     return {
         "place": one.place,
         "split": one.split,
+        "weather": one.weather,
         "frames": dict(one.frames),
         "detected": {
             name: {
@@ -390,8 +411,13 @@ def street_kinds(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.intp]:
     return np.asarray(scores["scores"][0].argmax(axis=0))
 
 
-def seen_people(frame: Frame, people: People, taken: Shot) -> SeenPeople:
-    """Return the people in a picture, by their pixels' places on the ground."""
+def seen_people(
+    frame: Frame, people: People, taken: Shot, heads_m: Floats | None = None
+) -> SeenPeople:
+    """Return the people in a picture, by their pixels' places on the ground.
+
+    heads_m: (N,) heights of their heads, as by `heads_with_companions`
+    """
     assert frame.labels is not None and frame.depth is not None
     height = frame.labels.shape[0]
     v, u = np.nonzero(frame.labels == LABELS["person"])
@@ -407,11 +433,30 @@ def seen_people(frame: Frame, people: People, taken: Shot) -> SeenPeople:
     whole = []
     for k in np.unique(owner[near]):
         mine = near & (owner == k)
+        if heads_m is not None and np.isfinite(heads_m[k]):
+            body = mine & (at[:, 2] < heads_m[k]) & (away[:, k] < _BODY_M)
+            mine = body if body.any() else mine
         left, top, right_px, bottom = u[mine].min(), v[mine].min(), u[mine].max(), v[mine].max()
         boxes.append((left, top, right_px + 1.0, bottom + 1.0))
         expected = _ADULT_M / (2.0 * tall * float(np.median(depth[mine]))) * height
         whole.append(bottom + 1.0 - top >= _SEEN * expected)
     return SeenPeople(np.array(boxes, dtype=float).reshape(-1, 4), np.array(whole, dtype=bool))
+
+
+def heads_with_companions(people: People, surface: Surface, scenario: Scenario) -> Floats:
+    """Return (N,) heights on the map of the heads of people with a companion, others infinite.
+
+    Umbrellas, prams, dogs and bicycles are labelled person, but detectors box people alone.
+    """
+    light, rain = scenario.light, scenario.conditions.rain_mm_h > 0.0
+    season = season_of(light.day_of_year, light.latitude_deg)
+    heads = np.full(len(people.ids), np.inf)
+    for k, name in enumerate(people.ids):
+        age, crowd = int(people.age[k]), int(people.kind[k]) == PersonKind.CROWD.value
+        outfit = ALL_OUTFITS[look_of(name, age, surface.seed, season, rain, crowd).outfit]
+        if outfit.companion not in ("", "wheelchair"):
+            heads[k] = surface.heights(people.xy[k : k + 1])[0] + stature_m(name, age)
+    return heads
 
 
 def _on_map(frame: Frame, taken: Shot, v: NDArray[np.intp], u: NDArray[np.intp]) -> Floats:
@@ -429,13 +474,13 @@ def _on_map(frame: Frame, taken: Shot, v: NDArray[np.intp], u: NDArray[np.intp])
 
 
 def _pictures(
-    place: str, split: Split, frames: int, appearance: Appearance, progress: Progress
+    place: str, split: Split, frames: int, options: EpisodeOptions, progress: Progress
 ) -> Iterator[Picture]:
     """Yield pictures while routes of a place are driven, the same number on each."""
     left = frames
     each = -(-frames // ROUTES)
     for scenario in _scenarios(place, split):
-        for one in itertools.islice(_driven(scenario, appearance, progress), min(each, left)):
+        for one in itertools.islice(_driven(scenario, options, progress), min(each, left)):
             left -= 1
             yield one
         if left <= 0:
@@ -458,12 +503,21 @@ def _scenarios(place: str, split: Split) -> Iterator[Scenario]:
                 )
 
 
-def _driven(scenario: Scenario, appearance: Appearance, progress: Progress) -> Iterator[Picture]:
+def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> Iterator[Picture]:
     driver = load_policy(_DRIVER)
     surface = surface_of_place(scenario.place)
     robot_model = robot_called(scenario.robot)
-    options = EpisodeOptions(appearance=appearance)
-    conditions = tuple(name for name, holds in CONDITIONS.items() if holds(scenario))
+    scenario = options.scenario(scenario)
+    if options.weather != CLEAR and surface.scan is not None:
+        raise UsageError(
+            f"--weather {options.weather}: scanned places are drawn in the light of their scan: "
+            f"leave it out, or leave --place out"
+        )
+    conditions = tuple(
+        name
+        for name, holds in CONDITIONS.items()
+        if name == ALL or (options.weather == CLEAR and holds(scenario))
+    )
     progress(f"starting {scenario.id}")
     with (
         Episode(scenario, driver.manifest, options) as episode,
@@ -478,7 +532,8 @@ def _driven(scenario: Scenario, appearance: Appearance, progress: Progress) -> I
                 robot, street = episode.moment.robot, episode.moment.street
                 frame = camera.render(robot, street)
                 taken = robot_shot(surface, robot_model, CAMERA, robot)
-                seen = seen_people(frame, street.people, taken)
+                heads_m = heads_with_companions(street.people, surface, scenario)
+                seen = seen_people(frame, street.people, taken, heads_m)
                 yield Picture(frame, seen, Things(surface, scenario, taken), conditions)
             observation = episode.advance(driver.act(observation))
 

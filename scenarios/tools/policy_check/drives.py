@@ -15,13 +15,14 @@ from types import MappingProxyType
 from typing import Final, Literal
 
 import msgspec
+import numpy as np
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose, wrap_angle
 from cosim.core.progress import Progress, ignore
-from cosim.core.state import NO_PEOPLE, People, PersonKind, RobotState, Street
+from cosim.core.state import NO_PEOPLE, Age, People, PersonKind, RobotState, Street
 from cosim.episode.interfaces import Observation
 from cosim.episode.loop import Moment
 from cosim.episode.manifest_checks import check_camera
@@ -33,6 +34,9 @@ from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of
 from physics.dynamics.world import BulletWorld
+from physics.people.appearance import look_of
+from physics.people.body import COATS
+from physics.people.wardrobe import Season, season_of
 from physics.sensors.caster import RayCaster
 from scenarios.episodes.wiring import (
     CORRIDOR_M,
@@ -49,11 +53,15 @@ SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
         "straight": "along a straight sidewalk, nobody there",
         "left": "askew on it, to the right: the way leads to the left",
         "right": "askew on it, to the left: the way leads to the right",
-        "person": "along it, and somebody stands 3 m ahead",
+        "person": "along it, and three people stand 3 m ahead",
     }
 )
-_PERSON: Final = "person-0"
-"""Name of the person ahead, whose shirt is yellow in this place and season: easy to see."""
+_PERSONS: Final = 3
+"""Number of people ahead. Several, as the clothes of one may be hard to see."""
+_CANDIDATES: Final = 200
+"""Number of names of whom those in the yellowest clothes are shown, for `colour_order`."""
+_APART_M: Final = 0.65
+"""Distance between their middles in metres."""
 _SHOWN: Final = "straight-003"
 """Scenario of the suite `unit` whose place is shown.
 
@@ -120,6 +128,7 @@ def _drive(
     surface = surface_of_place(scenario.place)
     clock = Clock.for_rate(manifest.rate_hz)
     street_map = place(scenario.place)[1]
+    season = season_of(scenario.light.day_of_year, scenario.light.latitude_deg)
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
 
     @cache
@@ -159,7 +168,7 @@ def _drive(
             rays,
         )
         people = (
-            _standing_person(route, 0.5 * route.length_m + _PERSON_M)
+            _standing_people(route, 0.5 * route.length_m + _PERSON_M, surface.seed, season)
             if scene == "person"
             else NO_PEOPLE
         )
@@ -180,14 +189,27 @@ def _drive(
     return Drive(scene, tuple(seen))
 
 
-def _standing_person(route: Polyline, s_m: float) -> People:
-    """Return one adult in the middle of the way, facing the robot."""
+def _standing_people(route: Polyline, s_m: float, seed: int, season: Season) -> People:
+    """Return adults side by side around the middle of the way, facing the robot.
+
+    seed, season: of their clothes
+    """
     pose = route.at(s_m)
+    across = np.array([-math.sin(pose.heading_rad), math.cos(pose.heading_rad)])
+    aside = _APART_M * (np.arange(_PERSONS) - 0.5 * (_PERSONS - 1))
+    heading = wrap_angle(pose.heading_rad + math.pi)
+
+    def yellow(name: str) -> int:
+        colours = look_of(name, Age.ADULT, seed, season, crowd=False).colours
+        red, green, blue = colours[[COATS.index("top"), COATS.index("bottom")]].astype(int).T
+        return int((np.minimum(red, green) - blue).sum())
+
+    names = [f"person-{k}" for k in range(_CANDIDATES)]
     return People.of(
-        (_PERSON,),
-        [pose.xy],
-        [wrap_angle(pose.heading_rad + math.pi)],
-        [0.0],
-        ("stand",),
+        tuple(sorted(names, key=yellow, reverse=True)[:_PERSONS]),
+        np.array(pose.xy) + aside[:, None] * across,
+        [heading] * _PERSONS,
+        [0.0] * _PERSONS,
+        ("stand",) * _PERSONS,
         kind=PersonKind.EVENT,
     )

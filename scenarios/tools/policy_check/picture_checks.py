@@ -160,11 +160,11 @@ def side(asker: Asker) -> CheckOutcome:
 
 
 def person(asker: Asker) -> CheckOutcome:
-    """A person in the way changes the answer."""
+    """People in the way change the answer."""
     if none := _blind(asker):
         return none
     clear, stands = asker.answer("straight", asker.plain), asker.answer("person", asker.plain)
-    said = f"nobody: {_words(clear)}; somebody 3 m ahead: {_words(stands)}"
+    said = f"empty way: {_words(clear)}; people 3 m ahead: {_words(stands)}"
     if apart(clear, stands) < _HARDLY:
         return doubted(f"{said}: right for a policy that was never shown people")
     return passed(said)
@@ -183,7 +183,7 @@ def _steers(asker: Asker, *edits: Edit) -> tuple[float, float]:
 
 
 def _brakes(asker: Asker, *edits: Edit) -> tuple[float, float]:
-    """Return the share of its speed by which the policy brakes for a person, also in a mirror."""
+    """Return the share of its speed by which the policy brakes for people, also in a mirror."""
     speeds = [
         [asker.answer(s, asker.plain, *more, *edits).v_mps for s in _MET] for more in _both(asker)
     ]

@@ -19,6 +19,7 @@ from cosim.core.files import atomic_folder
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import Command, WaypointCommand
 from cosim.spec.camera import CameraSpec
+from cosim.spec.goal import GOALS, Instruction, PointGoal
 from cosim.spec.manifest import Manifest
 from cosim.spec.ros2 import CMD_VEL, PLAN
 from cosim.spec.run_config import CameraChoice
@@ -41,6 +42,8 @@ _TYPES: Final = {name: row.type for name, row in messages.TOPICS.items()} | {
     PLAN: PATH,
 }
 """Type of each recorded topic."""
+_SENT_GOALS: Final = (PointGoal, Instruction)
+"""Goals that have a topic."""
 
 
 def write_bag(
@@ -76,11 +79,13 @@ def write_bag(
 def manifest_of_bag(recorded: Manifest, picture: CameraSpec | None) -> Manifest:
     """Return the sensors of a bag: those of the policy without privileged state.
 
-    Odometry without a heading becomes the exact one, because /odom needs a heading.
+    Odometry without a heading becomes the exact one, because /odom needs a heading. Goals without
+    a topic are not computed.
     """
     return replace(
         recorded,
         privileged=False,
+        goal=recorded.goal if GOALS[recorded.goal].type in _SENT_GOALS else "none",
         camera=recorded.camera if picture is None else picture,
         odometry="wheel" if recorded.odometry == "wheel" else "exact",
     )
@@ -115,7 +120,7 @@ def _write(
             tape.answer(command, now_ns)
             seen = episode.advance(command, delay=delay)
             progress(f"recording {told.scenario.id}", episode.moment.tick / len(told.log))
-        check_state_hash(folder, told, episode.result()[0].state_hash)
+        check_state_hash(folder, told, episode.state_hash)
     for file in path.iterdir():
         file.rename(path.parent / file.name)
     path.rmdir()

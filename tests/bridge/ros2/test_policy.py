@@ -43,6 +43,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros2_policy, "JOINED_S", 0.2)
     monkeypatch.setattr(ros2_policy, "GONE_S", 0.3)
     monkeypatch.setattr(ros2_policy, "SETTLE_S", 0.1)
+    monkeypatch.setattr(ros2_policy, "HINT_S", 0.3)
 
 
 def seen_at(tick: int, **more: Any) -> Observation:
@@ -226,23 +227,70 @@ def test_what_is_no_command_is_a_crash_in_words(
 def test_a_node_that_cannot_drive_is_described(
     at: str, network: Network, type_name: str, words: str
 ) -> None:
-    """A wrong type, domain, namespace or distribution is in the message of the crash."""
+    """A wrong type, domain, namespace or distribution is in the message of the crash, and is shown
+    while the run waits."""
+    shown: list[str] = []
     with (
         driven(at, start_s=1.2) as driver,
         Peer(at, network=network, type_name=type_name),
         pytest.raises(PolicyError, match="is missing after") as error,
     ):
+        driver.on_wait(shown.append)
         driver.reset("k1", 7)
     assert words in str(error.value)
+    assert len(shown) == 1 and shown[0].startswith("waits for a node: ") and words in shown[0]
 
 
-def test_without_a_node_the_crash_says_where_they_connect(at: str) -> None:
-    """No node: its endpoint and the other dialect are in the message."""
+def test_without_a_node_the_crash_says_how_they_connect(at: str) -> None:
+    """No node: its endpoint, its mode and the other dialect are in the message."""
     with (
         driven(at, start_s=1.0) as driver,
-        pytest.raises(PolicyError, match=f"no ROS 2 node is at {at}.*ros2dds"),
+        pytest.raises(
+            PolicyError, match=f"no ROS 2 node is at {at}.*mode client and this endpoint.*ros2dds"
+        ),
     ):
         driver.reset("k1", 7)
+
+
+ODOM_AS_TWIST = (
+    "/driver subscribes to /odom as geometry_msgs/msg/Twist, it is nav_msgs/msg/Odometry"
+)
+
+
+@pytest.mark.parametrize(
+    ("reads", "words"),
+    [
+        ({"/odom": TWIST}, ODOM_AS_TWIST),
+        ({"/odom": TWIST, "/clock": "rosgraph_msgs/msg/Clock"}, ODOM_AS_TWIST),
+        ({"/odom": "nav_msgs/msg/Odometry"}, "no message came on /cmd_vel"),
+        (
+            {"/plan": PATH},
+            "/driver publishes /cmd_vel and subscribes only to /plan, and the run publishes none",
+        ),
+        ({}, "/driver publishes /cmd_vel and subscribes to no topic"),
+        (
+            {"/scan": "sensor_msgs/msg/LaserScan"},
+            "/driver subscribes to /scan, and this run sends nothing there: see --ros2-scan",
+        ),
+    ],
+    ids=["type", "one of two", "silent", "other topic", "none", "no scan"],
+)
+def test_a_node_without_commands_is_described(
+    at: str, reads: dict[str, str], words: str, monkeypatch: Any
+) -> None:
+    """A subscription of a wrong type, to a topic without messages, or none, is in the message of
+    the crash, and is shown while the run waits."""
+    monkeypatch.setattr(ros2_policy, "SETTLED_S", 0.6)
+    shown: list[str] = []
+    with driven(at, start_s=1.6) as driver, Peer(at, reads=False) as peer:
+        for topic, name in reads.items():
+            peer.node.subscribe(topic, (name,), lambda got: None)
+        driver.on_wait(shown.append)
+        driver.reset("k1", 7)
+        with pytest.raises(PolicyError, match="gave no command for") as error:
+            driver.act(seen_at(0))
+    assert f"s: {words}" in str(error.value)
+    assert len(shown) == 1 and f": {words}" in shown[0]
 
 
 def test_humble_nodes_drive_with_their_distribution(at: str) -> None:
@@ -285,10 +333,13 @@ def test_a_lost_node_is_a_crash_and_a_new_one_drives_the_next_episode(at: str) -
 
 
 def test_two_nodes_do_not_drive_together(at: str, capfd: Any) -> None:
-    """Two publishers are reported at the start; their commands crash the episode."""
+    """Two publishers are reported and shown at the start; their commands crash the episode."""
     both = r"two publishers of /cmd_vel, /(one|two) and /(one|two): stop one"
+    shown: list[str] = []
     with driven(at) as driver, Peer(at, name="one"), Peer(at, name="two"):
+        driver.on_wait(shown.append)
         driver.reset("k1", 7)
+        assert len(shown) == 1 and re.match(f"there are {both}", shown[0])
         assert re.search(f"there are {both}", capfd.readouterr().err)
         with pytest.raises(PolicyError, match=f"is {both}"):
             for tick in range(0, 100, 2):
@@ -313,20 +364,51 @@ def test_two_nodes_behind_dds_bridges_do_not_drive(at: str, monkeypatch: Any) ->
         assert driver.act(seen_at(0)).v_mps == 1.0
 
 
-@pytest.mark.parametrize("dialect", ["rmw_zenoh", "ros2dds"])
-def test_a_restarted_node_is_not_two_nodes(at: str, dialect: Any) -> None:
-    """A node that leaves and comes back in an episode is reported as such; the next episode has the
-    new one."""
+@pytest.mark.parametrize(
+    ("dialect", "words"),
+    [
+        ("rmw_zenoh", r"is gone: /driver left and came back at 0\.\d0 s\."),
+        ("ros2dds", "is gone: a node of .* has left, and a node of .* publishes it now"),
+    ],
+    ids=["rmw_zenoh", "ros2dds"],
+)
+@pytest.mark.parametrize("when", ["between", "waits"])
+def test_a_restarted_node_is_not_two_nodes(
+    at: str, dialect: Any, words: str, when: str, monkeypatch: Any
+) -> None:
+    """A node that leaves and comes back in an episode is reported as such, at once also if it lacks
+    the observation; the next episode has the new one."""
+    monkeypatch.setattr(ros2_policy, "GONE_S", 30.0)
     network = Network(dialect=dialect)
-    with driven(at, dialect=dialect) as driver:
-        with Peer(at, network=network, name="driver"):
-            driver.reset("k1", 7)
-            driver.act(seen_at(0))
-        with Peer(at, network=network, name="driver"):
-            node = driver.policy._node  # type: ignore[attr-defined]
+
+    def once(peer: Peer, seen: Seen) -> None:
+        if when == "between" or seen.time_ns == 10**9:
+            answers(peer, seen)
+
+    with driven(at, dialect=dialect, answer_s=60.0) as driver:
+        old = Peer(at, once, network=network)
+        driver.reset("k1", 7)
+        driver.act(seen_at(0))
+        node = driver.policy._node  # type: ignore[attr-defined]
+
+        def restart() -> None:
+            if when == "waits":
+                wait_until(lambda: len(old.seen["/odom"]) == 2)
+            old.close()
+            new.append(Peer(at, network=network))
+
+        new: list[Peer] = []
+        restarts = threading.Thread(target=restart)
+        restarts.start()
+        if when == "between":
+            restarts.join()
             wait_until(lambda: node.has_subscriber("/odom") and node.subscriptions_arrived())
-            with pytest.raises(PolicyError, match=r"is gone: .* has left, and .* publishes it now"):
-                driver.act(seen_at(2, goal=PointGoal(5.0, 1.0)))
+        began_s = time.monotonic()
+        with pytest.raises(PolicyError, match=words):
+            driver.act(seen_at(2, goal=PointGoal(5.0, 1.0)))
+        assert time.monotonic() - began_s < 30.0, "it waited for the timeout"
+        restarts.join()
+        with new[0]:
             driver.reset("k2", 7)
             assert driver.act(seen_at(0)).v_mps == 1.0
 

@@ -21,6 +21,7 @@ from physics.street.gltf import as_gltf
 from physics.street.street_surface import StreetSurface
 from physics.textures.layers import linear_to_srgb, srgb_to_linear
 from tests.conftest import Cosim
+from tests.support.event_ways import event_way
 from tests.support.tiny_street import tiny_map
 
 FENCE = Barrier(x_m=-3.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end=1)
@@ -88,7 +89,7 @@ def test_nodes_stand_below_the_group_of_their_kind(street: StreetSurface, file: 
     standing = {prop.kind for key in KEYS for prop, _ in street.chunk(key).props}
     assert of_group["furniture"] == {f"prop:{kind}" for kind in standing} and len(standing) > 4
     assert of_group["buildings"] == {"building:walls", "building:windows"}
-    assert of_group["barriers"] == {"barrier:red", "barrier:white"}
+    assert of_group["barriers"] == {"barrier:red", "barrier:white", "barrier:posts"}
 
 
 def ground_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
@@ -157,12 +158,14 @@ def test_the_robot_of_a_run_is_exported_with_its_legs(
     street: StreetSurface, tmp_path: Path, cosim: Cosim
 ) -> None:
     """It is where it was, on its feet, which are not where they are at rest."""
-    words = ("unit", "--policy", "straight", "--robot", "dog", "--scenario", "crosswalk-050")
+    way = event_way("gesturing", "way", at_m=15.0, time_s=4.5)
+    write_suite(Suite(name="one", version="1", scenarios=(way,)), tmp_path / "one.json")
+    words = ("one.json", "--policy", "straight", "--robot", "dog")
     assert cosim("run", *words, "--out", "dog", cwd=tmp_path).returncode == 0
-    said = cosim("export", "crosswalk-050", "dog.glb", "--run", "dog", "--at", "4", cwd=tmp_path)
+    said = cosim("export", "way", "dog.glb", "--run", "dog", "--at", "4", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
     body = robot_of(tmp_path / "dog.glb")
-    log = Log.load(tmp_path / "dog" / "episodes" / "crosswalk-050" / "trajectory.npz")
+    log = Log.load(tmp_path / "dog" / "episodes" / "way" / "trajectory.npz")
     assert body.mean(axis=0)[:2] == pytest.approx(log.pose[79, :2], abs=0.1)
     recorded = parts_in_place(street, robot_called("dog"), log.robot(79))
     assert body.min(axis=0)[2] == pytest.approx(
@@ -174,8 +177,8 @@ def test_the_robot_of_a_run_is_exported_with_its_legs(
         for one, other in zip(recorded, stood, strict=True)
     ]
     assert np.ptp(lifted) > 0.03
-    late = cosim("export", "crosswalk-050", "late.glb", "--run", "dog", "--at", "999", cwd=tmp_path)
-    assert late.returncode == 2 and "'crosswalk-050' ended after" in late.stderr
+    late = cosim("export", "way", "late.glb", "--run", "dog", "--at", "999", cwd=tmp_path)
+    assert late.returncode == 2 and "'way' ended after" in late.stderr
 
 
 def test_what_cannot_be_exported_is_told_before_anything_is_built(
