@@ -299,7 +299,7 @@ class Things:
         seat: of their scene, or (N,)
         part: (N,) index of the part, below `parts`
         """
-        self.draws = _no_draws(parts)
+        self.clear(parts)
         if not len(form):
             return
         rank = self._forms.rank
@@ -325,6 +325,10 @@ class Things:
         seats = pooled.view(POOLED)["seat"][:, 0]
         seats[:] = seat if isinstance(seat, int) else seat[order]
         self._rows.write(self._start, pooled)
+
+    def clear(self, parts: int = 1) -> None:
+        """Remove all instances."""
+        self.draws = _no_draws(parts)
 
     def release(self) -> None:
         self._rows.give(self._start, self._room)
@@ -400,7 +404,7 @@ def turned_instances(
     pitch: ArrayLike,
     heading: ArrayLike,
     paint: ArrayLike,
-    label: int,
+    label: int | NDArray[np.intp],
 ) -> CornerRows:
     """Return rows of INSTANCE, rotated about x, then y, then z.
 

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, RobotState, Vehicles
 from cosim.spec.robot import Robot
-from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.instances import (
-    INSTANCE,
     Forms,
     Material,
     ThingArrays,
@@ -39,8 +37,25 @@ _MATERIALS: Final[tuple[Material, ...]] = ("solid", "cut-out")
 _FLEETS_MAX: Final = 256
 
 
-_Placed = tuple[NDArray[np.intp], CornerRows, NDArray[np.intp], NDArray[np.intp]]
-"""Forms, instances, numbers of the pictures, and 1 for shadows."""
+class _Placed(NamedTuple):
+    """N objects.
+
+    form: (N,) numbers of forms
+    at: (N, 3) metres from the anchor
+    turn: (N, 3) roll, pitch and heading
+    paint: (N, 3)
+    label: (N,)
+    picture: (N,) numbers of the pictures
+    shadow: (N,) 1 for shadows
+    """
+
+    form: NDArray[np.intp]
+    at: Floats
+    turn: Floats
+    paint: Floats
+    label: NDArray[np.intp]
+    picture: NDArray[np.intp]
+    shadow: NDArray[np.intp]
 
 
 class Driven(NamedTuple):
@@ -80,10 +95,17 @@ class TrafficDrawing:
         parts: part of the batch of each picture, in order
         seats: of the scenes of the pictures
         """
-        placed = [self._vehicles(driven, shots), *self._robots(driven, shots)]
-        form, rows, picture, shadow = (np.concatenate(one) for one in zip(*placed, strict=True))
+        both = self._vehicles(driven, shots), self._robots(driven, shots)
+        placed = [one for one in both if one is not None]
         count = 2 * (int(parts[-1]) + 1)
-        self._things.set(form, rows, seats[picture], 2 * parts[picture] + shadow, count)
+        if placed:
+            form, at, turn, paint, label, picture, shadow = (
+                of[0] if len(of) == 1 else np.concatenate(of) for of in zip(*placed, strict=True)
+            )
+            rows = turned_instances(at, *turn.T, paint, label)
+            self._things.set(form, rows, seats[picture], 2 * parts[picture] + shadow, count)
+        else:
+            self._things.clear(count)
         self._draws.set([self._things.draws[material] for material in _MATERIALS])
 
     def draw(self, stage: Pass, shadows: int, part: int) -> None:
@@ -96,7 +118,7 @@ class TrafficDrawing:
                 array = self._arrays.of(material, stage != "colour", shadows)
                 self._draws.draw(array, step, at, at + 1)
 
-    def _vehicles(self, driven: Sequence[Driven], shots: Shots) -> _Placed:
+    def _vehicles(self, driven: Sequence[Driven], shots: Shots) -> _Placed | None:
         whose = np.repeat(np.arange(len(driven)), [len(one.vehicles) for one in driven])
         xy = np.concatenate([one.vehicles.xy for one in driven])
         middle = shots.middle[whose]
@@ -107,15 +129,17 @@ class TrafficDrawing:
         )
         rows = np.concatenate([seen.nonzero()[0], casts.nonzero()[0]])
         if not len(rows):
-            none = np.zeros(0, dtype=np.intp)
-            return none, np.zeros(0, dtype=INSTANCE), none, none
+            return None
         fleets = [self._fleet(one.vehicles) for one in driven]
         form, paint = (np.concatenate(column) for column in zip(*fleets, strict=True))
-        lean = np.concatenate([_leaning(one) for one in driven])
-        heading = np.concatenate([one.vehicles.heading for one in driven])
-        at = np.column_stack([xy - shots.anchor[whose], lean[:, 0]])
-        placed = turned_instances(at, lean[:, 1], lean[:, 2], heading, paint, LABELS["vehicle"])
-        return form[rows], placed[rows], whose[rows], np.arange(len(rows)) >= seen.sum()
+        lean = np.concatenate([_leaning(one) for one in driven])[rows]
+        heading = np.concatenate([one.vehicles.heading for one in driven])[rows]
+        picture = whose[rows]
+        at = np.column_stack([xy[rows] - shots.anchor[picture], lean[:, 0]])
+        turn = np.column_stack([lean[:, 1:], heading])
+        label = np.full(len(rows), LABELS["vehicle"])
+        shadow = (np.arange(len(rows)) >= seen.sum()).astype(np.intp)
+        return _Placed(form[rows], at, turn, paint[rows], label, picture, shadow)
 
     def _fleet(self, which: Vehicles) -> tuple[NDArray[np.intp], Floats]:
         """Return (N,) forms of vehicles, and their (N, 3) paints."""
@@ -136,7 +160,7 @@ class TrafficDrawing:
         shape = vehicles.vehicle_shape(name, size[0])
         return self._forms.id(("vehicle", shape, *size), partial(_vehicle_parts, shape, *size))
 
-    def _robots(self, driven: Sequence[Driven], shots: Shots) -> list[_Placed]:
+    def _robots(self, driven: Sequence[Driven], shots: Shots) -> _Placed | None:
         """Return the robots in their postures."""
         forms: list[int] = []
         rows: list[tuple[float, ...]] = []
@@ -153,12 +177,11 @@ class TrafficDrawing:
                 pictures += len(shown) * [k]
                 shadow += shown
         if not rows:
-            return []
+            return None
         at = np.array(rows)
-        placed = turned_instances(
-            at[:, :3], at[:, 3], at[:, 4], at[:, 5], (1.0, 1.0, 1.0), LABELS["robot"]
-        )
-        return [(np.array(forms), placed, np.array(pictures), np.array(shadow))]
+        label = np.full(len(rows), LABELS["robot"])
+        found = at[:, :3], at[:, 3:], np.ones((len(rows), 3)), label
+        return _Placed(np.array(forms), *found, np.array(pictures), np.array(shadow))
 
     def _bodies(
         self, model: Robot, posture: Posture, anchor: Floats
