@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cosim.core.state import Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
 from physics.cameras.lens import drawn, through
-from physics.cameras.view import Shot, check_size, robot_shot, shot
+from physics.cameras.view import Mounting, Shot, check_size, mounted_shot, shot
 from physics.dynamics.world import BulletWorld
 
 
@@ -25,6 +25,7 @@ class WorldCamera(ABC):
         check_size(spec.width, spec.height, spec.fov_deg)
         self.spec = spec = dataclasses.replace(spec, mount=spec.on(world.robot))
         self._pinhole = drawn(spec)
+        self._mounting = Mounting.of(self._pinhole, world.robot)
         self._world = world
         self._depth = depth
 
@@ -75,7 +76,7 @@ class WorldCamera(ABC):
         return whole if self.spec.crop is None else _cropped(whole, *self.spec.crop)
 
     def _mounted(self, robot: RobotState) -> Shot:
-        return robot_shot(self._world.surface, self._world.robot, self._pinhole, robot)
+        return mounted_shot(self._world.surface, self._world.robot, self._mounting, robot)
 
 
 def _cropped(frame: Frame, x0: int, y0: int, x1: int, y1: int) -> Frame:

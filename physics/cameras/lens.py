@@ -26,6 +26,7 @@ GREY: Final = 0.18
 SAMPLES_MAX: Final = 8
 """Maximum number of averaged shutter samples; there is one for each 1.5 pixels of motion."""
 
+_NONE: Final = Lens()
 _DRAWN_MAX: Final = 4096
 _OFFSETS: Final = 1 << 18
 _FAR_M: Final = 15.0
@@ -41,7 +42,7 @@ def drawn(spec: CameraSpec) -> CameraSpec:
     Raises SpecError where k1 and k2 fold the picture at this field of view.
     """
     lens = spec.lens
-    if lens == Lens():
+    if lens == _NONE:
         return spec
     if not (lens.k1 or lens.k2):
         return dataclasses.replace(spec, lens=Lens())
@@ -67,7 +68,7 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
     People and vehicles blur as if they stood still.
     """
     lens = spec.lens
-    if lens == Lens():
+    if lens == _NONE:
         return frame
     source = drawn(spec)
     size = (source.height, source.width)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,8 +88,8 @@ class Shot:
     @property
     def steep_rad(self) -> float:
         """Return the angle of the view below the horizon."""
-        ahead = self.target_m - self.eye_m
-        return math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1]))
+        x, y, z = self._way
+        return math.atan2(-z, math.hypot(x, y))
 
     @property
     def half_picture(self) -> tuple[float, float]:
@@ -98,22 +98,22 @@ class Shot:
         return tall * self.size[0] / self.size[1], tall
 
     @cached_property
+    def _way(self) -> tuple[float, float, float]:
+        x, y, z = (self.target_m - self.eye_m).tolist()
+        return x, y, z
+
+    @cached_property
     def view(self) -> View:
-        ahead = self.target_m - self.eye_m
+        x, y, z = self._way
         half_up = math.radians(0.5 * self.fov_deg)
-        lowest = max(math.cos(abs(self.steep_rad) + half_up), 0.05)
+        steep_rad = self.steep_rad
+        lowest = max(math.cos(abs(steep_rad) + half_up), 0.05)
         half_wide = math.atan(math.tan(half_up) * self.size[0] / self.size[1] / lowest)
-        heading_rad = (
-            math.atan2(ahead[1], ahead[0])
-            if math.hypot(ahead[0], ahead[1]) > 0.0
-            else 0.5 * math.pi
-        )
-        past_rad = self.steep_rad + half_up - 0.5 * math.pi
+        heading_rad = math.atan2(y, x) if math.hypot(x, y) > 0.0 else 0.5 * math.pi
+        past_rad = steep_rad + half_up - 0.5 * math.pi
         if past_rad <= 0.0:
             return View(self.eye_m, heading_rad, half_wide)
-        return View(
-            self.eye_m, heading_rad, 0.5 * math.pi, max(-ahead[2], _MOUNT_M) * math.tan(past_rad)
-        )
+        return View(self.eye_m, heading_rad, 0.5 * math.pi, max(-z, _MOUNT_M) * math.tan(past_rad))
 
     @cached_property
     def axes(self) -> Floats:
@@ -121,7 +121,7 @@ class Shot:
 
         A view straight down has north at the top.
         """
-        x, y, z = (self.target_m - self.eye_m).tolist()
+        x, y, z = self._way
         flat = math.hypot(x, y)
         long = math.hypot(x, y, z)
         x, y, z = x / long, y / long, z / long
@@ -146,20 +146,42 @@ def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotSta
 
     It tilts with the ground, or with the trunk of a robot with legs.
     """
+    return mounted_shot(surface, model, Mounting.of(spec, model), robot)
+
+
+class Mounting(NamedTuple):
+    """Place of a camera on a robot, and its picture.
+
+    at_m: from the robot's frame
+    way: unit vector of the view: ahead, to the left, down
+    """
+
+    at_m: tuple[float, float, float]
+    way: tuple[float, float, float]
+    size: tuple[int, int]
+    fov_deg: float
+
+    @classmethod
+    def of(cls, spec: CameraSpec, model: Robot) -> Mounting:
+        """Return the place of a camera on a robot."""
+        mount = spec.on(model)
+        x, y, z = mount.at_m
+        down, left = math.radians(mount.pitch_down_deg), math.radians(mount.yaw_left_deg)
+        way = math.cos(down) * math.cos(left), math.cos(down) * math.sin(left), math.sin(down)
+        at_m = x, y, z - model.drive.pivot_m
+        return cls(at_m, way, (spec.width, spec.height), spec.fov_deg)
+
+
+def mounted_shot(surface: Surface, model: Robot, mounting: Mounting, robot: RobotState) -> Shot:
+    """Return the view of `robot_shot` of a camera whose place on the robot is known."""
     posture = posture_of(surface, model, robot)
     turn = attitude(posture.roll_rad, posture.pitch_rad, posture.heading_rad)
-    mount = spec.on(model)
-    x, y, z = mount.at_m
-    z -= model.drive.pivot_m
-    down, left = math.radians(mount.pitch_down_deg), math.radians(mount.yaw_left_deg)
-    ahead = math.cos(down) * math.cos(left)
-    aside = math.cos(down) * math.sin(left)
-    below = math.sin(down)
+    (x, y, z), (ahead, aside, below), size, fov_deg = mounting
     eye = np.array(
         [at + a * x + b * y + c * z for at, (a, b, c) in zip(posture.at_m, turn, strict=True)]
     )
     way = np.array([a * ahead + b * aside - c * below for a, b, c in turn])
-    return Shot(eye, eye + way, (spec.width, spec.height), spec.fov_deg)
+    return Shot(eye, eye + way, size, fov_deg)
 
 
 def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: float) -> Shot:

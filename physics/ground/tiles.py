@@ -40,6 +40,8 @@ CURB_M: Final = 0.12
 RAMP_SLOPE: Final = 1.0 / 12.0
 """Slope of curb ramps."""
 
+_MANY: Final = 50
+"""Number of points from which those beyond all ramps are sorted out first."""
 RAMP_M: Final = CURB_M / RAMP_SLOPE
 """Length of a curb ramp in metres."""
 
@@ -463,5 +465,18 @@ def _height_above_land(xy: Floats, ramp_to: shapely.Geometry) -> Floats:
     """Return the height of high ground above the land at (N, 2) points: CURB_M, less on ramps."""
     if shapely.is_empty(ramp_to):
         return np.full(len(xy), CURB_M)
+    if len(xy) < _MANY:
+        return _up_the_ramp(xy, ramp_to)
+    height = np.full(len(xy), CURB_M)
+    bounds = shapely.bounds(shapely.get_parts(ramp_to))
+    lowest, highest = bounds[:, :2], bounds[:, 2:]
+    reach = RAMP_M + 0.01  # beyond it no distance is needed
+    inside = (xy[:, None] > lowest - reach) & (xy[:, None] < highest + reach)
+    rows = np.flatnonzero(np.any(np.all(inside, axis=2), axis=1))
+    height[rows] = _up_the_ramp(xy[rows], ramp_to)
+    return height
+
+
+def _up_the_ramp(xy: Floats, ramp_to: shapely.Geometry) -> Floats:
     gap = np.asarray(shapely.distance(shapely.points(xy), ramp_to), dtype=float)
     return np.minimum(CURB_M, gap * RAMP_SLOPE)

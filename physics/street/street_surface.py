@@ -203,7 +203,9 @@ class StreetSurface(PlaceSurface):
         if len(xy) and (cells == cells[0]).all():
             return self.tile((int(cells[0, 0]), int(cells[0, 1]))).height(xy)
         height = np.zeros(len(xy))
-        for i, j in dict.fromkeys(map(tuple, cells.tolist())):
-            here = (cells[:, 0] == i) & (cells[:, 1] == j)
-            height[here] = self.tile((i, j)).height(xy[here])
+        key = (cells[:, 0] << 32) + cells[:, 1]
+        for one in set(key.tolist()):
+            here = key == one
+            first = cells[here.argmax()].tolist()
+            height[here] = self.tile((first[0], first[1])).height(xy[here])
         return height

@@ -146,7 +146,7 @@ def test_a_camera_frees_what_it_makes_but_for_programs_which_are_made_once(
             camera.render(*moment(world, n))
         left.append(dict(alive))
     assert (
-        touched["buffer"] > 0 and left[1]["buffer"] >= left[0]["buffer"]
+        touched["texture"] > 0 and left[1]["texture"] >= left[0]["texture"]
     )  # forms grow with what is seen
     assert left[2] == left[1] and left[3] == left[1]
 

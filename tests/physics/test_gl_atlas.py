@@ -56,6 +56,31 @@ def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -
     assert not np.array_equal(single[0][0].rgb, single[1][0].rgb)
 
 
+@pytest.mark.parametrize("layers", [False, True])
+def test_layers_hold_the_pictures_of_single_cameras(
+    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool
+) -> None:
+    """Pictures drawn as layers of one texture, among pictures that are not, are those of single
+    cameras; and they stay when later ones are drawn."""
+    from physics.cameras.gl.atlas import Atlas
+
+    monkeypatch.setattr(context, "LAYERS", False)
+    busy = busy_street(camera_city(300.0), 8, 9)
+    lights = [NOON, Light(hour=19.0), Light(hour=0.0), Light(shadows=False)]
+    asked = [(busy.robot, street) for street in busy.streets]
+    single = [_alone(worlds[k % 3], light, asked) for k, light in enumerate(lights)]
+    monkeypatch.setattr(context, "LAYERS", layers)
+    with Atlas(SPEC) as atlas:
+        keys = [atlas.join(worlds[k % 3], light) for k, light in enumerate(lights)]
+        order = [(0, 1, 2, 3), (3, 0), (1, 2), (0, 3, 1), (2, 1, 0), (1,), (3, 2, 0), (0, 0, 1)]
+        found = [
+            atlas.render([(keys[k], *asked[tick]) for k in some]) for tick, some in enumerate(order)
+        ]
+    for tick, some in enumerate(order):
+        for k, frame in zip(some, found[tick], strict=True):
+            assert _same(frame, single[k][tick]), (tick, k)
+
+
 def test_environments_join_and_leave_an_atlas(
     worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,11 +133,11 @@ def _same(one: Frame, other: Frame) -> bool:
 
 
 def test_an_atlas_too_large_is_refused_with_the_limit(worlds: list[BulletWorld]) -> None:
-    """More rows than a texture may have; and an atlas that is not running says so."""
+    """More pixels than may be under way; and an atlas that is not running says so."""
     from physics.cameras.gl.atlas import Atlas
 
     atlas = Atlas(CameraSpec(64, 1024))
     with pytest.raises(EngineError, match="'with' block"):
         atlas.join(worlds[0])
-    with atlas, pytest.raises(UsageError, match="1 to 16 fit"):
-        atlas.begin([(atlas.join(worlds[0]), RobotState(Pose(0.0, 0.0, 0.0)), Street(0))] * 17)
+    with atlas, pytest.raises(UsageError, match="64 x 1024 pixels: 1 to 512 fit"):
+        atlas.begin([(atlas.join(worlds[0]), RobotState(Pose(0.0, 0.0, 0.0)), Street(0))] * 513)

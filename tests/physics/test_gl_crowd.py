@@ -20,7 +20,7 @@ from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.lighting import lighting_of
-from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
+from physics.cameras.gl.shading import SceneBlocks
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
@@ -56,14 +56,14 @@ def drawing(
     crowd: CrowdDrawing, people: People, taken: Shot
 ) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
     gl = context()
-    anchor = anchor_of(taken.eye_m)
-    crowd.set([PeopleSeen(people, 2.0, flat, shadows=True)], Shots([taken]))
+    shots = Shots([taken])
+    crowd.set([PeopleSeen(people, 2.0, flat, shadows=True)], shots)
     blocks = SceneBlocks(gl)
     target = Target(gl, taken.size)
-    blocks.put(
-        0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, lighting_of(sky_of(NOON, 1))
-    )
-    blocks.upload()
+    rows = np.zeros((1, 8, 4), dtype=np.float32)
+    rows[0, :7] = lighting_of(sky_of(NOON, 1)).rows()
+    none = np.eye(4)[None]
+    blocks.set(shots.cameras(), none, none, shots.views(), rows)
     blocks.bind()
     target.frame.use()
     gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)

@@ -13,7 +13,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import City
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
-from physics.cameras.gl.scene import GlScene
+from physics.cameras.gl.street import StreetDrawing
 from physics.dynamics.world import BulletWorld
 from physics.ground.tiles import tiles_touching
 from physics.street.furniture import KINDS, PROP_VARIANTS, Prop, parts_of
@@ -97,7 +97,7 @@ class TestBlended:
         prop = first_prop(world, "shelter" if drawing == "draw_panes" else "tree")
         with GlCamera(world, SPEC, depth=True) as camera:
             whole = view_of(camera, prop, 5.0, 1.0)
-            monkeypatch.setattr(GlScene, drawing, lambda *_, **__: None)
+            monkeypatch.setattr(StreetDrawing, drawing, lambda *_, **__: None)
             bare = view_of(camera, prop, 5.0, 1.0)
         assert whole.labels is not None and bare.labels is not None
         assert whole.depth is not None and bare.depth is not None

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from itertools import count
 from types import TracebackType
-from typing import NewType, Self
+from typing import Final, NewType, Self
 
 import moderngl
 
@@ -27,11 +27,13 @@ from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.gl.batch import batch_drawing
 from physics.cameras.gl.camera import NOON, GlCamera
 from physics.cameras.gl.context import context
-from physics.cameras.gl.targets import Readback, Target
+from physics.cameras.gl.readback import Readback
+from physics.cameras.gl.targets import Target
 from physics.cameras.lens import drawn
-from physics.cameras.view import SIDE_MAX
 from physics.dynamics.world import BulletWorld
 
+_PIXELS_MAX: Final = 1 << 25
+"""Maximum number of pixels of pending pictures, 128 MiB."""
 SeatKey = NewType("SeatKey", int)
 """Key of an environment in an atlas, from `join` to `leave`; keys are never reused."""
 _Seen = Sequence[tuple[SeatKey, RobotState, Street]]
@@ -48,7 +50,7 @@ class Atlas:
         self._spec = spec
         self._appearance = appearance
         self._size = drawn(spec).width, drawn(spec).height
-        self._most = 4 * SIDE_MAX // self._size[1]
+        self._most = max(1, _PIXELS_MAX // (self._size[0] * self._size[1]))
         self._cameras: dict[SeatKey, GlCamera] = {}
         self._keys = count()
         self._begun: deque[list[tuple[GlCamera, RobotState, Street]]] = deque()
@@ -105,15 +107,16 @@ class Atlas:
         gl = self._running_context
         if len(seen) > self._most:
             raise UsageError(
-                f"an atlas of {len(seen)} pictures of {self._size[1]} rows: 1 to "
-                f"{self._most} fit at a time"
+                f"an atlas of {len(seen)} pictures of {self._size[0]} x {self._size[1]} pixels: "
+                f"1 to {self._most} fit at a time"
             )
         batch = [(self._camera(key), robot, street) for key, robot, street in seen]
         pictures = [camera.mounted_picture(robot, street) for camera, robot, street in batch]
         with gl:
             self._readback.begin(len(batch))
             try:
-                batch_drawing(gl).draw(pictures, self._target, self._readback.copy)
+                batch_drawing(gl).draw(pictures, self._target, self._readback)
+                self._readback.send()
             except BaseException:
                 self._readback.forget()
                 raise

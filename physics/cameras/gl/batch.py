@@ -1,49 +1,62 @@
 """Batches of pictures of any number of environments.
 
-Moving objects of all pictures are posed, culled and uploaded together, and splats of one scan are
-drawn together. Triangles of each picture are drawn separately. Bits do not depend on the batch.
+All pictures of a batch are arranged, posed, culled and uploaded together. On a graphics card,
+pictures by clear day are layers of one array texture: one call draws a material of all of them.
+Pictures with splats, weather or night are drawn one by one, and all pictures on a software
+renderer. Both ways run through the same code: a part of a batch is one or more pictures. Bits do
+not depend on the batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import moderngl
+import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Floats
 from cosim.core.state import RobotState, Street
 from cosim.spec.robot import Robot
 from physics.cameras.gl.air import AirDrawing, LinearTarget
-from physics.cameras.gl.backdrop import Backdrop
+from physics.cameras.gl.backdrop import Backdrop, SkySeat
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
+from physics.cameras.gl.driver import flush
 from physics.cameras.gl.instances import Forms
 from physics.cameras.gl.lamps import casting_people
+from physics.cameras.gl.layers import LayerTarget, LayerTargets
 from physics.cameras.gl.lighting import Lighting
+from physics.cameras.gl.pool import Part
 from physics.cameras.gl.scene import GlScene
-from physics.cameras.gl.shading import Pass, SceneBlocks, camera_matrix
-from physics.cameras.gl.shadows import TO_TEXTURE, ShadowMaps, casting
+from physics.cameras.gl.shading import PICTURES_MAX, Pass, SceneBlocks, SeatMaps
+from physics.cameras.gl.shadows import TO_TEXTURE, ShadowLayers, ShadowMaps, ShadowSeat, casting
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.splat_layers import Layers, splat_pictures
 from physics.cameras.gl.splats import SplatCloud
+from physics.cameras.gl.street import StreetDrawing
 from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.targets import Frame, Target
 from physics.cameras.gl.traffic import Driven, TrafficDrawing
+from physics.cameras.gl.variants import Variant
 from physics.cameras.gl.weather import Look, WeatherBlocks
 from physics.cameras.view import Shot
 from physics.people.wardrobe import Season
 from physics.street.surface import Surface
 
 _CLOCK: Final = Clock()
-_PEOPLE_MAX: Final = 4096
+_PEOPLE_MAX: Final = 8192
 """Maximum number of people in a batch; a picture with more is a separate batch."""
+
+
+_NO_SUN: Final = np.eye(4)
 
 
 class Stage(NamedTuple):
     """Resources of a camera: street scene, optional shadow maps, backdrop, light.
 
+    shadows, backdrop: seats where pictures are drawn as layers
     cloud: splats of the place, None without
     season: of people's clothes
     rain: most people hold umbrellas
@@ -53,8 +66,8 @@ class Stage(NamedTuple):
     surface: Surface
     model: Robot
     scene: GlScene
-    shadows: ShadowMaps | None
-    backdrop: Backdrop
+    shadows: ShadowMaps | ShadowSeat | None
+    backdrop: Backdrop | SkySeat
     light: Lighting
     cloud: SplatCloud | None = None
     season: Season = "mild"
@@ -62,15 +75,16 @@ class Stage(NamedTuple):
     look: Look | None = None
 
     @property
-    def variant(self) -> int:
+    def variant(self) -> Variant:
         """Return the variant of the programs."""
-        return int(self.shadows is not None) if self.look is None else self.look.variant
+        return self.scene.style.variant
 
 
 class PictureOrder(NamedTuple):
     """Request for a picture.
 
     light: as this view sees it
+    rows: (8, 4) of this light and of the backdrop, for `SceneBlocks`
     robot: None without a robot
     body: the robot's body is drawn in the picture itself, not only its shadow
     """
@@ -78,51 +92,70 @@ class PictureOrder(NamedTuple):
     stage: Stage
     taken: Shot
     light: Lighting
+    rows: NDArray[np.float32]
     street: Street
     robot: RobotState | None
     body: bool
 
 
+class Sink(Protocol):
+    """Receiver of drawn pictures, before the next ones are drawn."""
+
+    def take(self, place: int) -> None:
+        """Take the picture with a number from the target."""
+
+    def take_layers(self, drawn: LayerTarget, first: int, count: int, place: int) -> None:
+        """Take `count` pictures from the layers from `first` on. place: number of the first one"""
+
+
 class BatchDrawing:
-    """Drawing of batches; one instance per context, with the same lifetime."""
+    """Drawing of batches; one instance per context, with the same lifetime.
+
+    street: buffers of all scenes
+    """
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self._surfaces = surfaces(context)
-        self.forms = Forms(context, self._surfaces)
-        self._crowd, self._traffic = CrowdDrawing(context), TrafficDrawing(context, self.forms)
-        self._blocks = SceneBlocks(context)
+        forms = Forms(context, self._surfaces)
+        self.street = StreetDrawing(context, forms)
+        self._crowd = CrowdDrawing(context)
+        self._traffic = TrafficDrawing(context, forms, self.street.things)
+        self._blocks, self._seats = SceneBlocks(context), SeatMaps(context)
+        self._layers = LayerTargets(context)
         self._pictures = splat_pictures(context)
         self._weather, self._air = WeatherBlocks(context), AirDrawing(context)
 
-    def draw(
-        self, pictures: Sequence[PictureOrder], target: Target, drawn: Callable[[int], None]
-    ) -> None:
-        """Draw each picture into the target.
-
-        drawn: called with the picture's number before the next one is drawn
+    def draw(self, pictures: Sequence[PictureOrder], target: Target, sink: Sink) -> None:
+        """Draw pictures of the target's size, one after another into it, or as layers.
 
         The caller must hold the context.
         """
         first = 0
         for few in _batches(pictures):
-            shots = self._arrange(few)
+            parts = _parts(few)
+            shots = self._arrange(few, parts)
             self._surfaces.bind()
-            self._cast(few, shots)
+            self._cast(few, parts, shots)
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self._context.front_face = "cw"  # draw upside down, to read the top row first
-            for start, some in self._together(few, target.size):
-                for i in self._draw_some(start, some, target):
-                    drawn(first + i)
+            for some in self._together(few, parts, target.size):
+                if Variant.LAYERS in few[some[0].first].stage.variant:
+                    self._draw_layered(few, some[0], target.size, sink, first)
+                else:
+                    for i in self._draw_some(few, some, target):
+                        sink.take(first + i)
             first += len(few)
 
-    def _arrange(self, pictures: Sequence[PictureOrder]) -> Shots:
+    def _arrange(self, pictures: Sequence[PictureOrder], parts: Sequence[Part]) -> Shots:
         shots = Shots([one.taken for one in pictures])
-        for one, middle, anchor in zip(pictures, shots.middles, shots.anchors, strict=True):
-            one.stage.scene.arrange(one.taken.view, middle, anchor, one.street)
+        for one, lattice in zip(pictures, shots.lattice, strict=True):
+            one.stage.scene.arrange(one.taken.view, lattice, one.street)
+        scenes = [one.stage.scene for one in pictures]
+        self.street.set(scenes)
         watched = []
         driven = []
-        for stage, _, _, street, robot, body in pictures:
+        for stage, _, _, _, street, robot, body in pictures:
             surface = stage.surface
             shadows = stage.shadows is not None
             watched.append(
@@ -137,152 +170,239 @@ class BatchDrawing:
                 )
             )
             driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
-        self._crowd.set(watched, shots)
-        self._traffic.set(driven, shots)
-        self._blocks.room(2 * len(pictures))
-        for i, (one, middle, anchor) in enumerate(
-            zip(pictures, shots.middles, shots.anchors, strict=True)
-        ):
-            to_map: Floats = TO_TEXTURE
-            if one.stage.shadows is not None:
-                from_sun, to_map = one.stage.shadows.matrices(middle, anchor, one.stage.light)
-                self._blocks.put_sun(2 * i + 1, from_sun, one.stage.light)
-            self._blocks.put(
-                2 * i, camera_matrix(one.taken, anchor), to_map, one.taken, anchor, one.light
-            )
-        self._blocks.upload()
+        part = np.repeat(np.arange(len(parts)), [one.end - one.first for one in parts])
+        seats = np.array([scene.seat for scene in scenes])
+        self._crowd.set(watched, shots, part, seats)
+        self._traffic.set(driven, shots, part, seats)
+        self._arrange_blocks(pictures, shots)
+        self._arrange_layers(pictures, parts, seats)
         self._arrange_weather(pictures, shots)
         return shots
+
+    def _arrange_blocks(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
+        """Upload the blocks of the pictures and of their shadow passes."""
+        suns, to_maps = np.empty((2, len(pictures), 4, 4))
+        suns[:], to_maps[:] = _NO_SUN, TO_TEXTURE
+        views = shots.views()
+        for i, one in enumerate(pictures):
+            if (shadows := one.stage.shadows) is not None:
+                matrices = shadows.matrices(shots.lattice[i], one.stage.light)
+                suns[i], to_maps[i] = matrices
+                if isinstance(shadows, ShadowSeat):
+                    views[i, 0, 3] = shadows.layer
+        lights = np.array([one.rows for one in pictures])
+        self._blocks.set(shots.cameras(), suns, to_maps, views, lights)
+
+    def _arrange_layers(
+        self, pictures: Sequence[PictureOrder], parts: Sequence[Part], seats: NDArray[np.intp]
+    ) -> None:
+        """Upload the layers of the scenes whose pictures are drawn together."""
+        stages = [one.stage for one in pictures]
+        if not any(Variant.LAYERS in stage.variant for stage in stages):
+            return
+        maps = [
+            stage.shadows.layer if isinstance(stage.shadows, ShadowSeat) else 0 for stage in stages
+        ]
+        self._seats.set(self.street.seats, seats, np.array(maps))
+        for skies in {
+            id(stage.backdrop.skies): stage.backdrop.skies
+            for stage in stages
+            if isinstance(stage.backdrop, SkySeat)
+        }.values():
+            skies.set(seats, parts)
 
     def _arrange_weather(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Upload weather and lamps of the pictures that have these."""
         if all(one.stage.look is None for one in pictures):
             return
         self._weather.room(len(pictures))
-        for i, (one, anchor) in enumerate(zip(pictures, shots.anchors, strict=True)):
+        for i, (one, anchor) in enumerate(zip(pictures, shots.anchor, strict=True)):
             if (look := one.stage.look) is not None:
                 lamps = one.stage.scene.lamps(one.taken.view, one.street.vehicles)
                 people = casting_people(one.street.people, one.stage.surface, one.taken.view)
                 self._weather.put(i, look, lamps, people, anchor, one.street.tick)
         self._weather.upload()
 
-    def _cast(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
+    def _cast(self, pictures: Sequence[PictureOrder], parts: Sequence[Part], shots: Shots) -> None:
         """Update the shadow maps of all pictures."""
+        begun = set[int]()
         with casting(self._context):
-            for i, (one, middle, anchor) in enumerate(
-                zip(pictures, shots.middles, shots.anchors, strict=True)
-            ):
-                if one.stage.shadows is not None:
-                    self._blocks.bind(2 * i + 1)
-                    draw = partial(self._draw_pass, i, one.stage)
-                    one.stage.shadows.draw(middle, anchor, one.stage.light, draw)
+            for part in parts:
+                stage = pictures[part.first].stage
+                if isinstance(stage.shadows, ShadowSeat):
+                    maps = stage.shadows.maps
+                    self._cast_layered(pictures, part, shots, maps, id(maps) not in begun)
+                    begun.add(id(maps))
+                elif stage.shadows is not None:
+                    i = part.first
+                    self._blocks.bind(i, sun=True)
+                    draw = partial(self._draw_pass, part, stage)
+                    stage.shadows.draw(shots.lattice[i], stage.light, draw)
+
+    def _cast_layered(
+        self,
+        pictures: Sequence[PictureOrder],
+        part: Part,
+        shots: Shots,
+        maps: ShadowLayers,
+        begins: bool,
+    ) -> None:
+        """Update the shadow maps of a part. begins: it is the first of the batch with these maps"""
+        stage = pictures[part.first].stage
+        self._blocks.bind_all(sun=True)
+        wanted = {}
+        number = {}
+        for i in range(part.first, part.end):
+            shadows = pictures[i].stage.shadows
+            assert isinstance(shadows, ShadowSeat)
+            wanted[shadows.layer] = shots.lattice[i][1:], shadows.to_sun
+            number[shadows.layer] = i
+        changed = maps.begin_still(wanted)
+        if changed:
+            self._seats.bind(still=True)
+            for layer in changed:
+                one = Part(part.number, number[layer], number[layer] + 1)
+                self._draw_pass(one, stage, "still")
+        self._seats.bind()
+        maps.begin_moving(len(pictures), begins)
+        self._draw_pass(part, stage, "moving")
 
     def _together(
-        self, pictures: Sequence[PictureOrder], size: tuple[int, int]
-    ) -> Iterator[tuple[int, Sequence[PictureOrder]]]:
-        """Split pictures into those that are drawn together, with the number of the first.
-
-        These are pictures in a row with splats of the same cloud.
+        self, pictures: Sequence[PictureOrder], parts: Sequence[Part], size: tuple[int, int]
+    ) -> Iterator[Sequence[Part]]:
+        """Split parts into those that are drawn together: pictures in a row with splats of the same
+        cloud.
         """
         begun = 0
         most = self._pictures.most(size)
-        for i in range(1, len(pictures) + 1):
-            cloud = pictures[begun].stage.cloud
+        for i in range(1, len(parts) + 1):
+            cloud = pictures[parts[begun].first].stage.cloud
             alone = cloud is None or i - begun == most
-            if i == len(pictures) or alone or pictures[i].stage.cloud is not cloud:
-                yield begun, pictures[begun:i]
+            if i == len(parts) or alone or pictures[parts[i].first].stage.cloud is not cloud:
+                yield parts[begun:i]
                 begun = i
 
+    def _draw_layered(
+        self,
+        pictures: Sequence[PictureOrder],
+        part: Part,
+        size: tuple[int, int],
+        sink: Sink,
+        place: int,
+    ) -> None:
+        """Draw the pictures of a part as layers. place: number of the first of the batch"""
+        flush()  # people and shadow maps are on their way
+        stage = pictures[part.first].stage
+        target = self._layers.of(size, len(pictures))
+        self._blocks.bind_all()
+        self._seats.bind()
+        if isinstance(stage.shadows, ShadowSeat):
+            stage.shadows.maps.bind()
+        target.clear()
+        self._draw(part, stage, target)
+        sink.take_layers(target, part.first, part.end - part.first, place + part.first)
+
     def _draw_some(
-        self, start: int, pictures: Sequence[PictureOrder], target: Target
+        self, pictures: Sequence[PictureOrder], parts: Sequence[Part], target: Target
     ) -> Iterator[int]:
         """Draw pictures that belong together into the target; yield the number of each.
 
-        start: number of the first
+        parts: one for each
         """
-        cloud = pictures[0].stage.cloud
+        start = parts[0].first
+        first = pictures[start]
+        cloud = first.stage.cloud
         if cloud is None:
-            look = pictures[0].stage.look
+            look = first.stage.look
             drawn = target if look is None else self._air.target(target.size)
             drawn.clear()
-            self._draw(start, pictures[0], drawn)
+            self._bind(start, first)
+            self._draw(parts[0], first.stage, drawn)
             if isinstance(drawn, LinearTarget) and look is not None:
-                self._air.draw(look.variant, drawn, pictures[0].stage.backdrop.sky, target)
+                assert isinstance(first.stage.backdrop, Backdrop)
+                self._air.draw(look.variant, drawn, first.stage.backdrop.sky, target)
             yield start
             return
-        stack = self._pictures.stack(target.size, len(pictures))
+        stack = self._pictures.stack(target.size, len(parts))
         self._pictures.draw(
             cloud,
-            [one.taken for one in pictures],
+            [pictures[part.first].taken for part in parts],
             stack,
-            lambda nth, layers: self._draw_layers(start + nth, pictures[nth], layers),
+            lambda nth, layers: self._draw_layers(parts[nth], pictures[parts[nth].first], layers),
         )
-        for nth, picture in enumerate(pictures):
-            self._bind(start + nth, picture)
+        for nth, part in enumerate(parts):
+            picture = pictures[part.first]
+            self._bind(part.first, picture)
             target.clear()
             self._context.enable_only(moderngl.DEPTH_TEST)
             self._pictures.compose(nth, picture.light, stack, target)
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-            yield start + nth
+            yield part.first
 
     def _bind(self, i: int, picture: PictureOrder) -> None:
         """Bind a picture's scene block and shadow maps."""
-        if picture.stage.shadows is not None:
+        if isinstance(picture.stage.shadows, ShadowMaps):
             picture.stage.shadows.bind()
-        self._blocks.bind(2 * i)
+        self._blocks.bind(i)
         if picture.stage.look is not None:
             self._weather.bind(i)
             picture.stage.scene.bind_lamps()
 
-    def _draw(self, i: int, picture: PictureOrder, target: Frame) -> None:
-        """Draw a picture without splats."""
+    def _draw(self, part: Part, stage: Stage, target: Frame) -> None:
+        """Draw a part without splats. Its blocks and shadow maps must be bound."""
         gl = self._context
-        stage = picture.stage
-        self._bind(i, picture)
+        style = stage.scene.style
         gl.depth_func = "<"
-        self._draw_pass(i, stage, "colour")
+        self._draw_pass(part, stage, "colour")
         # Paint and the shade at feet change colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
         with target.only("colours"):
-            stage.scene.draw_paint()
+            self.street.draw_paint(part, style)
             gl.enable(moderngl.BLEND)
             gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
-            stage.scene.draw_decals()
+            self.street.draw_decals(part, style)
             gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
             gl.disable(moderngl.BLEND)
-            self._crowd.draw_contact(i)
+            self._crowd.draw_contact(style.variant & Variant.LAYERS, part.number)
         gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
-        stage.backdrop.draw()
+        self._draw_sky(part, stage)
         # Glass shows what is behind it; its labels and depth are its own.
         gl.enable(moderngl.BLEND)
         with target.only("colours"):
-            stage.scene.draw_panes(labels=False)
+            self.street.draw_panes(part, False, style)
         gl.disable(moderngl.BLEND)
         with target.only("labels"):
-            stage.scene.draw_panes(labels=True)
+            self.street.draw_panes(part, True, style)
 
-    def _draw_layers(self, i: int, picture: PictureOrder, layers: Layers) -> None:
+    def _draw_layers(self, part: Part, picture: PictureOrder, layers: Layers) -> None:
         """Draw objects before the sky, and the scan's mesh apart."""
         gl = self._context
-        self._bind(i, picture)
+        self._bind(part.first, picture)
         gl.depth_func = "<"
         layers.objects.use()
         layers.objects.clear(depth=1.0)
-        self._draw_pass(i, picture.stage, "colour")
+        self._draw_pass(part, picture.stage, "colour")
         gl.depth_func = "<="
-        picture.stage.backdrop.draw()
+        self._draw_sky(part, picture.stage)
         layers.mesh.use()
         layers.mesh.clear(depth=1.0)
         gl.depth_func = "<"
         gl.enable_only(moderngl.DEPTH_TEST)
-        picture.stage.scene.draw_mesh()
+        self.street.draw_mesh(part, picture.stage.scene.style)
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
-    def _draw_pass(self, i: int, stage: Stage, which: Pass) -> None:
-        self._crowd.draw(which, stage.variant, i)
-        stage.scene.draw(which)
-        self._traffic.draw(which, stage.variant, i)
+    def _draw_sky(self, part: Part, stage: Stage) -> None:
+        if isinstance(stage.backdrop, SkySeat):
+            stage.backdrop.skies.draw(part)
+        else:
+            stage.backdrop.draw()
+
+    def _draw_pass(self, part: Part, stage: Stage, which: Pass) -> None:
+        variant = stage.variant
+        self._crowd.draw(which, variant, part.number)
+        self.street.draw(part, which, stage.scene.style)
+        self._traffic.draw(which, variant, part.number)
 
 
 @lru_cache(maxsize=1)
@@ -294,15 +414,16 @@ def batch_drawing(context: moderngl.Context) -> BatchDrawing:
 def _batches(pictures: Sequence[PictureOrder]) -> Iterator[Sequence[PictureOrder]]:
     """Split the pictures, in order, into batches.
 
-    A batch holds at most _PEOPLE_MAX people, and no stage twice. A picture with more people is a
-    separate batch.
+    A batch holds at most PICTURES_MAX pictures and _PEOPLE_MAX people, and no stage twice. A
+    picture with more people is a separate batch.
     """
     begun = 0
     people = 0
     stages = set[int]()
     for i, one in enumerate(pictures):
         people += len(one.street.people)
-        if i > begun and (people > _PEOPLE_MAX or id(one.stage) in stages):
+        full = i - begun == PICTURES_MAX or people > _PEOPLE_MAX
+        if i > begun and (full or id(one.stage) in stages):
             yield pictures[begun:i]
             begun = i
             people = len(one.street.people)
@@ -310,3 +431,23 @@ def _batches(pictures: Sequence[PictureOrder]) -> Iterator[Sequence[PictureOrder
         stages.add(id(one.stage))
     if begun < len(pictures):
         yield pictures[begun:]
+
+
+def _parts(pictures: Sequence[PictureOrder]) -> list[Part]:
+    """Split a batch into parts: pictures in a row that are drawn as layers with the same programs
+    and textures, or single ones.
+    """
+    parts: list[Part] = []
+    last: object = None
+    for i, one in enumerate(pictures):
+        stage = one.stage
+        shared: object = None
+        if isinstance(stage.backdrop, SkySeat):
+            maps = stage.shadows.maps if isinstance(stage.shadows, ShadowSeat) else None
+            shared = stage.scene.style, id(maps), id(stage.backdrop.skies)
+        if shared is not None and shared == last:
+            parts[-1] = parts[-1]._replace(end=i + 1)
+        else:
+            parts.append(Part(len(parts), i, i + 1))
+        last = shared
+    return parts

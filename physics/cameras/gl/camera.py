@@ -10,6 +10,8 @@ import math
 from typing import Final, Self
 
 import moderngl
+import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
 from cosim.core.state import Frame, RobotState, Street
@@ -18,14 +20,14 @@ from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Light
 from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.camera_base import WorldCamera
-from physics.cameras.gl.backdrop import Backdrop
+from physics.cameras.gl.backdrop import Backdrop, SkySeat, sky_layers
 from physics.cameras.gl.batch import PictureOrder, Stage, batch_drawing
-from physics.cameras.gl.context import context
+from physics.cameras.gl.context import context, draws_layers
 from physics.cameras.gl.lighting import Lighting, lighting_of
+from physics.cameras.gl.readback import SinglePicture
 from physics.cameras.gl.scene import GlScene
-from physics.cameras.gl.shadows import ShadowMaps
+from physics.cameras.gl.shadows import ShadowMaps, ShadowSeat, shadow_layers
 from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
-from physics.cameras.gl.targets import Target
 from physics.cameras.gl.weather import Look, exposed, look_of, weathered_sky
 from physics.cameras.view import Shot, View
 from physics.dynamics.world import BulletWorld
@@ -67,9 +69,9 @@ class GlCamera(WorldCamera):
         self._light = lighting_of(self._sky, self._splats is None, contact, bright)
         self._season = season_of(light.day_of_year, light.latitude_deg)
         self._rain = weather.rain_mm_h > 0.0
-        self._lights: dict[tuple[int, int], Lighting] = {}
+        self._lights: dict[tuple[int, int], tuple[Lighting, NDArray[np.float32]]] = {}
         self._context: moderngl.Context | None = None
-        self._targets: dict[tuple[int, int], Target] = {}
+        self._targets: dict[tuple[int, int], SinglePicture] = {}
 
     def __enter__(self) -> Self:
         if self._context is None:
@@ -77,10 +79,17 @@ class GlCamera(WorldCamera):
             with context() as gl:
                 splats = self._splats
                 look = self._look
-                scene = GlScene(gl, batch_drawing(gl).forms, world, light, splats is not None, look)
-                shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
+                drawing = batch_drawing(gl)
+                plain = splats is None and look is None and not self._depth
+                layers = plain and draws_layers(gl)
+                scene = GlScene(gl, drawing.street, world, light, splats is not None, look, layers)
                 cloud = None if splats is None else splat_pictures(gl).cloud(splats)
-                sky = Backdrop(gl, self._sky, 0 if look is None else look.variant)
+                shadows = self._shadows(gl, layers) if light.shadows else None
+                sky: Backdrop | SkySeat
+                if layers:
+                    sky = SkySeat(sky_layers(gl, self._sky.radiance.shape[:2]), self._sky)
+                else:
+                    sky = Backdrop(gl, self._sky, 0 if look is None else look.variant)
                 clothes = self._season, self._rain
                 self._stage = Stage(
                     *(world.surface, world.robot, scene, shadows, sky, light, cloud),
@@ -88,6 +97,10 @@ class GlCamera(WorldCamera):
                 )
             self._context = gl
         return self
+
+    def _shadows(self, gl: moderngl.Context, layers: bool) -> ShadowMaps | ShadowSeat:
+        high = self._pinhole.height
+        return ShadowSeat(shadow_layers(gl, high), self._light) if layers else ShadowMaps(gl, high)
 
     def close(self) -> None:
         """Free the camera's resources; a second call does nothing."""
@@ -99,6 +112,7 @@ class GlCamera(WorldCamera):
                 self._stage.backdrop.release()
                 if self._stage.cloud is not None:
                     splat_pictures(self._context).release(self._stage.cloud)
+                self._lights.clear()
                 while self._targets:
                     self._targets.popitem()[1].release()
             self._context = None
@@ -109,35 +123,37 @@ class GlCamera(WorldCamera):
 
     def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
         picture = self._picture(taken, street, robot, body)
-        frames = []
         assert self._context is not None
         with self._context as gl:
             target = self._target(taken.size)
-
-            def read(_: int) -> None:
-                frames.append(Frame(*target.read(), target.read_depth() if self._depth else None))
-
-            batch_drawing(gl).draw([picture], target, read)
-        return frames[0]
+            batch_drawing(gl).draw([picture], target.target, target)
+            rgb, labels = target.end()
+            depth = target.target.read_depth() if self._depth else None
+        return Frame(rgb, labels, depth)
 
     def _picture(
         self, taken: Shot, street: Street, robot: RobotState | None, body: bool
     ) -> PictureOrder:
         if self._context is None:
             raise EngineError("the camera is not running: use GlCamera in a 'with' block")
-        return PictureOrder(self._stage, taken, self._light_of(taken.view), street, robot, body)
+        return PictureOrder(self._stage, taken, *self._light_of(taken.view), street, robot, body)
 
-    def _light_of(self, view: View) -> Lighting:
-        """Return the light of a view; its direction is rounded to a degree."""
+    def _light_of(self, view: View) -> tuple[Lighting, NDArray[np.float32]]:
+        """Return the light of a view, and its rows; its direction is rounded to a degree."""
         key = round(math.degrees(view.heading_rad)), round(math.degrees(view.half_angle_rad))
         if key not in self._lights:
-            self._lights[key] = self._light.seen(math.radians(key[0]), math.radians(key[1]))
+            light = self._light.seen(math.radians(key[0]), math.radians(key[1]))
+            rows = np.zeros((8, 4), dtype=np.float32)
+            rows[:7] = light.rows()
+            if isinstance(sky := self._stage.backdrop, SkySeat):
+                rows[7] = *sky.around, sky.layer
+            self._lights[key] = light, rows
         return self._lights[key]
 
-    def _target(self, size: tuple[int, int]) -> Target:
+    def _target(self, size: tuple[int, int]) -> SinglePicture:
         if size not in self._targets:
             assert self._context is not None
             if len(self._targets) == _TARGETS_MAX:
                 self._targets.pop(next(iter(self._targets))).release()
-            self._targets[size] = Target(self._context, size)
+            self._targets[size] = SinglePicture(self._context, size)
         return self._targets[size]

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import moderngl
-import numpy as np
-from numpy.typing import NDArray
 
 from physics.cameras.gl.shading import programs
 from physics.people.skeleton import INDEX
 
-_SPOT: Final = np.dtype([("person", "i4"), ("tall", "f4")])
+CORNERS: Final = 12
+"""Corners of the two spots of a person."""
 _VERTEX: Final = f"""
 layout(binding = 0) uniform sampler2D posed;
 in int person; in float tall;
@@ -46,46 +45,32 @@ class ContactShadows:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self._counts = np.zeros(0, dtype=np.intp)
-        self._room = 0
-        self._held: list[moderngl.Buffer | moderngl.VertexArray] = []
+        self._arrays: dict[int, moderngl.VertexArray] = {}
 
-    def set(
-        self, counts: NDArray[np.intp], person: NDArray[np.intp], tall: NDArray[np.floating]
+    def draw(
+        self,
+        instances: moderngl.Buffer,
+        commands: moderngl.Buffer,
+        first: int,
+        count: int,
+        layers: int,
     ) -> None:
-        """Upload spots, by picture.
+        """Draw `count` indirect draws, from `first` on. Labels and depth must be masked.
 
-        counts: (pictures,) people with spots
-        person: (N,) rows of the matrix texture
-        tall: (N,) size of the modelled man relative to their family
+        instances: as for `Skins`, until `release`
+        layers: `Variant.LAYERS`, or 0
         """
-        self._counts = counts
-        table = np.empty(len(person), dtype=_SPOT)
-        table["person"], table["tall"] = person, tall
-        commands = np.zeros((len(counts), 5), dtype=np.uint32)
-        commands[:, 0], commands[:, 1], commands[:, 3] = 12, counts, np.cumsum(counts) - counts
-        if max(table.nbytes, commands.nbytes) > self._room or not self._held:
-            self._grow(max(2 * table.nbytes, 2 * commands.nbytes, 1024))
-        self._spots.write(table)
-        self._commands.write(commands)
-
-    def draw(self, picture: int) -> None:
-        """Darken the ground of a picture. Labels and depth must be masked."""
-        if picture < len(self._counts) and self._counts[picture]:
-            self._context.enable(moderngl.BLEND)
-            self._array.render_indirect(self._commands, moderngl.TRIANGLES, 1, picture)
-            self._context.disable(moderngl.BLEND)
+        if layers not in self._arrays:
+            drawn = programs(self._context, _VERTEX, _FRAGMENT, layers).colour
+            layout = ("1i4 8x 1f4 1i4/i", "person", "tall", "seat")
+            content = [(instances, *(layout if layers else ("1i4 8x 1f4 4x/i", *layout[1:3])))]
+            self._arrays[layers] = self._context.vertex_array(drawn, content)
+        self._context.enable(moderngl.BLEND)
+        self._arrays[layers].render_indirect(commands, moderngl.TRIANGLES, count, first)
+        self._context.disable(moderngl.BLEND)
 
     def release(self) -> None:
-        for thing in self._held:
-            thing.release()
-        self._held = []
-
-    def _grow(self, room: int) -> None:
-        self.release()
-        self._room = room
-        self._spots, self._commands = (self._context.buffer(reserve=room) for _ in range(2))
-        drawn = programs(self._context, _VERTEX, _FRAGMENT, False).colour
-        content = [(self._spots, "1i4 1f4/i", "person", "tall")]
-        self._array = self._context.vertex_array(drawn, content)
-        self._held = [self._array, self._spots, self._commands]
+        """Free the arrays; they are made again when needed."""
+        for array in self._arrays.values():
+            array.release()
+        self._arrays = {}

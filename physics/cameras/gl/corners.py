@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from physics.ground.mesh import Mesh
 
-_CORNER: Final = np.dtype([("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4)])
+CORNER: Final = np.dtype([("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4)])
 """normal: bytes from -127 to 127, plus 127, for `unpacked` in shading's chunks.
 
 Each drawable defines the meaning of the fourth channels.
@@ -28,7 +28,7 @@ def corners(mesh: Mesh, colour: ArrayLike, fourth: int) -> CornerRows:
     colour: rgb from 0 to 1, (3,) or (V, 3)
     fourth: fourth channel of the colour
     """
-    rows = np.zeros(len(mesh.vertices), dtype=_CORNER)
+    rows = np.zeros(len(mesh.vertices), dtype=CORNER)
     rows["at"], rows["normal"][:, :3] = mesh.vertices, np.rint(127.0 * mesh.normals) + 127.0
     rows["colour"][:, :3], rows["colour"][:, 3] = np.rint(255.0 * np.asarray(colour)), fourth
     return rows

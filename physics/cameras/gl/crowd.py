@@ -4,15 +4,15 @@ Each batch uploads a few numbers per person: four baked frames with weights, pla
 A first small pass blends the frames into 25 joint matrices per person, stored in a texture.
 They are in metres from the picture's anchor; the vertex shaders of all passes skin with them.
 Bodies of all outfits and levels are in one buffer.
-A pass of a picture is one indirect draw for near people (four joints per vertex) and one for far
-people (two).
+A pass of a part of the batch is one indirect draw for near people (four joints per vertex) and one
+for far people (two).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import moderngl
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.core.state import People, PersonKind
 from physics.cameras.gl.cloth import MAPS_UNIT, map_texture
-from physics.cameras.gl.contact import ContactShadows
+from physics.cameras.gl.contact import CORNERS, ContactShadows
 from physics.cameras.gl.instances import runs_of
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shots import Shots
@@ -44,9 +44,11 @@ CAST_M: Final = 18.0
 _CONTACT_M: Final = 25.0
 """Maximum distance from the eye of people whose feet darken the ground, metres."""
 
-_INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4")])
+_INSTANCE: Final = np.dtype(
+    [("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4"), ("seat", "i4")]
+)
 """person: row of the matrix texture; dress: row of the colour texture; tall: of the modelled man
-relative to the family."""
+relative to the family; seat: of the scene."""
 _SIT: Final = list(GESTURES).index("sit")
 _SEAT_AHEAD_M: Final = SEATED_BACK_M - 0.1
 """Shift of people in wheelchairs, so that their hips are nearly at their place, metres."""
@@ -54,9 +56,11 @@ _TALL: Final = np.array([1.75 / skeleton(outfit.family).height_m for outfit in A
 _Dress = tuple[tuple[str, ...], bytes, bytes, int, Season, bool]
 _ROW: Final = 3 * len(ROWS)
 _CROWD_MIN: Final = 64
-_KEYS: Final = (LEVELS + 1) * len(ALL)
-"""Number of forms of a picture: outfits by level, plus one level for shadows."""
-_ENDS: Final = (0, MESH_LEVELS * len(ALL), LEVELS * len(ALL), _KEYS)
+_SHADOWS: Final = LEVELS * len(ALL)
+_FEET: Final = _SHADOWS + len(ALL)
+_KEYS: Final = _FEET + 1
+"""Number of forms of a part: outfits by level, plus one level for shadows, and feet."""
+_ENDS: Final = (0, MESH_LEVELS * len(ALL), _SHADOWS, _FEET, _KEYS)
 
 _POSE_VERTEX: Final = """#version 430
 void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
@@ -154,52 +158,65 @@ class CrowdDrawing:
         self._dressed: list[_Dress] = []
         self._grow(_CROWD_MIN)
 
-    def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
+    def set(
+        self,
+        watched: Sequence[PeopleSeen],
+        shots: Shots,
+        parts: NDArray[np.intp] | None = None,
+        seats: NDArray[np.intp] | None = None,
+    ) -> None:
         """Upload the people of all pictures, each on the ground.
+
+        parts: part of the batch of each picture, in order; each its own by default
+        seats: of the scenes of the pictures
 
         Binds a framebuffer, and texture units 0 and 1 until all pictures are drawn.
         """
         counts = [len(one.people) for one in watched]
-        self._split = [[0, 0, 0, 0]] * len(watched)
+        parts = np.arange(len(watched)) if parts is None else parts
+        seats = np.zeros(len(watched), dtype=np.intp) if seats is None else seats
+        self._split = [[0] * len(_ENDS)] * (int(parts[-1]) + 1)
         if not sum(counts):
             return
         whose = np.repeat(np.arange(len(watched)), counts)
-        xy = np.concatenate([one.people.xy for one in watched])
+        xy = _joined([one.people.xy for one in watched])
         casting = np.array([CAST_M if one.shadows else 0.0 for one in watched])
+        far_m = shots.far_m(whose, xy)
         seen = shots.sees(whose, xy, PERSON_MARGIN_M)
-        casts = shots.far_m(whose, xy) < casting[whose]
+        casts = far_m < casting[whose]
         rows = (seen | casts).nonzero()[0]
         if not len(rows):
             return
-        whose = whose[rows]
-        xy = xy[rows]
-        seen = seen[rows]
-        casts = casts[rows]
+        whose, xy, far_m = whose[rows], xy[rows], far_m[rows]
+        seen, casts = seen[rows], casts[rows]
         z_m = _heights(watched, whose, xy)
         worn = self._dress([one.dressed for one in watched])
-        outfit, girth, bodies = worn.outfit[rows], worn.girth[rows], worn.bodies[rows]
-        heading, strides, pace = (
-            np.concatenate([getattr(one.people, name) for one in watched])[rows]
-            for name in ("heading", "strides", "pace")
-        )
-        loops = np.concatenate([loops_of(one.people.doing) for one in watched])[rows]
+        outfit, bodies = worn.outfit[rows], worn.bodies[rows]
+        heading = _joined([one.people.heading for one in watched])[rows]
+        strides = _joined([one.people.strides for one in watched])[rows]
+        pace = _joined([one.people.pace for one in watched])[rows]
+        loops = _joined([loops_of(one.people.doing) for one in watched])[rows]
+        cos, sin = np.cos(heading), np.sin(heading)
         sits = worn.sits[rows]
         if sits.any():
             loops = np.where(sits, _SIT, loops)
             pace = np.where(sits, 0.0, pace)
-            ahead = np.column_stack([np.cos(heading), np.sin(heading)])
-            xy = xy + (sits * _SEAT_AHEAD_M)[:, None] * ahead
+            xy = xy + (sits * _SEAT_AHEAD_M)[:, None] * np.column_stack([cos, sin])
+            far_m = shots.far_m(whose, xy)
         time_s = np.array([one.time_s for one in watched])[whose]
         posed = poses_of(bodies, pace, strides, loops, time_s, self._clips)
         told = np.zeros((len(rows), 4, 4), dtype=np.float32)
         told[:, 0], told[:, 1] = posed.rows, posed.weights
         told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = xy - shots.anchor[whose], z_m, posed.scale
-        told[:, 3, 0], told[:, 3, 1] = np.cos(heading), np.sin(heading)
+        told[:, 3, 0], told[:, 3, 1] = cos, sin
         self._told.write(told, viewport=(0, 0, 4, len(rows)))
-        self._set_draws(whose, outfit, levels(shots, whose, xy, z_m), seen, casts, girth, rows)
-        near = (seen & (shots.far_m(whose, xy) < _CONTACT_M)).nonzero()[0]
-        on_picture = np.bincount(whose[near], minlength=len(watched))
-        self._contact.set(on_picture, near, _TALL[outfit[near]])
+        table = np.empty(len(rows), dtype=_INSTANCE)
+        table["person"], table["dress"] = np.arange(len(rows)), rows
+        table["girth"], table["tall"] = worn.girth[rows], _TALL[outfit]
+        table["seat"] = seats[whose]
+        level = levels(shots, whose, far_m, z_m)
+        near = seen & (far_m < _CONTACT_M)
+        self._set_draws(parts[whose], outfit, level, (seen, casts, near), table)
         self._posed.use()
         self._posed.viewport = (0, 0, _ROW, len(rows))
         self._context.enable_only(moderngl.NOTHING)
@@ -224,64 +241,64 @@ class CrowdDrawing:
             self._dressed = who
         return self._worn
 
-    def draw(self, stage: Pass, shadows: int, picture: int = 0) -> None:
-        """Draw the people of a picture; shadow maps of moving objects use the coarsest level.
+    def draw(self, stage: Pass, shadows: int, part: int = 0) -> None:
+        """Draw the people of a part; shadow maps of moving objects use the coarsest level.
 
         shadows: people are shaded by shadow maps
         """
-        near, far, cast, end = self._split[picture]
-        if stage == "still" or near == end:
+        near, far, cast, feet, _ = self._split[part]
+        if stage == "still" or near == feet:
             return
         held = self._instances, self._commands
         self._maps.use(MAPS_UNIT)
         if stage == "moving":
-            self._far.draw(stage, shadows, *held, end - cast, cast)
+            self._far.draw(stage, shadows, *held, feet - cast, cast)
         else:
             self._near.draw(stage, shadows, *held, far - near, near)
             self._far.draw(stage, shadows, *held, cast - far, far)
 
-    def draw_contact(self, picture: int = 0) -> None:
-        """Darken the ground under the feet of the people of a picture, without labels."""
-        if self._split[picture][3]:
-            self._contact.draw(picture)
+    def draw_contact(self, layers: int, part: int = 0) -> None:
+        """Darken the ground under the feet of the people of a part, without labels."""
+        *_, feet, end = self._split[part]
+        if feet != end:
+            self._contact.draw(self._instances, self._commands, feet, end - feet, layers)
 
     def release(self) -> None:
-        self._contact.release()
-        self._near.release()
-        self._far.release()
         self._release_room()
         for thing in (self._baked, self._maps, self._everywhere, self._pose):
             thing.release()
 
     def _set_draws(
         self,
-        whose: NDArray[np.intp],
+        part: NDArray[np.intp],
         outfit: NDArray[np.intp],
         level: NDArray[np.intp],
-        seen: NDArray[np.bool_],
-        casts: NDArray[np.bool_],
-        girth: NDArray[np.float32],
-        dress: NDArray[np.intp],
+        shown: tuple[NDArray[np.bool_], ...],
+        table: NDArray[np.void],
     ) -> None:
         """Fill the buffers of instances and draws.
 
-        The order is by picture: near levels, far levels, then shadows as an additional last level.
+        The order is by part: near levels, far levels, then shadows and feet as additional last
+        levels.
+        shown: masks of the people in view, of those who cast shadows, and of those with visible
+            feet
+        table: rows of the people
         """
-        in_view, casting = seen.nonzero()[0], casts.nonzero()[0]
-        people = np.concatenate([in_view, casting])
-        levels_ = np.concatenate([level[in_view], np.full(len(casting), LEVELS)])
+        in_view, casting, near = (mask.nonzero()[0] for mask in shown)
+        people = np.concatenate([in_view, casting, near])
+        form_ = part * _KEYS
+        key = form_ + outfit
+        body = key[in_view] + level[in_view] * len(ALL)
         order, form, commands = runs_of(
-            (whose[people] * (LEVELS + 1) + levels_) * len(ALL) + outfit[people]
+            np.concatenate([body, key[casting] + _SHADOWS, form_[near] + _FEET])
         )
-        people = people[order]
         start = self._start(form % _KEYS)
         commands[:, 0], commands[:, 2:4] = start[:, 0], start[:, 1:]
+        feet = form % _KEYS == _FEET
+        commands[feet, 3] = commands[feet, 4]  # these draws have no indices
         ends = np.arange(len(self._split))[:, None] * _KEYS + np.array(_ENDS)
         self._split = form.searchsorted(ends).tolist()
-        table = np.empty(len(people), dtype=_INSTANCE)
-        table["person"], table["dress"], table["girth"] = people, dress[people], girth[people]
-        table["tall"] = _TALL[outfit[people]]
-        self._instances.write(table)
+        self._instances.write(table[people[order]])
         self._commands.write(commands)
 
     def _start(self, form: NDArray[np.intp]) -> NDArray[np.uint32]:
@@ -292,7 +309,9 @@ class CrowdDrawing:
         if not self._known[form].all():
             for one in dict.fromkeys(form[~self._known[form]].tolist()):
                 level, outfit = divmod(one, len(ALL))
-                if level == LEVELS:
+                if one == _FEET:
+                    self._starts[one] = CORNERS, 0, 0
+                elif level == LEVELS:
                     self._starts[one] = self._start(np.array([one - len(ALL)]))
                 else:
                     self._starts[one] = (self._near if level < MESH_LEVELS else self._far).start(
@@ -309,8 +328,8 @@ class CrowdDrawing:
         self._dyed = _texture(self._context, (len(COATS), room), 4, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
         self._posed = self._context.framebuffer([self._matrices])
-        self._instances = self._context.buffer(reserve=2 * room * _INSTANCE.itemsize)
-        self._commands = self._context.buffer(reserve=2 * room * 20)
+        self._instances = self._context.buffer(reserve=3 * room * _INSTANCE.itemsize)
+        self._commands = self._context.buffer(reserve=3 * room * 20)
         self._held = [
             self._posed,
             self._told,
@@ -323,9 +342,15 @@ class CrowdDrawing:
     def _release_room(self) -> None:
         self._near.release()
         self._far.release()
+        self._contact.release()
         for thing in self._held:
             thing.release()
         self._held = []
+
+
+def _joined(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Concatenate arrays of pictures."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats) -> Floats:
@@ -360,13 +385,13 @@ def _worn(
     )
 
 
-def levels(shots: Shots, whose: NDArray[np.intp], xy: Floats, z_m: Floats) -> NDArray[np.intp]:
+def levels(shots: Shots, whose: NDArray[np.intp], far_m: Floats, z_m: Floats) -> NDArray[np.intp]:
     """Return (N,) levels of detail of people by their height in the pictures.
 
-    xy: (N, 2) positions
+    far_m: (N,) horizontal distances from the eyes
     z_m: (N,) ground heights
     """
-    return np.asarray(np.searchsorted(-np.array(LEVEL_PX), -shots.tall_px(whose, xy, z_m)))
+    return np.asarray(np.searchsorted(-np.array(LEVEL_PX), -shots.tall_px(whose, far_m, z_m)))
 
 
 def _texture(

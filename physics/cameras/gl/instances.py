@@ -14,6 +14,7 @@ pane       clear glass, blended over the finished picture; it casts no shadow
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from itertools import pairwise
 from typing import Final, Literal
 
 import moderngl
@@ -21,7 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from physics.cameras.gl.corners import LAYOUT, CornerRows, corners, joined_corners
-from physics.cameras.gl.shading import Pass, Programs, programs
+from physics.cameras.gl.pool import NO_DRAWS, Pool
+from physics.cameras.gl.shading import Programs, programs
 from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.ground.mesh import Part
 from physics.textures.walls import CUT_OUT, PANE
@@ -30,6 +32,9 @@ INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 
 """at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, with the label as fourth
 channel.
 """
+
+POOLED: Final = np.dtype([*INSTANCE.descr, ("seat", "i4")])
+"""Row of INSTANCE in a pool, with the seat of its scene."""
 
 _OWN = 255
 _PAINT = 0
@@ -266,22 +271,24 @@ def _material_of(part: Part) -> Material:
 
 
 class Things:
-    """Set of instances in runs of one form each, replaced as a whole. One call draws all runs."""
+    """Set of instances in runs of one form each, replaced as a whole.
 
-    def __init__(self, context: moderngl.Context, forms: Forms) -> None:
-        self._context = context
+    rows: pool of POOLED rows, shared with other sets
+    draws: of each material, by part
+    """
+
+    def __init__(self, forms: Forms, rows: Pool) -> None:
         self._forms = forms
-        self._bound = -1
+        self._rows = rows
+        self._start = 0
         self._room = 0
-        self._instances: moderngl.Buffer | None = None
-        self._commands: moderngl.Buffer | None = None
-        self._arrays: dict[tuple[Material, int], list[moderngl.VertexArray]] = {}
-        self._ends: dict[Material, list[int]] = {material: [0, 0] for material in MATERIALS}
+        self.draws = _no_draws(1)
 
     def set(
         self,
         form: NDArray[np.intp],
         rows: CornerRows,
+        seat: int | NDArray[np.intp],
         part: NDArray[np.intp] | None = None,
         parts: int = 1,
     ) -> None:
@@ -289,88 +296,78 @@ class Things:
 
         form: (N,) numbers of forms
         rows: (N,) rows of INSTANCE
+        seat: of their scene, or (N,)
         part: (N,) index of the part, below `parts`
         """
-        self._ends = {material: [0] * (parts + 1) for material in MATERIALS}
+        self.clear(parts)
         if not len(form):
             return
         rank = self._forms.rank
         kinds = len(self._forms.rank)
         order, key, commands = runs_of(rank[form] if part is None else rank[form] + kinds * part)
         draws = self._forms.draws[form[order[commands[:, 4]]]]
+        if len(form) > self._room:
+            self.release()
+            self._room = 2 * len(form)
+            self._start = self._rows.take(self._room)
+        commands[:, 4] += self._start
         limits = kinds * np.arange(parts + 1)
-        runs: list[NDArray[np.uint32]] = []
         for k, material in enumerate(MATERIALS):
             drawn = draws[:, k, 0] > 0
+            if not drawn.any():
+                continue
             own = commands[drawn]
             own[:, 0], own[:, 2:4] = draws[drawn, k, 0], draws[drawn, k, 1:]
-            ends = sum(map(len, runs)) + key[drawn].searchsorted(limits)
-            self._ends[material] = ends.tolist()
-            runs.append(own)
-        if len(form) > self._room:
-            self._make_room(2 * len(form))
-        assert self._instances is not None and self._commands is not None
-        self._instances.write(rows[order])
-        self._commands.write(np.concatenate(runs))
+            ends = key[drawn].searchsorted(limits).tolist() if parts > 1 else [0, len(own)]
+            self.draws[material] = [own[i:j] for i, j in pairwise(ends)]
+        pooled = np.empty((len(form), POOLED.itemsize), dtype=np.uint8)
+        pooled[:, : INSTANCE.itemsize] = rows[order].view(np.uint8).reshape(len(form), -1)
+        seats = pooled.view(POOLED)["seat"][:, 0]
+        seats[:] = seat if isinstance(seat, int) else seat[order]
+        self._rows.write(self._start, pooled)
 
-    def draw(self, stage: Pass, shadows: int, part: int = 0) -> None:
-        """Draw solid and cut-out surfaces of one part. shadows: shaded by shadow maps."""
-        self._draw("solid", stage != "colour", shadows, part)
-        self._draw("cut-out", stage != "colour", shadows, part)
+    def clear(self, parts: int = 1) -> None:
+        """Remove all instances."""
+        self.draws = _no_draws(parts)
 
-    def draw_panes(self, labels: bool, shadows: int) -> None:
-        """Draw the panes of the first part over the picture: their colours, or their labels."""
-        self._draw("pane", labels, shadows, 0)
+    def release(self) -> None:
+        self._rows.give(self._start, self._room)
+        self._room = 0
 
-    def _draw(self, material: Material, second: bool, shadows: int, part: int) -> None:
-        """Draw a material with its first or second program."""
-        first = self._ends[material][part]
-        count = self._ends[material][part + 1] - first
-        if count:
-            if self._bound != self._forms.version or (material, shadows) not in self._arrays:
-                self._bind(material, shadows)
-            assert self._commands is not None
-            array = self._arrays[material, shadows][second]
-            array.render_indirect(self._commands, moderngl.TRIANGLES, count=count, first=first)
 
-    def _make_room(self, count: int) -> None:
-        self._drop()
-        self._room = max(64, count)
-        self._instances = self._context.buffer(reserve=self._room * INSTANCE.itemsize, dynamic=True)
-        size = self._room * len(MATERIALS) * 20
-        self._commands = self._context.buffer(reserve=size, dynamic=True)
+def _no_draws(parts: int) -> dict[Material, list[NDArray[np.uint32]]]:
+    return {material: [NO_DRAWS] * parts for material in MATERIALS}
 
-    def _bind(self, material: Material, shadows: int) -> None:
-        at_corners, triangles = self._forms.buffers()
-        if self._bound != self._forms.version:
-            self._unbind()
-        content = [
-            (at_corners, *LAYOUT),
-            (self._instances, "3f 4f 4f1 /i", "thing_at", "thing_turn", "thing_paint"),
-        ]
-        self._arrays[material, shadows] = [
-            self._context.vertex_array(program, content, triangles, skip_errors=True)
-            for program in self._forms.programs(material, shadows)
-        ]
-        self._bound = self._forms.version
 
-    def _unbind(self) -> None:
+class ThingArrays:
+    """Vertex arrays that draw instances of a registry's forms from a pool of POOLED rows."""
+
+    def __init__(self, context: moderngl.Context, forms: Forms, rows: Pool) -> None:
+        self._context = context
+        self._forms = forms
+        self._rows = rows
+        self._bound = (-1, -1)
+        self._arrays: dict[tuple[Material, int], list[moderngl.VertexArray]] = {}
+
+    def of(self, material: Material, second: bool, variant: int) -> moderngl.VertexArray:
+        """Return the array of a material with its first or second program."""
+        if self._bound != (self._forms.version, self._rows.version):
+            self.release()
+            self._bound = self._forms.version, self._rows.version
+        if (material, variant) not in self._arrays:
+            at_corners, triangles = self._forms.buffers()
+            names = ("thing_at", "thing_turn", "thing_paint", "seat")
+            content = [(at_corners, *LAYOUT), (self._rows.buffer, "3f 4f 4f1 1i4/i", *names)]
+            self._arrays[material, variant] = [
+                self._context.vertex_array(program, content, triangles, skip_errors=True)
+                for program in self._forms.programs(material, variant)
+            ]
+        return self._arrays[material, variant][second]
+
+    def release(self) -> None:
         for array in (array for both in self._arrays.values() for array in both):
             array.release()
         self._arrays = {}
-        self._bound = -1
-
-    def _drop(self) -> None:
-        self._unbind()
-        for thing in (self._instances, self._commands):
-            if thing is not None:
-                thing.release()
-        self._instances = self._commands = None
-
-    def release(self) -> None:
-        self._drop()
-        self._room = 0
-        self._ends = {material: [0, 0] for material in MATERIALS}
 
 
 def runs_of(key: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.uint32]]:
@@ -407,7 +404,7 @@ def turned_instances(
     pitch: ArrayLike,
     heading: ArrayLike,
     paint: ArrayLike,
-    label: int,
+    label: int | NDArray[np.intp],
 ) -> CornerRows:
     """Return rows of INSTANCE, rotated about x, then y, then z.
 

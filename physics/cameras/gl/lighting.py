@@ -115,13 +115,18 @@ def _horizon(sky: Sky) -> Floats:
     return np.asarray(np.minimum(around, limit))
 
 
+def sky_texels(radiance: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Return the texels of an equirectangular picture (H, W, 3)."""
+    return np.ascontiguousarray(np.minimum(radiance, 6.0e4).astype(np.float16))
+
+
 def sky_texture(context: moderngl.Context, radiance: NDArray[np.float32]) -> moderngl.Texture:
     """Upload an equirectangular picture (H, W, 3) as a texture."""
     rows, columns, _ = radiance.shape
     texture = context.texture(
         (columns, rows),
         3,
-        np.minimum(radiance, 6.0e4).astype(np.float16).tobytes(),
+        sky_texels(radiance).tobytes(),
         dtype="f2",
         alignment=2,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import moderngl
 import numpy as np
@@ -12,15 +12,20 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import Frame, Street
 from cosim.spec.scenario import Light
-from physics.cameras.gl.context import context
+from physics.cameras.gl.context import context, draws_layers
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
+from physics.cameras.gl.layers import LayerTarget
 from physics.cameras.gl.lighting import lighting_of
-from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
+from physics.cameras.gl.readback import Readback
+from physics.cameras.gl.shading import SceneBlocks, SeatMaps
 from physics.cameras.gl.shots import Shots
-from physics.cameras.gl.targets import Readback, Target
+from physics.cameras.gl.targets import Target
+from physics.cameras.gl.variants import Variant
 from physics.cameras.sky import sky_of
 from physics.cameras.view import shot
 
+_FIRST: Final = np.zeros(1, dtype=np.intp)
+_NO_SUN: Final = np.eye(4)[None]
 EYE_M = 0.75
 """Height of the eye over flat ground, metres."""
 
@@ -34,7 +39,8 @@ class PeopleAlone:
     def __init__(self, size: tuple[int, int], fov_deg: float) -> None:
         self._size = size
         self._fov_deg = fov_deg
-        self._light = lighting_of(sky_of(Light(shadows=False), 0))
+        self._rows = np.zeros((1, 8, 4), dtype=np.float32)
+        self._rows[0, :7] = lighting_of(sky_of(Light(shadows=False), 0)).rows()
 
     def __enter__(self) -> Self:
         with context() as gl:
@@ -44,6 +50,9 @@ class PeopleAlone:
                 Target(gl, self._size),
             )
             self._readback = Readback(gl, self._target)
+            self._layers = LayerTarget(gl, self._size)
+            self._seats = SeatMaps(gl)
+            self._variant = Variant.LAYERS if draws_layers(gl) else Variant.NONE
         self._context = gl
         return self
 
@@ -54,7 +63,10 @@ class PeopleAlone:
         trace: TracebackType | None,
     ) -> None:
         with self._context:
-            for thing in (self._crowd, self._blocks, self._target, self._readback):
+            for thing in (
+                *(self._crowd, self._blocks, self._target, self._readback),
+                *(self._layers, self._seats),
+            ):
                 thing.release()
 
     def render(self, pose: Pose, street: Street) -> Frame:
@@ -68,22 +80,34 @@ class PeopleAlone:
         eye = np.append(pose.xy, EYE_M)
         taken = shot(eye, eye + np.append(ahead, -0.1), self._size, self._fov_deg)
         shots = Shots([taken])
-        anchor = anchor_of(taken.eye_m)
         with self._context as gl:
             self._crowd.set(
                 [PeopleSeen(street.people, Clock().time_s(street.tick), _flat, shadows=False)],
                 shots,
             )
-            self._blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
-            self._blocks.upload()
-            self._blocks.bind()
-            self._target.clear()
+            self._blocks.set(shots.cameras(), _NO_SUN, _NO_SUN, shots.views(), self._rows)
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             gl.front_face = "cw"
             gl.depth_func = "<"
-            self._crowd.draw("colour", shadows=False)
             self._readback.begin()
-            self._readback.copy()
+            if self._variant:
+                self._draw_layer()
+            else:
+                self._blocks.bind()
+                self._target.clear()
+                self._crowd.draw("colour", Variant.NONE)
+                self._readback.take()
+            self._readback.send()
+
+    def _draw_layer(self) -> None:
+        """Draw the picture as a layer, as on a graphics card."""
+        self._layers.room(1)
+        self._blocks.bind_all()
+        self._seats.set(1, _FIRST, _FIRST)
+        self._seats.bind()
+        self._layers.clear()
+        self._crowd.draw("colour", self._variant)
+        self._readback.take_layers(self._layers, 0, 1, 0)
 
     def end(self) -> Frame:
         """Return the oldest pending picture."""

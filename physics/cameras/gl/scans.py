@@ -13,8 +13,8 @@ import moderngl
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
-from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
+from physics.cameras.gl.corners import corners, joined_corners
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileRows
 from physics.street.surface import ScannedPatch
 
 SHADE: Final = 0.7
@@ -53,11 +53,6 @@ def scan_shaders(
     """Create the program of all scanned triangles. normals: draw these in place of colours."""
     fragment = _NORMALS if normals else _FRAGMENT
     return SurfaceShaders(context, surfaces, _VERTEX, fragment, shadows)
-
-
-def scan_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
-    """Create the layer for rows of `scan_rows`."""
-    return TileLayer(context, shaders, LAYOUT)
 
 
 def scan_rows(patches: Sequence[ScannedPatch], middle: Floats) -> TileRows | None:

@@ -8,9 +8,10 @@ Cell and sector depend on the view alone, and so does the picture.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from typing import Final
 
 import moderngl
@@ -24,23 +25,26 @@ from cosim.core.state import LABELS, Street, Vehicles
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import Barrier
 from physics.cameras.gl.corners import CornerRows
-from physics.cameras.gl.instances import INSTANCE, Forms, Things, instances
+from physics.cameras.gl.instances import INSTANCE, MATERIALS, ThingArrays, Things, instances
 from physics.cameras.gl.lamps import Lamps, WallMap, lamp_heads, lamps_of, nearest
 from physics.cameras.gl.lighting import Lighting
-from physics.cameras.gl.scans import scan_layer, scan_rows, scan_shaders
-from physics.cameras.gl.shading import Pass
-from physics.cameras.gl.shadows import STEP_M
-from physics.cameras.gl.surfaces import TileRows, surfaces
-from physics.cameras.gl.tiles import (
-    DECALS_M,
-    decal_rows,
-    decal_shaders,
-    ground_layer,
-    ground_rows,
-    tile_shaders,
+from physics.cameras.gl.pool import NO_DRAWS, Piece
+from physics.cameras.gl.scans import scan_rows
+from physics.cameras.gl.shots import CELL_M, STEP_M, Lattice
+from physics.cameras.gl.street import (
+    STEPS,
+    TILE_KINDS,
+    Step,
+    StreetDrawing,
+    ThingStep,
+    TileKind,
+    TileStep,
+    style_of,
 )
+from physics.cameras.gl.surfaces import surfaces
+from physics.cameras.gl.tiles import DECALS_M, decal_rows, ground_rows
 from physics.cameras.gl.variants import Variant
-from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
+from physics.cameras.gl.walls import wall_rows
 from physics.cameras.gl.weather import Look
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.dynamics.world import BulletWorld
@@ -56,12 +60,12 @@ from physics.street import props
 from physics.street.furniture import KINDS, parts_of
 from physics.street.surface import grounded_obstacles
 
-_CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
-_SLACK_M: Final = _CELL_M * math.sqrt(0.5)
+_SLACK_M: Final = CELL_M * math.sqrt(0.5)
 """Maximum distance of an eye from the middle of its cell, metres."""
 _NEAR_M: Final = 12.0
 """Distance within which objects have all their details, metres."""
+_VERSIONS: Final = count(1)
 _DETAILS: Final[tuple[Detail, ...]] = ("near", "far")
 _TILE_REACH_M: Final = 34.0
 """Maximum distance of a tile's content from its middle, including objects over its border,
@@ -75,9 +79,10 @@ _NOTHING: Final[_Placed] = (np.zeros(0, dtype=np.intp), np.zeros(0, dtype=INSTAN
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """Content of a tile; its rows are relative to its middle.
+    """Content of a tile.
 
-    middle: (2,) world metres
+    middle: (2,) world metres, which its meshes and objects are relative to
+    meshes: by layer of the ground
     far: (N,) forms of its objects at a distance
     lamps: (N, 3) glasses of street lamps, world metres
     thing_xy: (N, 2) positions of its objects
@@ -85,11 +90,7 @@ class _Tile:
     """
 
     middle: Floats
-    ground: TileRows | None
-    paint: TileRows | None
-    decals: TileRows | None
-    walls: TileRows | None
-    scan: TileRows | None
+    meshes: Mapping[TileKind, Piece]
     lamps: Floats
     things: _Placed
     far: NDArray[np.intp]
@@ -110,46 +111,48 @@ class GlScene:
     """Static street around a view, as a function of view and signals alone.
 
     look: weather and night; None by a clear day
-    splats: the scan's mesh is not in the picture, but drawn apart by `draw_mesh`
+    splats: the scan's mesh is not in the picture, but drawn apart
+    layers: pictures are drawn as layers, together with those of other scenes
+
+    seat: number of the scene in the shared buffers
+    draws: of each of STEPS, for `StreetDrawing`
+    version: unique number of `draws`
     """
 
     def __init__(
         self,
         context: moderngl.Context,
-        forms: Forms,
+        street: StreetDrawing,
         world: BulletWorld,
         light: Lighting,
         splats: bool = False,
         look: Look | None = None,
+        layers: bool = False,
     ) -> None:
-        self._splats = splats
         self._look = look
         self._surface = world.surface
-        self._forms = forms
+        self._street = street
+        self._forms = street.forms
         self._shadows = light.shadows
-        self._variant = Variant(light.shadows) if look is None else look.variant
         self._surfaces = surfaces(context)
-        ground = tile_shaders(context, self._surfaces, self._variant)
-        walls = wall_shaders(context, self._surfaces, self._variant, light.lamps > 0.0)
-        self._ground = ground_layer(context, ground)
-        self._paint = ground_layer(context, ground)
-        self._decals = ground_layer(context, decal_shaders(context, self._surfaces))
-        self._walls = wall_layer(context, walls)
-        self._scan = scan_layer(
-            context, scan_shaders(context, self._surfaces, light.shadows and not splats, splats)
-        )
-        self._seen = Things(context, forms)
-        self._standing = Things(context, forms)
-        self._fence_forms = forms.apart()  # the number of sizes is unlimited
-        self._fenced = Things(context, self._fence_forms)
+        self.seat = street.seat()
+        self.style = style_of(light, splats, look, layers)
+        self.draws = [NO_DRAWS] * len(STEPS)
+        self.version = 0
+        self._changed()
+        self._seen, self._standing = (Things(self._forms, street.things) for _ in range(2))
+        self._fence_forms = self._forms.apart()  # the number of sizes is unlimited
+        self._fenced = Things(self._fence_forms, street.things)
+        self.fence_arrays = ThingArrays(context, self._fence_forms, street.things)
         self._walls_map = WallMap(context, world.surface)
+        self._places = (0, 0)
         self._tiles: dict[Key, _Tile] = {}
         self._keys: list[Key] = []
         self._cell: tuple[int, int] | None = None
-        self._placed = False
+        self._placed_for: tuple[float, ...] | None = None
         self._anchor: Floats = np.zeros(2)
         self._seen_for: tuple[tuple[int, int], int, int | None] | None = None
-        self._still_for: tuple[float, ...] | None = None
+        self._still_for: tuple[tuple[float, ...], tuple[float, ...]] | None = None
         self._lit_for: list[bool | None] = []
         self._lit: _Placed = _NOTHING
         self._fences = [self._fence(barrier) for barrier in world.barriers]
@@ -157,24 +160,23 @@ class GlScene:
         self._obstacles = self._stood(world.obstacles)
         self._obstacle_xy = np.array([(o.x_m, o.y_m) for o in world.obstacles]).reshape(-1, 2)
 
-    def arrange(self, view: View, middle: Floats, anchor: Floats, street: Street) -> None:
-        """Prepare all static objects that a picture can show.
-
-        middle: (3,) of the space with shadows
-        """
-        cell = round(view.eye_m[0] / _CELL_M), round(view.eye_m[1] / _CELL_M)
+    def arrange(self, view: View, lattice: Lattice, street: Street) -> None:
+        """Prepare all static objects that a picture can show."""
+        cell, anchor, middle = lattice.cell, lattice.anchor, lattice.middle
         if cell != self._cell:
             self._stream(cell)
             self._cell = cell
-        if not self._placed or (anchor != self._anchor).any():
-            self._place(anchor)
+        if anchor != self._placed_for:
+            self._place(np.array(anchor))
+            self._placed_for = anchor
         self._light(street)
         seen_for = cell, *_sector(view)
         if seen_for != self._seen_for:
             self._choose(*seen_for)
             self._seen_for = seen_for
-        if self._shadows:
-            self._stand(middle, anchor)
+        if self._shadows and (middle, anchor) != self._still_for:
+            self._stand(middle, np.array(anchor))
+            self._still_for = middle, anchor
 
     def lamps(self, view: View, vehicles: Vehicles) -> Lamps | None:
         """Return the lamps of a view after `arrange`, and prepare their wall map; None by day."""
@@ -188,75 +190,55 @@ class GlScene:
         """Bind the wall map of the last view's lamps."""
         self._walls_map.bind()
 
-    def draw(self, stage: Pass) -> None:
-        """Draw the arranged street: small objects first, then walls and ground from near to far."""
-        if stage == "moving":
-            return
-        (self._seen if stage == "colour" else self._standing).draw(stage, self._variant)
-        self._fenced.draw(stage, self._variant)
-        if stage == "colour":
-            self._walls.draw_seen()
-        else:
-            self._walls.draw(stage)
-        self._ground.draw(stage)
-        if not self._splats:
-            self._scan.draw(stage)
-
-    def draw_mesh(self) -> None:
-        """Draw normals and labels of the scan's mesh."""
-        self._scan.draw("colour")
-
-    def draw_paint(self) -> None:
-        """Draw road paint after the ground, without labels and depth."""
-        self._paint.draw("colour")
-
-    def draw_decals(self) -> None:
-        """Draw pictures on the ground, unless snow covers it; the blending multiplies colours."""
-        if not self._variant & Variant.SNOW:
-            self._decals.draw("colour")
-
-    def draw_panes(self, labels: bool) -> None:
-        """Draw clear glass over the finished picture: its colours, or its labels and depth."""
-        self._seen.draw_panes(labels, self._variant & ~Variant.SHADOWS)
-
     def release(self) -> None:
-        for held in (
-            self._ground,
-            self._paint,
-            self._decals,
-            self._walls,
-            self._scan,
-            self._seen,
-            self._standing,
-            self._fenced,
-        ):
-            held.release()
+        for things in (self._seen, self._standing, self._fenced):
+            things.release()
+        self.fence_arrays.release()
         self._fence_forms.release()
         self._walls_map.release()
+        self._street.places.give(*self._places)
+        for tile in self._tiles.values():
+            self._drop(tile)
         self._tiles.clear()
+        self._street.leave(self.seat)
+
+    def _drop(self, tile: _Tile) -> None:
+        for kind, piece in tile.meshes.items():
+            self._street.meshes[kind].drop(piece)
+
+    def _changed(self) -> None:
+        self.version = next(_VERSIONS)
+
+    def _show(self, step: Step, draws: NDArray[np.uint32]) -> None:
+        self.draws[STEPS.index(step)] = draws
+        self._changed()
+
+    def _show_things(self, step: ThingStep, things: Things) -> None:
+        for material in MATERIALS:
+            self._show((step, material), things.draws[material][0])
+
+    def _show_tiles(self, step: TileStep, kind: TileKind, tiles: NDArray[np.intp]) -> None:
+        """Select the tiles to draw in a step from now on, in this order."""
+        draws = self._tile_draws[kind][tiles]
+        self._show((step, kind), draws[draws[:, 0] > 0])
 
     def _stream(self, cell: tuple[int, int]) -> None:
         """Load the tiles around a cell, the nearest first."""
-        x, y = cell[0] * _CELL_M, cell[1] * _CELL_M
+        x, y = cell[0] * CELL_M, cell[1] * CELL_M
         keys = [key for _, key in sorted(tile_distances_within(x, y, VISIBLE_M + _SLACK_M))]
         if keys == self._keys:
             return
         for key in [k for k in self._tiles if tile_distance(k, x, y) > FORGET_M]:
-            del self._tiles[key]
+            self._drop(self._tiles.pop(key))
         for key in keys:
             if key not in self._tiles:
                 self._tiles[key] = self._built(key)
         tiles = [self._tiles[key] for key in keys]
         self._keys = keys
         self._middles = np.array([tile.middle for tile in tiles])
-        for layer, rows in (
-            (self._ground, [tile.ground for tile in tiles]),
-            (self._paint, [tile.paint for tile in tiles]),
-            (self._decals, [tile.decals for tile in tiles]),
-            (self._walls, [tile.walls for tile in tiles]),
-            (self._scan, [tile.scan for tile in tiles]),
-        ):
-            layer.hold(rows, self._middles)
+        self._street.places.give(*self._places)
+        self._places = self._street.places.take(len(tiles)), len(tiles)
+        self._tile_draws = {kind: self._draws_of(kind, tiles) for kind in TILE_KINDS}
         self._heads = np.concatenate([tile.lamps for tile in tiles])
         self._stands_xy = np.concatenate([*(tile.thing_xy for tile in tiles), self._obstacle_xy])
         always = np.full(len(self._obstacle_xy), math.inf)
@@ -266,56 +248,56 @@ class GlScene:
         self._posts = [
             one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)
         ]
-        self._placed = False
+        self._placed_for = None
 
     def _place(self, anchor: Floats) -> None:
         """Set the anchor that all positions are relative to."""
         self._anchor = anchor
-        self._placed = True
         self._seen_for = None
         self._still_for = None
         self._lit_for = []
-        for layer in (self._ground, self._paint, self._decals, self._walls, self._scan):
-            layer.place(anchor)
+        self._street.place(self._places[0], self.seat, self._middles, anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
         self._stands = _joined([*placed, _at(self._obstacles, self._obstacle_xy, anchor)])
         self._far = np.concatenate(
             [*(self._tiles[key].far for key in self._keys), self._obstacles[0]]
         )
-        self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]))
+        self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]), self.seat)
+        self._show_things("fenced", self._fenced)
 
     def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
         """Select everything visible from any eye in the cell with a heading in the sector."""
-        offset = self._stands_xy - np.multiply(cell, _CELL_M)
+        offset = self._stands_xy - np.multiply(cell, CELL_M)
         away = np.hypot(offset[:, 0], offset[:, 1])
         chosen = away < self._stands_seen_m + _SLACK_M
         tiles = np.ones(len(self._keys), dtype=bool)
         if half is not None:
             chosen &= _within(offset, sector, half, PROP_MARGIN_M)
-            tiles = _within(self._middles - np.multiply(cell, _CELL_M), sector, half, _TILE_REACH_M)
+            tiles = _within(self._middles - np.multiply(cell, CELL_M), sector, half, _TILE_REACH_M)
         rows = chosen.nonzero()[0]
         form, things = self._stands
         form = np.where(away > _NEAR_M, self._far, form)
-        self._seen.set(*_joined([(form[rows], things[rows]), self._lit]))
-        for layer in (self._ground, self._paint, self._walls, self._scan):
-            layer.show("colour", tiles.nonzero()[0])
-        x, y = np.multiply(cell, _CELL_M).tolist()
+        self._seen.set(*_joined([(form[rows], things[rows]), self._lit]), self.seat)
+        self._show_things("seen", self._seen)
+        for kind in TILE_KINDS:
+            if kind != "decals":
+                self._show_tiles("colour", kind, tiles.nonzero()[0])
+        x, y = np.multiply(cell, CELL_M).tolist()
         near = [tile_distance(key, x, y) < DECALS_M + _SLACK_M for key in self._keys]
-        self._decals.show("colour", (tiles & np.array(near)).nonzero()[0])
+        self._show_tiles("colour", "decals", (tiles & np.array(near)).nonzero()[0])
 
-    def _stand(self, middle: Floats, anchor: Floats) -> None:
+    def _stand(self, middle: tuple[float, ...], anchor: Floats) -> None:
         """Prepare the shadow casters in the square around `middle`, visible or not."""
-        still = (*middle.tolist(), *anchor.tolist())
-        if still != self._still_for:
-            keys = tiles_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
-            obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
-            self._standing.set(
-                *_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles])
-            )
-            tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
-            for layer in (self._ground, self._walls):
-                layer.show("still", tiles)
-            self._still_for = still
+        keys = tiles_within(middle[0], middle[1], VISIBLE_M - STEP_M)
+        obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
+        self._standing.set(
+            *_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles]),
+            self.seat,
+        )
+        self._show_things("standing", self._standing)
+        tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
+        for kind in ("ground", "walls"):
+            self._show_tiles("still", kind, tiles)
 
     def _built(self, key: Key) -> _Tile:
         held = self._surface.kept("gl", key, lambda: self._made(key))
@@ -323,17 +305,13 @@ class GlScene:
         pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
         forms = [self._form(*form) for form in words.forms] + [(pole, pole)] * len(words.posts)
         near, far = np.array(forms, dtype=np.intp).reshape(-1, 2).T
-        ground, paint, decals, walls, scan = (
-            (held[name], held[f"{name}_triangles"]) if name in held else None
-            for name in ("ground", "paint", "decals", "walls", "scan")
-        )
         return _Tile(
             _middle(key),
-            ground,
-            paint,
-            decals,
-            walls,
-            scan,
+            {
+                kind: self._street.meshes[kind].hold(held[kind], held[f"{kind}_triangles"])
+                for kind in TILE_KINDS
+                if kind in held
+            },
             lamp_heads(words.forms, held["things"], _middle(key)),
             (near, held["things"]),
             far,
@@ -342,6 +320,16 @@ class GlScene:
             words.posts,
             held["post_z"],
         )
+
+    def _draws_of(self, kind: TileKind, tiles: Sequence[_Tile]) -> NDArray[np.uint32]:
+        """Return the (T, 5) draws of the meshes of a kind, without indices where there is none."""
+        draws = np.zeros((len(tiles), 5), dtype=np.uint32)
+        draws[:, 1] = 1
+        draws[:, 4] = self._places[0] + np.arange(len(tiles))
+        for row, tile in zip(draws, tiles, strict=True):
+            if kind in tile.meshes:
+                row[0], row[2], row[3] = tile.meshes[kind].draw
+        return draws
 
     def _form(self, kind: str, variant: int, look: int) -> tuple[int, int]:
         """Return the numbers of a prop's forms, near and at a distance."""

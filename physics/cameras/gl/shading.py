@@ -3,7 +3,8 @@
 A drawable's program is written once and works in every pass.
 `programs` puts this file's chunks before its code:
 
-vertex shader     Reads its own attributes and ends with `gl_Position = project(at);`.
+vertex shader     Reads its own attributes and ends with `gl_Position = project(at);`,
+                  or `in_picture(clip)`.
                   at: position in metres relative to the picture's anchor (below).
                   Normals are in world axes.
 fragment shader   Calls `show(albedo, normal, at, label)` once, or `glow(colour, label)`
@@ -40,6 +41,11 @@ Uniform block `Scene` (binding SCENE_BINDING, one per pass and picture, from `Sc
     vec4 anchor            xy in world metres (float32: for patterns, not for geometry)
     vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half width and
                            height; w of ahead: width of a pixel at a distance of 1 m, metres
+    vec4 backdrop          with layers: rgb linear, all around the horizon; w layer of the sky
+
+With `Variant.LAYERS` one draw fills layers of array textures, one for each picture. The attribute
+`seat` of an instance is that of its scene; the buffer `Seats` maps it to the block and the layer of
+the picture, and `project` selects both. Then eye.w is the layer of the static shadow map.
 
 Textures: the shadow maps are bound to units STILL_UNIT (static) and MOVING_UNIT (moving objects).
 SKY_UNIT holds the sky; SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT those of ground and walls.
@@ -62,9 +68,9 @@ from typing import Final, Literal, NamedTuple
 
 import moderngl
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.variants import Variant
 from physics.cameras.gl.weather_shaders import BLOCK, FOG_GLOW, LAMPS, PATTERNS
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
@@ -79,8 +85,12 @@ SKY_UNIT: Final = 5
 STILL_UNIT: Final = 6
 MOVING_UNIT: Final = 7
 ANCHOR_M: Final = 64.0
+PICTURES_MAX: Final = 128
+"""Maximum number of pictures of a batch: their blocks fill the uniform block of a layered draw."""
+SEATS_BINDING: Final = 1
+_USED_ROWS: Final = 21
 _BLOCK_ROWS: Final = 32
-"""Rows (vec4) of a block, of which 20 are used; graphics cards require aligned starts of blocks."""
+"""Rows (vec4) of a block; graphics cards require aligned starts of blocks."""
 
 
 class Programs(NamedTuple):
@@ -95,30 +105,57 @@ class Programs(NamedTuple):
         return [uniform if isinstance(uniform, moderngl.Uniform) else None for uniform in found]
 
 
-_BLOCK = """#version 430
-layout(std140, binding = 0) uniform Scene {
-    mat4 clip_from_at;
-    mat4 shadow_from_at;
-    vec4 eye;
-    vec4 sun;
-    vec4 sun_light;
-    vec4 side_light;
-    vec4 tilt_light;
-    vec4 flat_light;
-    vec4 fog;
-    vec4 haze;
-    vec4 anchor;
-    vec4 right;
-    vec4 up;
-    vec4 ahead;
-};
+_MEMBERS: Final = (
+    ("mat4", "clip_from_at"),
+    ("mat4", "shadow_from_at"),
+    *(("vec4", name) for name in ("eye", "sun", "sun_light", "side_light", "tilt_light")),
+    *(("vec4", name) for name in ("flat_light", "fog", "haze", "anchor", "right", "up", "ahead")),
+    ("vec4", "backdrop"),
+)
+_DECLARED: Final = "".join(f"    {kind} {name};\n" for kind, name in _MEMBERS)
+
+_BLOCK: Final = f"""#version 430
+layout(std140, binding = 0) uniform Scene {{
+{_DECLARED}}};
 """
+
+_BLOCKS: Final = f"""#version 430
+#extension GL_ARB_shader_viewport_layer_array : require
+struct Scene {{
+{_DECLARED}    vec4 unused[{_BLOCK_ROWS - _USED_ROWS}];
+}};
+layout(std140, binding = 0) uniform Scenes {{ Scene scenes[{PICTURES_MAX}]; }};
+"""
+_OF_PICTURE: Final = "".join(
+    f"{kind} {name} = scenes[PICTURE].{name};\n" for kind, name in _MEMBERS
+)
+"""Values of one block under the names that they have without layers."""
 
 _VERTEX = """
 invariant gl_Position;  // the same depth in all programs
 vec3 unpacked(vec4 normal) { return normal.xyz * (255.0 / 127.0) - 1.0; }
+vec4 in_picture(vec4 clip) { return clip; }
 vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
 """
+
+_SEATS: Final = f"""
+layout(std430, binding = {SEATS_BINDING}) readonly buffer Seats {{ ivec2 seats[]; }};
+in int seat;
+flat out int picture;
+ivec2 block_layer = seats[seat];
+#define PICTURE block_layer.x
+{_OF_PICTURE}"""
+_LAYERS_VERTEX: Final = """
+invariant gl_Position;
+vec3 unpacked(vec4 normal) { return normal.xyz * (255.0 / 127.0) - 1.0; }
+vec4 in_picture(vec4 clip) {
+    gl_Layer = block_layer.y;
+    picture = block_layer.x;
+    return clip;
+}
+vec4 project(vec3 at) { return in_picture(clip_from_at * vec4(at, 1.0)); }
+"""
+_LAYERS_FRAGMENT: Final = f"flat in int picture;\n#define PICTURE picture\n{_OF_PICTURE}"
 
 _DECODED = """
 vec3 decoded(vec3 c) { return c * (c * (c * 0.305306011 + 0.682171111) + 0.012522878); }
@@ -126,14 +163,23 @@ vec3 decoded(vec3 c) { return c * (c * (c * 0.305306011 + 0.682171111) + 0.01252
 """Conversion of sRGB to linear by a cubic, accurate to about one 8-bit level."""
 
 _SHADOW = """
+#ifdef LAYERS
+layout(binding = 6) uniform sampler2DArrayShadow still_shadow;
+layout(binding = 7) uniform sampler2DArrayShadow moving_shadow;
+#define STILL(p) texture(still_shadow, vec4((p).xy, eye.w, (p).z))
+#define MOVING(p) texture(moving_shadow, vec4((p).xy, float(PICTURE), (p).z))
+#else
 layout(binding = 6) uniform sampler2DShadow still_shadow;
 layout(binding = 7) uniform sampler2DShadow moving_shadow;
+#define STILL(p) texture(still_shadow, p)
+#define MOVING(p) texture(moving_shadow, p)
+#endif
 vec3 on_map(vec3 at, vec3 normal) { return (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz; }
 float sunlit_on(vec3 on_map) {
 #ifdef SHADOWS
     vec2 off = abs(on_map.xy - 0.5);
     float inside = clamp((0.5 - max(off.x, off.y)) * 20.0, 0.0, 1.0);
-    float lit = min(texture(still_shadow, on_map), texture(moving_shadow, on_map));
+    float lit = min(STILL(on_map), MOVING(on_map));
     return 1.0 - sun.w * inside * (1.0 - lit);
 #else
     return 1.0;
@@ -266,7 +312,7 @@ float snow_on(vec3 at, float raised, float label) {
 _NOTHING = "#version 430\nvoid main() {}\n"
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=128)
 def programs(
     context: moderngl.Context, vertex: str, fragment: str, shadows: int, cut_out: str = ""
 ) -> Programs:
@@ -279,11 +325,15 @@ def programs(
     Equal programs are shared during the context's lifetime, so set their uniforms before each draw.
     """
     variant = Variant(shadows)
-    head = _BLOCK + variant.defines
+    layers = Variant.LAYERS in variant
+    head = (_BLOCKS if layers else _BLOCK) + variant.defines
+    before = head + (_SEATS if layers else "") + _DECODED + _SHADOW
+    before += _LAYERS_VERTEX if layers else _VERTEX
+    head += _LAYERS_FRAGMENT if layers else ""
     weather = BLOCK if variant & Variant.WEATHER else ""
     return Programs(
         context.program(
-            vertex_shader=head + _DECODED + _SHADOW + _VERTEX + vertex,
+            vertex_shader=before + vertex,
             fragment_shader=head
             + weather
             + _DECODED
@@ -292,15 +342,15 @@ def programs(
             + fragment,
         ),
         context.program(
-            vertex_shader=head + _DECODED + _SHADOW + _VERTEX + vertex,
+            vertex_shader=before + vertex,
             fragment_shader=f"#version 430\n{cut_out}" if cut_out else _NOTHING,
         ),
     )
 
 
 def anchor_of(eye_m: Floats) -> Floats:
-    """Return the (2,) point of the anchors' lattice nearest to an eye."""
-    return np.array([round(eye_m[0] / ANCHOR_M), round(eye_m[1] / ANCHOR_M)]) * ANCHOR_M
+    """Return the (..., 2) points of the anchors' lattice nearest to (..., 3) eyes."""
+    return np.asarray(np.round(eye_m[..., :2] / ANCHOR_M) * ANCHOR_M)
 
 
 def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
@@ -308,81 +358,116 @@ def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
 
     The first row of the picture is at the bottom, as it is read top first.
     """
-    wide, tall = shot.half_picture
-    far, near = FAR_PLANE_M, NEAR_PLANE_M
     eye = shot.eye_m - (float(anchor[0]), float(anchor[1]), 0.0)
-    matrix = np.empty((4, 4))
-    matrix[:3, :3] = shot.axes
-    matrix[:3, 3] = shot.axes @ -eye
-    matrix[3] = matrix[2]
+    matrices = camera_matrices(shot.axes[None], eye[None], np.array([shot.half_picture]))
+    return np.asarray(matrices[0])
+
+
+def camera_matrices(axes: Floats, eye: Floats, half_picture: Floats) -> Floats:
+    """Return the (N, 4, 4) matrices of `camera_matrix` of N views.
+
+    axes: (N, 3, 3) as in `Shot`
+    eye: (N, 3) metres from the anchors
+    half_picture: (N, 2) as in `Shot`
+    """
+    far, near = FAR_PLANE_M, NEAR_PLANE_M
+    matrix = np.empty((len(axes), 4, 4))
+    matrix[:, :3, :3] = axes
+    x, y, z = eye.T[:, :, None]
+    matrix[:, :3, 3] = -(axes[..., 0] * x + axes[..., 1] * y + axes[..., 2] * z)
+    matrix[:, 3] = matrix[:, 2]
     deep = (far + near) / (far - near)
-    matrix[:3] *= ((1.0 / wide,), (-1.0 / tall,), (deep,))
-    matrix[2, 3] -= 2.0 * far * near / (far - near)
+    matrix[:, 0] *= (1.0 / half_picture[:, 0])[:, None]
+    matrix[:, 1] *= (-1.0 / half_picture[:, 1])[:, None]
+    matrix[:, 2] *= deep
+    matrix[:, 2, 3] -= 2.0 * far * near / (far - near)
     return matrix
 
 
 class SceneBlocks:
-    """Uniform blocks of several passes, uploaded together."""
+    """Uniform blocks of the pictures of a batch and of their shadow passes, uploaded together."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._rows = np.zeros((2, PICTURES_MAX, _BLOCK_ROWS, 4), dtype=np.float32)
+        self._buffer = context.buffer(reserve=self._rows.nbytes)
+
+    def set(
+        self,
+        cameras: Floats,
+        suns: Floats,
+        to_maps: Floats,
+        views: Floats,
+        lights: NDArray[np.float32],
+    ) -> None:
+        """Upload the blocks of N pictures.
+
+        cameras, suns, to_maps: (N, 4, 4) matrices to the clip spaces of the picture and of its
+            shadow maps, and to their texture space
+        views: (N, 5, 4) eye, anchor, and the axes of the picture, as in the block
+        lights: (N, 8, 4) rows of `Lighting.rows`, and the row of the backdrop
+        """
+        n = len(cameras)
+        camera, sun = self._rows[:, :n]
+        camera[:, :4], camera[:, 4:8] = cameras.transpose(0, 2, 1), to_maps.transpose(0, 2, 1)
+        camera[:, 8], camera[:, 16:20] = views[:, 0], views[:, 1:]
+        camera[:, 9:16], camera[:, 20] = lights[:, :7], lights[:, 7]
+        sun[:, :4], sun[:, 9:16] = suns.transpose(0, 2, 1), lights[:, :7]
+        self._buffer.write(self._rows[0, :n])
+        self._buffer.write(self._rows[1, :n], offset=self._rows[0].nbytes)
+
+    def bind(self, picture: int = 0, sun: bool = False) -> None:
+        """Bind the block of a picture, or of its shadow pass, as uploaded last."""
+        each = self._rows[0, 0].nbytes
+        self._bind(sun, picture * each, each)
+
+    def bind_all(self, sun: bool = False) -> None:
+        """Bind all blocks, or those of the shadow passes, for draws with `Variant.LAYERS`."""
+        self._bind(sun, 0, self._rows[0].nbytes)
+
+    def _bind(self, sun: bool, offset: int, size: int) -> None:
+        offset += sun * self._rows[0].nbytes
+        self._buffer.bind_to_uniform_block(SCENE_BINDING, offset=offset, size=size)
+
+    def release(self) -> None:
+        self._buffer.release()
+
+
+class SeatMaps:
+    """Buffers `Seats`: blocks and layers of the scenes of a batch, for pictures and static maps."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self._rows = np.zeros((0, _BLOCK_ROWS, 4), dtype=np.float32)
-        self._lights: list[Lighting | None] = []
-        self._suns: list[Floats | None] = []
-        self._buffer: moderngl.Buffer | None = None
-        self.room(1)
+        self._room = 0
+        self._buffers: list[moderngl.Buffer] = []
+        self._held: tuple[int, bytes, bytes] | None = None
 
-    def room(self, count: int) -> None:
-        """Ensure space for at least `count` blocks. Growing discards earlier blocks."""
-        if count > len(self._rows):
+    def set(self, count: int, seats: NDArray[np.intp], maps: NDArray[np.intp]) -> None:
+        """Upload the places of N scenes.
+
+        count: number above all seats
+        seats, maps: (N,) seats, and layers of the static shadow maps
+        """
+        if count > self._room:
             self.release()
-            self._rows = np.zeros((2 * count, _BLOCK_ROWS, 4), dtype=np.float32)
-            self._lights = [None for _ in self._rows]
-            self._suns = [None for _ in self._rows]
-            self._buffer = self._context.buffer(reserve=self._rows.nbytes)
+            self._room = 2 * count
+            self._buffers = [self._context.buffer(reserve=8 * self._room) for _ in range(2)]
+            self._held = None
+        wanted = count, seats.tobytes(), maps.tobytes()
+        if wanted == self._held:
+            return
+        self._held = wanted
+        pictures = np.arange(len(seats))
+        for buffer, layers in zip(self._buffers, (pictures, maps), strict=True):
+            rows = np.zeros((count, 2), dtype=np.int32)
+            rows[seats, 0], rows[seats, 1] = pictures, layers
+            buffer.write(rows)
 
-    def put(
-        self,
-        place: int,
-        clip_from_at: Floats,
-        shadow_from_at: Floats,
-        taken: Shot,
-        anchor: Floats,
-        light: Lighting,
-    ) -> None:
-        """Set one block; matrices are (4, 4)."""
-        rows = self._rows[place]
-        self._suns[place] = None
-        self._light(place, light)
-        rows[:4], rows[4:8] = clip_from_at.T, shadow_from_at.T
-        rows[8, :2], rows[8, 2] = taken.eye_m[:2] - anchor, taken.eye_m[2]
-        rows[16, :2] = anchor
-        rows[17:20, :3] = taken.axes
-        rows[17, 3], rows[18, 3] = taken.half_picture
-        rows[19, 3] = 2.0 * taken.half_picture[1] / taken.size[1]
-
-    def put_sun(self, place: int, clip_from_at: Floats, light: Lighting) -> None:
-        """Set one block for a shadow map. The same matrix object as before changes nothing."""
-        if self._suns[place] is not clip_from_at:
-            self._suns[place] = clip_from_at
-            self._light(place, light)
-            self._rows[place, :4] = clip_from_at.T
-
-    def _light(self, place: int, light: Lighting) -> None:
-        if self._lights[place] is not light:
-            self._lights[place], self._rows[place, 9:16] = light, light.rows()
-
-    def upload(self) -> None:
-        assert self._buffer is not None
-        self._buffer.write(self._rows)
-
-    def bind(self, place: int = 0) -> None:
-        """Bind a block, as uploaded last, for later draws."""
-        assert self._buffer is not None
-        each = self._rows[0].nbytes
-        self._buffer.bind_to_uniform_block(SCENE_BINDING, offset=place * each, size=each)
+    def bind(self, still: bool = False) -> None:
+        """Bind the places of pictures, or of static shadow maps, for later draws."""
+        self._buffers[still].bind_to_storage_buffer(SEATS_BINDING)
 
     def release(self) -> None:
-        if self._buffer is not None:
-            self._buffer.release()
-            self._buffer = None
+        for buffer in self._buffers:
+            buffer.release()
+        self._buffers = []
+        self._room = 0

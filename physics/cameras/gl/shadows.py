@@ -1,5 +1,7 @@
 """Shadow maps from the sun: one for static objects and one for moving objects.
 
+Scenes whose pictures are drawn as layers share arrays of maps; others have two maps of their own.
+
 Both maps cover one box around a point of a coarse lattice near the eye.
 The box is aligned to whole texels, so that shadows do not shimmer.
 The static map is redrawn only when that point changes.
@@ -7,21 +9,23 @@ The static map is redrawn only when that point changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
+from itertools import count
 from typing import Final
 
 import moderngl
 import numpy as np
 
 from cosim.core.geometry import Floats
+from physics.cameras.gl.layers import DepthLayers
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Pass
+from physics.cameras.gl.shots import Lattice
 
 SHADOW_REACH_M: Final = 32.0
 """Half the side of the square that has shadows, metres."""
-STEP_M: Final = 8.0
-"""Spacing of the lattice of shadow box middles, metres."""
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
@@ -31,11 +35,6 @@ TO_TEXTURE: Final = np.array(
     [[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
 )
 """Matrix from clip space to texture space."""
-
-
-def middle_of(eye_m: Floats) -> Floats:
-    """Return the (3,) middle of the space with shadows around an eye, world metres."""
-    return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
 
 
 def shadow_matrix(
@@ -63,6 +62,15 @@ def shadow_matrix(
     return matrix
 
 
+def sides_px(high_px: int) -> tuple[int, int]:
+    """Return the sides of the static and the moving map of pictures of a height."""
+    still, moving = (
+        px // 2 if high_px <= small_px else px
+        for px, small_px in zip((_STILL_PX, _MOVING_PX), _SMALL_PX, strict=True)
+    )
+    return still, moving
+
+
 @contextmanager
 def casting(context: moderngl.Context) -> Iterator[None]:
     """Set the GL state for drawing shadow maps within a `with` block."""
@@ -73,23 +81,38 @@ def casting(context: moderngl.Context) -> Iterator[None]:
     context.polygon_offset = 0.0, 0.0
 
 
-class ShadowMaps:
-    """Two depth maps from the sun. high_px: height of the pictures that use them."""
+class SunView:
+    """View of a scene from the sun. side_px: side of the static map."""
+
+    def __init__(self, side_px: int) -> None:
+        self._side_px = side_px
+        self._matrices_for: tuple[object, ...] | None = None
+        self._matrices: tuple[Floats, Floats] = np.eye(4), TO_TEXTURE
+
+    def matrices(self, lattice: Lattice, light: Lighting) -> tuple[Floats, Floats]:
+        """Return `shadow_matrix`, and the same to texture space; the last ones are cached."""
+        key = lattice.anchor, lattice.middle
+        if key != self._matrices_for:
+            middle, anchor = np.array(lattice.middle), np.array(lattice.anchor)
+            from_at = shadow_matrix(middle, anchor, light.to_sun, self._side_px)
+            self._matrices_for = key
+            self._matrices = (from_at, TO_TEXTURE @ from_at)
+        return self._matrices
+
+
+class ShadowMaps(SunView):
+    """Two depth maps from the sun of one scene. high_px: height of the pictures that use them."""
 
     def __init__(self, context: moderngl.Context, high_px: int) -> None:
         self._context = context
-        self._side_px, moving_px = (
-            px // 2 if high_px <= small_px else px
-            for px, small_px in zip((_STILL_PX, _MOVING_PX), _SMALL_PX, strict=True)
-        )
-        self._still, self._moving = self._texture(self._side_px), self._texture(moving_px)
+        still_px, moving_px = sides_px(high_px)
+        super().__init__(still_px)
+        self._still, self._moving = self._texture(still_px), self._texture(moving_px)
         self._frames = {
             "still": context.framebuffer(depth_attachment=self._still),
             "moving": context.framebuffer(depth_attachment=self._moving),
         }
         self._drawn_for: tuple[float, ...] | None = None
-        self._matrices_for: tuple[float, ...] | None = None
-        self._matrices: tuple[Floats, Floats] = np.eye(4), TO_TEXTURE
 
     def _texture(self, pixels: int) -> moderngl.Texture:
         texture = self._context.depth_texture((pixels, pixels))
@@ -98,23 +121,12 @@ class ShadowMaps:
         texture.repeat_x = texture.repeat_y = False
         return texture
 
-    def matrices(self, middle: Floats, anchor: Floats, light: Lighting) -> tuple[Floats, Floats]:
-        """Return `shadow_matrix`, and the same to texture space; the last ones are cached."""
-        key = (*middle.tolist(), *anchor.tolist())
-        if key != self._matrices_for:
-            from_at = shadow_matrix(middle, anchor, light.to_sun, self._side_px)
-            self._matrices_for = key
-            self._matrices = (from_at, TO_TEXTURE @ from_at)
-        return self._matrices
-
-    def draw(
-        self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Pass], None]
-    ) -> None:
+    def draw(self, lattice: Lattice, light: Lighting, draw: Callable[[Pass], None]) -> None:
         """Update the maps, within `casting`.
 
         The scene block must hold their matrix as its camera.
         """
-        key = (*middle.tolist(), *anchor.tolist(), *light.to_sun.tolist())
+        key = (*lattice.anchor, *lattice.middle, *light.to_sun.tolist())
         if key != self._drawn_for:
             self._draw("still", draw)
             self._drawn_for = key
@@ -135,3 +147,76 @@ class ShadowMaps:
             frame.release()
         self._still.release()
         self._moving.release()
+
+
+class ShadowSeat(SunView):
+    """A scene in `ShadowLayers`. layer: of its static map; to_sun: x, y, z"""
+
+    def __init__(self, maps: ShadowLayers, light: Lighting) -> None:
+        super().__init__(maps.sides_px[0])
+        self.maps = maps
+        self.layer = maps.take()
+        self.to_sun: tuple[float, ...] = tuple(light.to_sun.tolist())
+
+    def release(self) -> None:
+        self.maps.give(self.layer)
+
+
+class ShadowLayers:
+    """Shadow maps as layers of two arrays: static ones by scene, moving ones by picture."""
+
+    def __init__(self, context: moderngl.Context, sides: tuple[int, int]) -> None:
+        self.sides_px = sides
+        self._still, self._moving = (
+            DepthLayers(context, (side, side), shadow=True) for side in sides
+        )
+        self._seats: set[int] = set()
+        self._drawn: dict[int, object] = {}
+
+    def take(self) -> int:
+        """Return an unused layer of the static maps."""
+        layer = next(i for i in count() if i not in self._seats)
+        self._seats.add(layer)
+        return layer
+
+    def give(self, layer: int) -> None:
+        """Return a layer from `take`."""
+        self._seats.remove(layer)
+        self._drawn.pop(layer, None)
+
+    def begin_still(self, wanted: Mapping[int, object]) -> list[int]:
+        """Clear the static maps to be drawn, and return their layers.
+
+        wanted: what the map of each layer depends on
+        """
+        if self._still.room(max(self._seats, default=0) + 1):
+            self._drawn.clear()
+        changed = [layer for layer, key in wanted.items() if self._drawn.get(layer) != key]
+        for layer in changed:
+            self._still.clear(layer)
+            self._drawn[layer] = wanted[layer]
+        if changed:
+            self._still.use()
+        return changed
+
+    def begin_moving(self, pictures: int, clear: bool) -> None:
+        """Draw into the maps of the moving objects of a batch from now on."""
+        self._moving.room(pictures)
+        self._moving.use()
+        if clear:
+            self._moving.clear_all()
+
+    def bind(self) -> None:
+        self._still.bind(STILL_UNIT)
+        self._moving.bind(MOVING_UNIT)
+
+
+@lru_cache(maxsize=8)
+def shadow_layers(context: moderngl.Context, high_px: int) -> ShadowLayers:
+    """Return the context's maps for pictures of a height, with the same lifetime."""
+    return _layers_of(context, sides_px(high_px))
+
+
+@lru_cache(maxsize=8)
+def _layers_of(context: moderngl.Context, sides: tuple[int, int]) -> ShadowLayers:
+    return ShadowLayers(context, sides)

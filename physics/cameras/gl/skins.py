@@ -28,7 +28,7 @@ _CORNER: Final = np.dtype(
         ("coat", "u1", 4),
     ]
 )
-"""normal: as in corners._CORNER, fourth: offset by fat; weights: of 255.
+"""normal: as in corners.CORNER, fourth: offset by fat; weights: of 255.
 
 coat: row of COATS, unshaded light of 255
 """
@@ -140,7 +140,7 @@ void main() {
 class Skins:
     """Bodies in one vertex and one index buffer.
 
-    instances: rows of person, dress, girth and tall
+    instances: rows of person, dress, girth, tall and seat
     drawn: the programs, with and without shadow maps
     """
 
@@ -202,7 +202,7 @@ class Skins:
         corner, index = self._buffers
         content = [
             (corner, *self._layout),
-            (instances, "1i4 1i4 1f4 1f4/i", "person", "dress", "girth", "tall"),
+            (instances, "1i4 1i4 1f4 1f4 1i4/i", *("person", "dress", "girth", "tall", "seat")),
         ]
         colour, shadow = (
             self._context.vertex_array(program, content, index, skip_errors=True)

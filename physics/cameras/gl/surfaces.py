@@ -4,7 +4,6 @@ process.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -13,10 +12,9 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.geometry import Floats
 from physics.cameras.gl.context import is_card
 from physics.cameras.gl.corners import CornerRows
-from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Pass, programs
+from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, programs
 from physics.textures.decals import decal_layers
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
@@ -82,107 +80,6 @@ class SurfaceShaders:
 
 TileRows = tuple[CornerRows, NDArray[np.uint32]]
 """Joined meshes of one tile: vertex rows relative to the tile's middle, and flat triangles."""
-
-
-class TileLayer:
-    """Meshes of the surrounding tiles, uploaded when the tiles change.
-
-    One call draws those in view.
-    layout: of a row, for moderngl
-    """
-
-    def __init__(
-        self, context: moderngl.Context, shaders: SurfaceShaders, layout: tuple[str, ...]
-    ) -> None:
-        self._context = context
-        self._shaders = shaders
-        self._layout = layout
-        self._buffers: list[moderngl.Buffer] = []
-        self._arrays: list[moderngl.VertexArray] = []
-        self._draws = np.zeros((0, 5), dtype=np.uint32)
-        self._counts = {"colour": 0, "still": 0}
-
-    def hold(self, tiles: Sequence[TileRows | None], middles: Floats) -> None:
-        """Replace all tiles. middles: (T, 2) world metres of each."""
-        self.release()
-        self._middles = middles
-        held = [tile for tile in tiles if tile is not None]
-        if not held:
-            return
-        ends = np.cumsum(
-            [(0, 0)] + [(len(t[0]), len(t[1])) if t else (0, 0) for t in tiles], axis=0
-        )
-        self._draws = np.zeros((len(tiles), 5), dtype=np.uint32)
-        self._draws[:, 0], self._draws[:, 1], self._draws[:, 2:4] = (
-            np.diff(ends[:, 1]),
-            1,
-            ends[:-1, ::-1],
-        )
-        self._draws[:, 4] = np.arange(len(tiles))
-        rows, triangles = (
-            self._context.buffer(np.concatenate(part).tobytes()) for part in zip(*held, strict=True)
-        )
-        self._place = self._context.buffer(reserve=16 * len(tiles))
-        self._commands = {
-            name: self._context.buffer(reserve=20 * len(tiles)) for name in self._counts
-        }
-        self._buffers = [rows, triangles, self._place, *self._commands.values()]
-        content = [(rows, *self._layout), (self._place, "2f 2f /i", "middle", "middle_in_world")]
-        self._arrays = [
-            self._context.vertex_array(one, content, triangles, skip_errors=True)
-            for one in self._shaders.programs
-        ]
-
-    def place(self, anchor: Floats) -> None:
-        """Set the anchor that all tiles are relative to."""
-        if self._arrays:
-            self._place.write(np.hstack([self._middles - anchor, self._middles]).astype(np.float32))
-
-    def show(self, stage: Pass, tiles: NDArray[np.intp]) -> None:
-        """Select the tiles to draw from now on, in this order."""
-        if self._arrays:
-            draws = self._draws[tiles]
-            draws = draws[draws[:, 0] > 0]
-            self._commands[stage].write(draws)
-            self._counts[stage] = len(draws)
-
-    def draw(self, stage: Pass) -> None:
-        if self._counts.get(stage, 0):
-            self._render(stage, self._arrays[stage != "colour"])
-
-    def _render(self, stage: Pass, array: moderngl.VertexArray) -> None:
-        count = self._counts[stage]
-        array.render_indirect(self._commands[stage], moderngl.TRIANGLES, count=count)
-
-    def draw_seen(self) -> None:
-        """Draw the picture of surfaces that hide one another, and shade only what is seen.
-
-        The depth comes first on a software renderer, which spends its time on shading.
-        """
-        gl = self._context
-        if not self._counts["colour"]:
-            return
-        if is_card(gl):
-            self.draw("colour")
-            return
-        frame = gl.fbo
-        frame.color_mask = False, False, False, False
-        frame.use()
-        self._render("colour", self._arrays[1])
-        frame.color_mask = True, True, True, True
-        frame.use()
-        gl.depth_func = "<="
-        self.draw("colour")
-        gl.depth_func = "<"
-
-    def release(self) -> None:
-        for array in self._arrays:
-            array.release()
-        for buffer in self._buffers:
-            buffer.release()
-        self._arrays = []
-        self._buffers = []
-        self._counts = {"colour": 0, "still": 0}
 
 
 @lru_cache(maxsize=1)

@@ -1,4 +1,4 @@
-"""Render targets and their readback.
+"""Render targets.
 
 Colour and label share one texture (the label is its fourth channel), so that a picture needs one
 readback.
@@ -6,7 +6,6 @@ readback.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -17,8 +16,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.errors import EngineError
-from physics.cameras.gl.context import is_card
+from physics.cameras.gl.context import draws_layers, is_card
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 
 _UNIT: Final = 8
@@ -73,7 +71,8 @@ class Target(Frame):
         self._depth = context.depth_renderbuffer(size)
         self.frame = context.framebuffer([self._colour], self._depth)
         self.drawn_in = self.frame
-        on_card = is_card(context) if parts_on_card is None else parts_on_card
+        on_card = is_card(context) or draws_layers(context)
+        on_card = on_card if parts_on_card is None else parts_on_card
         self._parting = _Parting(context, size) if on_card else None
 
     def clear(self) -> None:
@@ -168,54 +167,3 @@ def _parting_program(context: moderngl.Context) -> moderngl.Program:
         }
         """,
     )
-
-
-class Readback:
-    """Asynchronous readback of pictures.
-
-    Pictures are queued one after another into a buffer and fetched later, while the next are drawn.
-    target: source of the pictures
-    """
-
-    UNDER_WAY: Final = 2
-    """Maximum number of pending buffers."""
-
-    def __init__(self, context: moderngl.Context, target: Target) -> None:
-        self._context = context
-        self._target = target
-        self._each = target.size[0] * target.size[1] * 4
-        self._free = [context.buffer(reserve=self._each) for _ in range(self.UNDER_WAY)]
-        self._begun: deque[tuple[moderngl.Buffer, int]] = deque()
-
-    def begin(self, pictures: int = 1) -> None:
-        """Take a buffer for `pictures` pictures, which are copied next."""
-        if not self._free:
-            raise EngineError("too many pictures are under way: `end` some first")
-        buffer = self._free.pop()
-        if buffer.size < pictures * self._each:
-            buffer.release()
-            buffer = self._context.buffer(reserve=pictures * self._each)
-        self._begun.append((buffer, pictures))
-
-    def copy(self, place: int = 0) -> None:
-        """Queue a copy of the target to a place in the most recent buffer."""
-        self._target.copy(self._begun[-1][0], place * self._each)
-
-    def forget(self) -> None:
-        """Return the most recent buffer after a failed drawing."""
-        self._free.append(self._begun.pop()[0])
-
-    def end(self) -> list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
-        """Return the pictures of the oldest buffer, as `Target.read` does."""
-        if not self._begun:
-            raise EngineError("no picture is under way: `begin` one first")
-        buffer, pictures = self._begun.popleft()
-        self._free.append(buffer)
-        data = np.empty((pictures, self._each), dtype=np.uint8)
-        if pictures:
-            buffer.read_into(data, data.nbytes)
-        return [self._target.parted(one) for one in data]
-
-    def release(self) -> None:
-        for buffer in (*self._free, *(buffer for buffer, _ in self._begun)):
-            buffer.release()

@@ -10,8 +10,8 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
-from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
+from physics.cameras.gl.corners import corners, joined_corners
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileRows
 from physics.street.decals import Decals
 from physics.street.surface import Patch
 
@@ -76,14 +76,9 @@ def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: int) ->
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 
 
-def decal_shaders(context: moderngl.Context, surfaces: Surfaces) -> SurfaceShaders:
+def decal_shaders(context: moderngl.Context, surfaces: Surfaces, variant: int) -> SurfaceShaders:
     """Create the program of the decals of all tiles."""
-    return SurfaceShaders(context, surfaces, _DECAL_VERTEX, _DECAL_FRAGMENT, shadows=False)
-
-
-def ground_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
-    """Create the layer for rows of `ground_rows`."""
-    return TileLayer(context, shaders, LAYOUT)
+    return SurfaceShaders(context, surfaces, _DECAL_VERTEX, _DECAL_FRAGMENT, variant)
 
 
 def ground_rows(surfaces: Surfaces, patches: Sequence[Patch], middle: Floats) -> TileRows | None:

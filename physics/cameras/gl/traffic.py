@@ -1,6 +1,4 @@
-"""Vehicles and robots of all pictures of a batch: culled and uploaded together, drawn per
-picture.
-"""
+"""Vehicles and robots of all pictures of a batch: culled and uploaded together."""
 
 from __future__ import annotations
 
@@ -15,8 +13,14 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, RobotState, Vehicles
 from cosim.spec.robot import Robot
-from physics.cameras.gl.corners import CornerRows
-from physics.cameras.gl.instances import INSTANCE, Forms, Things, turned_instances
+from physics.cameras.gl.instances import (
+    Forms,
+    Material,
+    ThingArrays,
+    Things,
+    turned_instances,
+)
+from physics.cameras.gl.pool import Draws, Pool
 from physics.cameras.gl.robot_body import link_parts, robot_parts
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import SHADOW_REACH_M
@@ -29,12 +33,29 @@ from physics.robots.kinematics import angles_of, link_tree, turned
 from physics.street import vehicles
 from physics.street.surface import Surface
 
-_PARTS: Final = {"colour": 0, "still": 1, "moving": 1}
+_MATERIALS: Final[tuple[Material, ...]] = ("solid", "cut-out")
 _FLEETS_MAX: Final = 256
 
 
-_Placed = tuple[NDArray[np.intp], CornerRows, NDArray[np.intp]]
-"""Forms, instances, and part numbers: twice the picture's number, plus one for shadows."""
+class _Placed(NamedTuple):
+    """N objects.
+
+    form: (N,) numbers of forms
+    at: (N, 3) metres from the anchor
+    turn: (N, 3) roll, pitch and heading
+    paint: (N, 3)
+    label: (N,)
+    picture: (N,) numbers of the pictures
+    shadow: (N,) 1 for shadows
+    """
+
+    form: NDArray[np.intp]
+    at: Floats
+    turn: Floats
+    paint: Floats
+    label: NDArray[np.intp]
+    picture: NDArray[np.intp]
+    shadow: NDArray[np.intp]
 
 
 class Driven(NamedTuple):
@@ -55,25 +76,49 @@ class Driven(NamedTuple):
 class TrafficDrawing:
     """Drawing of vehicles and robots of the pictures of a batch."""
 
-    def __init__(self, context: moderngl.Context, forms: Forms) -> None:
+    def __init__(self, context: moderngl.Context, forms: Forms, rows: Pool) -> None:
         self._forms = forms
-        self._things = Things(context, forms)
+        self._things = Things(forms, rows)
+        self._arrays = ThingArrays(context, forms, rows)
+        self._draws = Draws(context)
         self._fleets: dict[tuple[tuple[str, ...], bytes], tuple[NDArray[np.intp], Floats]] = {}
 
-    def set(self, driven: Sequence[Driven], shots: Shots) -> None:
-        """Upload the vehicles and robots of all pictures."""
-        placed = [self._vehicles(driven, shots), *self._robots(driven, shots)]
-        form, rows, part = (np.concatenate(column) for column in zip(*placed, strict=True))
-        self._things.set(form, rows, part, 2 * len(driven))
+    def set(
+        self,
+        driven: Sequence[Driven],
+        shots: Shots,
+        parts: NDArray[np.intp],
+        seats: NDArray[np.intp],
+    ) -> None:
+        """Upload the vehicles and robots of all pictures.
 
-    def draw(self, stage: Pass, shadows: int, picture: int = 0) -> None:
-        if stage != "still":
-            self._things.draw(stage, shadows, 2 * picture + _PARTS[stage])
+        parts: part of the batch of each picture, in order
+        seats: of the scenes of the pictures
+        """
+        both = self._vehicles(driven, shots), self._robots(driven, shots)
+        placed = [one for one in both if one is not None]
+        count = 2 * (int(parts[-1]) + 1)
+        if placed:
+            form, at, turn, paint, label, picture, shadow = (
+                of[0] if len(of) == 1 else np.concatenate(of) for of in zip(*placed, strict=True)
+            )
+            rows = turned_instances(at, *turn.T, paint, label)
+            self._things.set(form, rows, seats[picture], 2 * parts[picture] + shadow, count)
+        else:
+            self._things.clear(count)
+        self._draws.set([self._things.draws[material] for material in _MATERIALS])
 
-    def release(self) -> None:
-        self._things.release()
+    def draw(self, stage: Pass, shadows: int, part: int) -> None:
+        """Draw the vehicles and robots of a part."""
+        if stage == "still":
+            return
+        at = 2 * part + (stage == "moving")
+        for step, material in enumerate(_MATERIALS):
+            if self._draws.count(step, at, at + 1):
+                array = self._arrays.of(material, stage != "colour", shadows)
+                self._draws.draw(array, step, at, at + 1)
 
-    def _vehicles(self, driven: Sequence[Driven], shots: Shots) -> _Placed:
+    def _vehicles(self, driven: Sequence[Driven], shots: Shots) -> _Placed | None:
         whose = np.repeat(np.arange(len(driven)), [len(one.vehicles) for one in driven])
         xy = np.concatenate([one.vehicles.xy for one in driven])
         middle = shots.middle[whose]
@@ -84,18 +129,17 @@ class TrafficDrawing:
         )
         rows = np.concatenate([seen.nonzero()[0], casts.nonzero()[0]])
         if not len(rows):
-            return (
-                np.zeros(0, dtype=np.intp),
-                np.zeros(0, dtype=INSTANCE),
-                np.zeros(0, dtype=np.intp),
-            )
+            return None
         fleets = [self._fleet(one.vehicles) for one in driven]
         form, paint = (np.concatenate(column) for column in zip(*fleets, strict=True))
-        lean = np.concatenate([_leaning(one) for one in driven])
-        heading = np.concatenate([one.vehicles.heading for one in driven])
-        at = np.column_stack([xy - shots.anchor[whose], lean[:, 0]])
-        placed = turned_instances(at, lean[:, 1], lean[:, 2], heading, paint, LABELS["vehicle"])
-        return form[rows], placed[rows], 2 * whose[rows] + (np.arange(len(rows)) >= seen.sum())
+        lean = np.concatenate([_leaning(one) for one in driven])[rows]
+        heading = np.concatenate([one.vehicles.heading for one in driven])[rows]
+        picture = whose[rows]
+        at = np.column_stack([xy[rows] - shots.anchor[picture], lean[:, 0]])
+        turn = np.column_stack([lean[:, 1:], heading])
+        label = np.full(len(rows), LABELS["vehicle"])
+        shadow = (np.arange(len(rows)) >= seen.sum()).astype(np.intp)
+        return _Placed(form[rows], at, turn, paint[rows], label, picture, shadow)
 
     def _fleet(self, which: Vehicles) -> tuple[NDArray[np.intp], Floats]:
         """Return (N,) forms of vehicles, and their (N, 3) paints."""
@@ -116,27 +160,28 @@ class TrafficDrawing:
         shape = vehicles.vehicle_shape(name, size[0])
         return self._forms.id(("vehicle", shape, *size), partial(_vehicle_parts, shape, *size))
 
-    def _robots(self, driven: Sequence[Driven], shots: Shots) -> list[_Placed]:
+    def _robots(self, driven: Sequence[Driven], shots: Shots) -> _Placed | None:
         """Return the robots in their postures."""
         forms: list[int] = []
         rows: list[tuple[float, ...]] = []
-        parts: list[int] = []
-        for k, (one, anchor) in enumerate(zip(driven, shots.anchors, strict=True)):
-            shown = [2 * k] * one.body + [2 * k + 1] * one.shadows
+        pictures: list[int] = []
+        shadow: list[int] = []
+        for k, (one, anchor) in enumerate(zip(driven, shots.anchor, strict=True)):
+            shown = [0] * one.body + [1] * one.shadows
             if one.robot is None or not shown:
                 continue
             posture = posture_of(one.surface, one.model, one.robot)
             for form, row in self._bodies(one.model, posture, anchor):
                 forms += len(shown) * [form]
                 rows += len(shown) * [row]
-                parts += shown
+                pictures += len(shown) * [k]
+                shadow += shown
         if not rows:
-            return []
+            return None
         at = np.array(rows)
-        placed = turned_instances(
-            at[:, :3], at[:, 3], at[:, 4], at[:, 5], (1.0, 1.0, 1.0), LABELS["robot"]
-        )
-        return [(np.array(forms), placed, np.array(parts))]
+        label = np.full(len(rows), LABELS["robot"])
+        found = at[:, :3], at[:, 3:], np.ones((len(rows), 3)), label
+        return _Placed(np.array(forms), *found, np.array(pictures), np.array(shadow))
 
     def _bodies(
         self, model: Robot, posture: Posture, anchor: Floats

@@ -12,6 +12,7 @@ class Variant(IntFlag):
     WEATHER: colours are linear radiances, toned by `physics.cameras.gl.air`; fog glows at the sun
     LAMPS: street lamps and headlights light the surfaces
     WET, SNOW: surfaces are wet, or covered by snow
+    LAYERS: one draw fills many pictures, each a layer of an array texture
     """
 
     NONE = 0
@@ -20,6 +21,7 @@ class Variant(IntFlag):
     LAMPS = 4
     WET = 8
     SNOW = 16
+    LAYERS = 32
 
     @property
     def defines(self) -> str:

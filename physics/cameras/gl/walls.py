@@ -19,7 +19,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from physics.cameras.gl.corners import CornerRows, joined_corners
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT
-from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileRows
 from physics.ground.mesh import Mesh
 from physics.ground.tiles import CURB_M
 from physics.street.building_style import WINDOW_WALL_MIN_M, building_appearance
@@ -27,7 +27,7 @@ from physics.street.buildings import Building, facade_meshes
 from physics.textures.facade_canvas import BAY_M, STOREY_M
 from physics.textures.facades import BAY_VARIANTS, WallStyle
 
-_CORNER: Final = np.dtype(
+CORNER: Final = np.dtype(
     [
         ("at", "f4", 3),
         ("normal", "u1", 4),
@@ -47,7 +47,7 @@ fronts: layers of the front and of its bays with doors, door spacing, random num
 
 The door spacing is 16 times the bays from door to door, plus the first bay with a door.
 """
-_LAYOUT: Final = (
+LAYOUT: Final = (
     "3f 4f1 4f1 4f 4f1 4f1",
     "in_at",
     "in_normal",
@@ -140,11 +140,6 @@ def wall_shaders(
     )
 
 
-def wall_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
-    """Create the layer for rows of `wall_rows`."""
-    return TileLayer(context, shaders, _LAYOUT)
-
-
 def wall_rows(
     surfaces: Surfaces, buildings: Sequence[Building], styles: Sequence[WallStyle], middle: Floats
 ) -> TileRows | None:
@@ -173,7 +168,7 @@ def _parts(
     for facade, mesh in facade_meshes((building,)).items():
         if facade < 0 or not len(mesh):
             continue  # windows of the bullet camera; here they are textures
-        rows = np.zeros(len(mesh.vertices), dtype=_CORNER)
+        rows = np.zeros(len(mesh.vertices), dtype=CORNER)
         rows["at"] = mesh.vertices - np.array([*middle, 0.0])
         rows["normal"][:, :3] = np.rint(127.0 * mesh.normals) + 127.0
         flat = mesh.normals[:, 2] > 0.5
