@@ -102,7 +102,7 @@ class TrafficDrawing:
             form, at, turn, paint, label, picture, shadow = (
                 of[0] if len(of) == 1 else np.concatenate(of) for of in zip(*placed, strict=True)
             )
-            rows = turned_instances(at, *turn.T, paint, label)
+            rows = turned_instances(at, turn[:, 0], turn[:, 1], turn[:, 2], paint, label)
             self._things.set(form, rows, seats[picture], 2 * parts[picture] + shadow, count)
         else:
             self._things.clear(count)
