@@ -123,8 +123,8 @@ def _pieces(lines: shapely.Geometry) -> Floats:
     starts = np.concatenate([points[:-1] for points in parts])
     steps = np.concatenate([np.diff(points, axis=0) for points in parts])
     lengths = np.hypot(steps[:, 0], steps[:, 1])
-    long = lengths > 0.0
-    return np.column_stack([starts, steps / np.maximum(lengths, 1e-9)[:, None], lengths])[long]
+    rows: Floats = np.column_stack([starts, steps / np.maximum(lengths, 1e-9)[:, None], lengths])
+    return rows[lengths > 0.0]
 
 
 def _pieces_near(pieces: Floats, x_m: float, y_m: float) -> _Segments:
@@ -345,7 +345,7 @@ class Proxy:
         self._walk: Walk | None = None
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
-        self._outline: shapely.Geometry | None = None
+        self._outline: shapely.Geometry = shapely.LineString()
         self._border: Floats | None = None
         self._near_border: tuple[Circle, _Segments] = Circle(), ()
         self._inside = self._compared = Circle()
