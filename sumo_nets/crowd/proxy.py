@@ -123,8 +123,9 @@ def _pieces(lines: shapely.Geometry) -> Floats:
     starts = np.concatenate([points[:-1] for points in parts])
     steps = np.concatenate([np.diff(points, axis=0) for points in parts])
     lengths = np.hypot(steps[:, 0], steps[:, 1])
-    rows: Floats = np.column_stack([starts, steps / np.maximum(lengths, 1e-9)[:, None], lengths])
-    return rows[lengths > 0.0]
+    rows = np.column_stack([starts, steps / np.maximum(lengths, 1e-9)[:, None], lengths])
+    long: Floats = rows[lengths > 0.0]
+    return long
 
 
 def _pieces_near(pieces: Floats, x_m: float, y_m: float) -> _Segments:

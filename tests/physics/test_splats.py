@@ -362,7 +362,7 @@ def test_people_darken_the_splats_around_their_feet(sun: ScanSun | None) -> None
     assert np.abs(darker[ground & ~shadow]).max() <= 30
     middle_m = 3.0 + (1.0 if sun is None else 0.4)
     at_m = full.depth[shadow].mean()  # type: ignore[index]
-    assert at_m == pytest.approx(middle_m, abs=1.2)
+    assert at_m == pytest.approx(middle_m, abs=1.5)
     near = np.s_[120:]
     assert np.array_equal(behind.rgb[near], empty.rgb[near])
 
