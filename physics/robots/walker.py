@@ -15,8 +15,8 @@ ROTOR_KGM2: Final = 0.01
 """Inertia of a rotor at its joint."""
 SOLE_M: Final = 0.035
 """Distance of a sole below the roll joint of its ankle, and of its middle ahead of it."""
-_FOOT_HEIGHT_M: Final = 0.06
-"""Height of the box that collides for a foot, above the underside of the sole.
+_FOOT_HEIGHT_M: Final = 0.05
+"""Height of the visible foot, and of the box that collides for it, from the underside of the sole.
 
 Bullet pushes a box out of a triangle to its nearer side: a box as thin as the sole would fall
 through the ground.
