@@ -15,6 +15,13 @@ ROTOR_KGM2: Final = 0.01
 """Inertia of a rotor at its joint."""
 SOLE_M: Final = 0.035
 """Distance of a sole below the roll joint of its ankle, and of its middle ahead of it."""
+_FOOT_HEIGHT_M: Final = 0.05
+"""Height of the visible foot, and of the box that collides for it, from the underside of the sole.
+
+Bullet pushes a box out of a triangle to its nearer side: a box as thin as the sole would fall
+through the ground.
+"""
+_FOOT_MIDDLE_M: Final = (SOLE_M, 0.0, 0.5 * _FOOT_HEIGHT_M - SOLE_M)
 
 _TORQUES_NM: Final = torque_limits_nm(WALKER)
 _TILT_RAD: Final = 0.1749
@@ -100,7 +107,8 @@ def _leg_links(side: str, left: float) -> list[Link]:
             (0.0265, 0.0, -0.0164),
             (0.00022, 0.00162, 0.00167),
             (
-                Solid("box", (0.17, 0.06, 0.025), (SOLE_M, 0.0, -0.0225), _NONE, "rubber", True),
+                Solid("box", (0.17, 0.06, 0.025), (SOLE_M, 0.0, -0.0225), colour="rubber"),
+                Solid("box", (0.17, 0.06, _FOOT_HEIGHT_M), _FOOT_MIDDLE_M, touches=True),
                 Solid("box", (0.12, 0.05, 0.03), (0.01, 0.0, 0.0), colour="body"),
             ),
         ),
