@@ -91,7 +91,7 @@ vec3 reaching(int k, vec3 to, float far2) {{
     return lamp_light[k].rgb * (fade * fade * cone / (far2 + 0.3)) * unblocked(-to, lamp_light[k].w);
 }}
 float past_people(vec3 at, vec3 to) {{
-    // Share of a lamp's light that people leave; each is an upright post.
+    // Share of a lamp's light that people leave; each is an upright post that does not shade itself.
     float lit = 1.0, flat_m = length(to.xy);
     vec2 way = to.xy / max(flat_m, 0.01);
     int count = int(night.w);
@@ -101,7 +101,8 @@ float past_people(vec3 at, vec3 to) {{
         float high = at.z + to.z * along / max(flat_m, 0.01) - person[k].z;
         float soft = 0.04 + 0.03 * max(along, 0.0);
         float shade = fading(0.20 + soft, 0.20 - soft, aside) * fading(person[k].w + soft, person[k].w - soft, high);
-        lit *= 1.0 - shade * smoothstep(0.28, 0.40, along) * step(along, flat_m) * step(-0.5, high);
+        float own = mix(0.04, 0.28, smoothstep(0.03, 0.12, at.z - person[k].z));
+        lit *= 1.0 - shade * smoothstep(own, own + 0.12, along) * step(along, flat_m) * step(-0.5, high);
     }}
     return lit;
 }}
