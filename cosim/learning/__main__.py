@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from cosim.core.errors import SOME_CRASHED, CosimError
+from cosim.core.errors import TIME_IS_UP, CosimError
 from cosim.learning.settings import BATCHES, PLANNED_STEPS, Training
 from cosim.learning.training import train_and_report
 
@@ -49,7 +49,7 @@ def _main() -> None:
         )
     except CosimError as error:
         raise SystemExit(f"error: {error}") from None
-    raise SystemExit(0 if whole else SOME_CRASHED)
+    raise SystemExit(0 if whole else TIME_IS_UP)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -15,14 +16,19 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from cosim.core.errors import CosimError, RunError, SpecError
+from cosim.cli.collect import DemoConfig, _source
+from cosim.core.errors import CosimError, RunError, SpecError, UsageError
 from cosim.core.packed_demos import FREE_RAYS, LABELLED_PEOPLE, read_packed
+from cosim.core.progress import ignore
 from cosim.core.state import Command
+from cosim.policies.load import load_policy
 from cosim.spec.camera import CameraSpec
 from cosim.spec.demo_options import DemoOptions, recording_manifest
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.manifest import Manifest
+from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
+from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Suite, write_suite
 from cosim.spec.sensors import PEOPLE_ROWS, ScanSpec
 from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pictures
@@ -32,8 +38,9 @@ from scenarios.episodes.demonstration import (
     glimpse,
     waypoints_ahead,
 )
-from scenarios.episodes.demonstrator import _Bursts
+from scenarios.episodes.demonstrator import Demonstrator, _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
+from scenarios.tools.dataset.collect import _Rounds
 from scenarios.tools.dataset.collected import Collected
 from scenarios.tools.dataset.lerobot import Filmed, write_lerobot
 from scenarios.tools.dataset.pack import pack_raw
@@ -484,6 +491,33 @@ def test_cities_of_the_suites_are_refused(words: str) -> None:
     asked for."""
     with pytest.raises(CosimError, match=f"--cities {words}: .*900:940"):
         fresh_cities(words)
+
+
+@pytest.mark.parametrize(
+    ("suite", "more", "words"),
+    [
+        ("reactive", {"weathers": "rain,fog"}, "--weathers and --weather do not go together"),
+        ("unit", {"cities": "900:901", "decoys": True}, "new scenarios of unit have no decoys"),
+    ],
+    ids=["weathers", "decoys"],
+)
+def test_options_that_contradict_each_other_are_refused(
+    suite: str, more: dict[str, Any], words: str
+) -> None:
+    """Two ways to set the weather, and decoys of a suite that has none."""
+    with pytest.raises(UsageError, match=words):
+        _source(RunConfig(suite=suite, weather="snow"), DemoConfig(**more))
+
+
+def test_raw_demonstrations_name_the_robot_of_their_scenarios(tmp_path: Path) -> None:
+    """It is that of the suite's scenarios, unless another robot is requested."""
+    way = short_way("s").driven_by("scout")
+    whole = Suite(name="ways", version="1", scenarios=(way,))
+    demonstrator = Demonstrator(load_policy("orca"), DemoOptions(format="raw"), "route_point")
+    for requested, robot in (("", "scout"), ("courier", "courier")):
+        options = EpisodeOptions(robot=requested)
+        rounds = _Rounds(whole, tmp_path, "orca", demonstrator, options, 1, math.inf, ignore)
+        assert rounds.robot == robot
 
 
 def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:

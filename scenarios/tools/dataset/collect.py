@@ -39,7 +39,6 @@ from cosim.results.run_folder import DEMONSTRATION, RunFolder
 from cosim.results.run_spec import brief
 from cosim.spec.demo_options import DemoOptions
 from cosim.spec.options import EpisodeOptions, PolicyHost
-from cosim.spec.robot import COURIER
 from cosim.spec.run_config import DataFormat
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.episodes.demonstration import Demonstration, check_parquet
@@ -192,7 +191,7 @@ def collect(
     spec = rounds.asked(wanted or len(rounds.all), expert)
     _open(out, spec, resume)
     if form == "raw":
-        _write_about(out, spec, demonstrator)
+        _write_about(out, _about(spec, demonstrator, rounds.robot))
     beside = (
         None
         if learner is None
@@ -265,14 +264,24 @@ class _Rounds:
         """The scenarios of a suite."""
         return () if isinstance(self.source, Fresh) else self.source.scenarios
 
+    @property
+    def robot(self) -> str:
+        """The robot of the scenarios, in suites with several that of the first one."""
+        return self._whole.scenarios[0].robot
+
+    @property
+    def _whole(self) -> Suite:
+        """The scenarios of a suite with the requested robot, or a placeholder for new ones."""
+        some = self.all or _nowhere(self.source)
+        return with_robot(
+            Suite(name="asked", version="1", scenarios=tuple(some)), self.options.robot
+        )
+
     def asked(self, episodes: int, expert: PolicyCaller) -> CollectSpec:
         """Return the requested options, checked as far as possible without a place. Raises
         UsageError.
         """
-        some = self.all or _nowhere(self.source)
-        whole = with_robot(
-            Suite(name="asked", version="1", scenarios=tuple(some)), self.options.robot
-        )
+        whole = self._whole
         told = run_spec(whole, whole.scenarios, self.policy, self.demonstrator, self.options)
         is_fresh = isinstance(self.source, Fresh)
         return CollectSpec(
@@ -465,9 +474,8 @@ def _written(
     return back
 
 
-def _write_about(out: Path, spec: CollectSpec, demonstrator: Demonstrator) -> None:
+def _write_about(out: Path, about: dict[str, Any]) -> None:
     """Write what packing needs beside the runs. Raises MachineError."""
-    about = _about(spec, demonstrator, spec.robot or COURIER.name)
     try:
         write_atomic(out / ABOUT, json.dumps(about, indent=1).encode() + b"\n")
     except OSError as error:
