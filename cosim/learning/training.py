@@ -124,6 +124,8 @@ def _train(
         state.step += 1
         over = time.monotonic() - began_s > 60.0 * training.minutes
         scheduled = is_evaluated(state.step, steps)
+        if over and not scheduled:  # an evaluation may outlast the time that is left
+            _write_checkpoint(checkpoint, state, spec)
         if scheduled or over:
             parts = {f"{name}_loss": float(part) for name, part in loss_parts.items()}
             row = {

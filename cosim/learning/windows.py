@@ -69,7 +69,8 @@ class Windows:
     goal, speeds: (B, T, 2) inputs
     valid: (B, T) whether a step belongs to the episode; of the fields below only such rows exist
     speed, turn, stop, way, driven: see `objective.PlanTargets`
-    near: (N, LABELLED_PEOPLE, 6), free: (N, FREE_RAYS), scene: (N, 2) labels
+    near: (N, LABELLED_PEOPLE, 6), free: (N, FREE_RAYS), scene: (N, 2) labels; (N, 0) unless
+        auxiliary heads are trained
     """
 
     pictures: Tensor
@@ -125,11 +126,9 @@ class WindowExamples:
             arrays = [getattr(one, name) for one in packed]
             return torch.from_numpy(np.concatenate(arrays)).to(device)
 
-        self._rows = {
-            name: joined(name)
-            for name in ("state", "goal", "command", "waypoints", "driven", *LABELS)
-            if getattr(packed[0], name).size
-        }
+        labels = LABELS if training.auxiliary else ()
+        names = ("state", "goal", "command", "waypoints", "driven", *labels)
+        self._rows = {name: joined(name) for name in names}
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
         changes = self.learned[((command < STOPS_MPS) != (state < STOPS_MPS))[self.learned]]
         self._changes = changes if len(changes) else self.learned
@@ -330,11 +329,13 @@ def _checked(path: Path, training: Training) -> Packed:
             f"{path}: goals are no points ({packed.meta.get('goal')}): cosim collect --goal "
             f"route_point"
         )
-    if training.auxiliary and not packed.scene.size:
+    if not training.auxiliary:
+        return packed
+    if not packed.scene.size:
         raise RunError(
             f"{path}: has no labels for auxiliary heads: cosim collect --labels, or train with "
             f"--no-auxiliary"
         )
-    if packed.scene.size and (packed.scene.max(axis=0) >= [SIGNALS, EVENTS]).any():
+    if (packed.scene.max(axis=0) >= [SIGNALS, EVENTS]).any():
         raise RunError(f"{path}: labels of another version: collect it again")
     return packed

@@ -262,6 +262,8 @@ def test_settings_of_ablations_are_checked(data: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="cosim collect --labels, or train with --no-auxiliary"):
         WindowExamples([tmp_path / "plain.npz"], BRISK, CPU)
     plain = replace(BRISK, auxiliary=False, steps=1, share=0.5)
+    mixed = WindowExamples([data, tmp_path / "plain.npz"], plain, CPU)
+    assert mixed.windows(np.array([0]), 2).scene.shape == (2, 0)
     assert train([tmp_path / "plain.npz"], tmp_path / "net", plain, False, ignore).whole
     with pytest.raises(RunError, match=r"of another training: share 0\.5, not 1\.0"):
         train([tmp_path / "plain.npz"], tmp_path / "net", replace(plain, share=1.0), True, ignore)
