@@ -12,7 +12,7 @@ import typer
 from cosim.cli.console import notice
 from cosim.cli.options import LEARN
 from cosim.core.errors import TIME_IS_UP, MachineError
-from cosim.learning.settings import BATCHES, PLANNED_STEPS, TO_INSTALL, Training
+from cosim.learning.settings import PLANNED_STEPS, TO_INSTALL, Training, batches_in_words
 
 train_app = typer.Typer()
 
@@ -64,7 +64,7 @@ def train_command(
         typer.Option(
             min=1,
             help="Examples per step, of sidewalk windows of 8 s.",
-            show_default=", ".join(f"{size} of {name}" for name, size in BATCHES.items()),
+            show_default=batches_in_words(),
         ),
     ] = None,
     rate: Annotated[float, typer.Option(help="Peak learning rate; it then falls to 0.")] = 1e-3,

@@ -134,7 +134,7 @@ class PolicyCaller:
         """Set a callback for raw answers, before checks and limits."""
         self._on_answer = hears
 
-    def on_wait(self, hears: Callable[[str], None]) -> None:
+    def on_reason(self, callback: Callable[[str], None]) -> None:
         """Set a callback for the reasons for which the policy waits. Most policies give none."""
 
     def ended(self) -> None:

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from cosim.core.errors import UsageError
+from scenarios.examples.black_pictures import Blinded
+
 SCRIPT = Path(__file__).parents[2] / "scenarios/examples/sidewalk_policy.sh"
 COMMAND = """#!/usr/bin/env bash
 echo "$(basename "$0") $*" >> "$CALLS"
@@ -97,3 +100,17 @@ def test_a_collection_must_fit_in_a_piece(tmp_path: Path) -> None:
     done, calls = called(tmp_path, COLLECT="9")
     assert (done.returncode, calls) == (2, [])
     assert done.stdout == "COLLECT=9 must be less than MINUTES=9\n"
+
+
+def test_black_pictures_have_the_name_and_hash_of_their_policy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So another policy is another run. Without a policy the message says how to set one."""
+    names = set()
+    for policy in ("small", "small-reactive"):
+        monkeypatch.setenv("POLICY", policy)
+        names.add(Blinded().manifest.name.removeprefix(f"{policy}-black-"))
+    assert [len(name) for name in names] == [8, 8]
+    monkeypatch.delenv("POLICY")
+    with pytest.raises(UsageError, match="set POLICY, the policy that drives"):
+        Blinded()
