@@ -135,8 +135,8 @@ def _train(
             }
             if not math.isfinite(sum(row.values())):
                 raise RunError(
-                    f"{folder}: nothing is learned any more at step {state.step}: train "
-                    f"anew, at a lower --rate"
+                    f"{folder}: losses are not finite at step {state.step}: train again, at a "
+                    f"lower --rate"
                 )
             write_curve(folder, [*state.curve, row])
             # An evaluation at the time limit is only in the file, so that a resumed training
@@ -250,7 +250,9 @@ def _read_checkpoint(
         averaged = {name: value.to(device) for name, value in checkpoint["averaged"].items()}
         step = checkpoint["step"]
     except Exception as error:
-        raise RunError(f"{path}: cannot be continued: {error}: delete it and train anew") from error
+        raise RunError(
+            f"{path}: cannot be continued: {error}: delete it and train again"
+        ) from error
     refuse_another(path, was, spec)
     steps = planned_steps(path, training.steps, plans[-1], step)
     return _State(

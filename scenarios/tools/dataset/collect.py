@@ -1,9 +1,9 @@
 """Collect a data set of an expert that drives scenarios, with the pictures of a camera.
 
 OUT/collect.json      options of the collection; other options are refused
-OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode; another one is
-                      added if too few are solved. They may be deleted once
-                      the data set is complete
+OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode; one is added if
+                      too few are solved. Of other formats than raw, they may be deleted once the
+                      data set is complete
 OUT/writing           unfinished data set
 OUT/about.json        with the format raw: what `cosim dataset pack` needs beside the runs, in
                       place of the following
@@ -104,7 +104,7 @@ def _refuse(path: Path, name: str, mine: object, theirs: object) -> None:
     if mine != theirs:
         raise RunError(
             f"{path} is of another data set: its {name} is {brief(mine)}, now asked for is "
-            f"{brief(theirs)}. Go on with the same command, or choose another --out."
+            f"{brief(theirs)}. Continue with the same command, or choose another --out."
         )
 
 
@@ -227,11 +227,11 @@ def collect(
             number = number + 1
         whole = len(found) >= spec.episodes or not rounds.over()
         if not found and whole:
-            told = (
+            reasons = (
                 "; ".join(f"{words} ({count})" for words, count in dropped.most_common())
                 or "none were drawn"
             )
-            raise SpecError(f"{out}: nothing to keep of {run} episodes: {told}")
+            raise SpecError(f"{out}: none of {run} episodes can be stored: {reasons}")
         kept = found[: spec.episodes]
         back = None
         if whole and form == "rosbag2":
@@ -381,8 +381,8 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
             found.refuse_other(spec, out)
             if not resume:
                 raise RunError(
-                    f"{out} already holds a data set, or a part of one. Add --resume to go "
-                    f"on with it."
+                    f"{out} already holds a data set, or a part of one. Add --resume to "
+                    f"continue it."
                 )
             return
         if out.exists() and (
@@ -417,7 +417,7 @@ def _loaded(path: Path) -> Demonstration:
         return Demonstration.decoded(path.read_bytes(), path)
     except OSError as error:
         raise RunError(
-            f"{path}: cannot be read: {error.strerror}: collect it anew, in another --out"
+            f"{path}: cannot be read: {error.strerror}: collect it again, in another --out"
         ) from error
 
 
@@ -469,7 +469,7 @@ def _written(
         writing.rmdir()
     except OSError as error:
         raise unwritable(
-            out, error, "episodes are kept; make room and go on with --resume"
+            out, error, "episodes are stored; make room and continue with --resume"
         ) from error
     return back
 

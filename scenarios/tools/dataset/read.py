@@ -70,7 +70,7 @@ class DataSet:
             first += shown
         if first != len(self):
             raise RunError(
-                f"{self.folder}: {first} pictures and {len(self)} rows: collect it anew, in "
+                f"{self.folder}: {first} pictures and {len(self)} rows: collect it again, in "
                 f"another --out"
             )
 
