@@ -127,8 +127,8 @@ class WindowExamples:
             return torch.from_numpy(np.concatenate(arrays)).to(device)
 
         labels = LABELS if training.auxiliary else ()
-        names = ("state", "goal", "command", "waypoints", "driven", *labels)
-        self._rows = {name: joined(name) for name in names}
+        arrays = ("state", "goal", "command", "waypoints", "driven", *labels)
+        self._rows = {name: joined(name) for name in arrays}
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
         changes = self.learned[((command < STOPS_MPS) != (state < STOPS_MPS))[self.learned]]
         self._changes = changes if len(changes) else self.learned
