@@ -43,8 +43,9 @@ app = typer.Typer(
     help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
     epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND "
     "--help`\n\nExit codes: 0 done, of a run: all is scored; 1 ended, but not all is scored, or a "
-    "check has failed; 2 wrong use or bad input; 3 the machine or an engine; 130 interrupted, by "
-    "Ctrl-C or SIGTERM: finished episodes are stored; 141 the output was closed early.",
+    "check has failed; 2 wrong use or bad input; 3 the machine or an engine; 4 the time of "
+    "--minutes is over; 130 interrupted, by Ctrl-C or SIGTERM: finished episodes are stored; 141 "
+    "the output was closed early.",
 )
 for commands in (
     *(run_app, list_app, show_app, installation_app, cache_app),

@@ -19,7 +19,7 @@ from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import LEARN, camera_here, check_output, parse_size, replacement_note
 from cosim.cli.progress import doing, stages_in_lines
 from cosim.cli.run_progress import ProgressDisplay
-from cosim.core.errors import INTERRUPTED, SOME_CRASHED, UsageError
+from cosim.core.errors import INTERRUPTED, TIME_IS_UP, UsageError
 from cosim.spec.run_config import DataFormat, Option, RunConfig
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ class DemoConfig:
     minutes: Annotated[
         float,
         Option(
-            "Begin no episode after so long, and end with exit code 1: --resume continues.",
+            "Begin no episode after so long, and end with exit code 4: --resume continues.",
             default="no limit",
             least=0.0,
         ),
@@ -262,7 +262,7 @@ def collect_command(
         raise typer.Exit(INTERRUPTED) from None
     if not found.whole:
         _print_stopped(f"The time is up after {found.kept} episodes", folder)
-        raise typer.Exit(SOME_CRASHED)
+        raise typer.Exit(TIME_IS_UP)
     _print_end(found, folder, time.monotonic() - began_s)
     if config.episodes is not None and found.kept < config.episodes:
         err.print(f"There are no more: {config.episodes} were requested.", highlight=False)
@@ -330,7 +330,13 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
             f"{' and '.join(given)} do not go together: scenarios are drawn in places, or are "
             f"a suite's"
         )
+    if demo.weathers and config.weather:
+        raise UsageError("--weathers and --weather do not go together: give one of them")
     if demo.cities:
+        if demo.decoys and config.suite != "reactive":
+            raise UsageError(
+                f"--decoys goes with reactive: new scenarios of {config.suite} have no decoys"
+            )
         cities = fresh_cities(demo.cities)
         return fresh(config.suite, cities, config.event, demo.city_size, demo.decoys)
     if demo.decoys:

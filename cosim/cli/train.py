@@ -11,8 +11,8 @@ import typer
 
 from cosim.cli.console import notice
 from cosim.cli.options import LEARN
-from cosim.core.errors import SOME_CRASHED, MachineError
-from cosim.learning.settings import BATCHES, PLANNED_STEPS, TO_INSTALL, Training
+from cosim.core.errors import TIME_IS_UP, MachineError
+from cosim.learning.settings import PLANNED_STEPS, TO_INSTALL, Training, batches_in_words
 
 train_app = typer.Typer()
 
@@ -45,7 +45,11 @@ def train_command(
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Seed of initial parameters, batches and held-out episodes.")
+        int,
+        typer.Option(
+            min=0,
+            help="Seed of initial parameters and batches; of small also of held-out episodes.",
+        ),
     ] = 0,
     network: Annotated[
         str,
@@ -60,7 +64,7 @@ def train_command(
         typer.Option(
             min=1,
             help="Examples per step, of sidewalk windows of 8 s.",
-            show_default=", ".join(f"{size} of {name}" for name, size in BATCHES.items()),
+            show_default=batches_in_words(),
         ),
     ] = None,
     rate: Annotated[float, typer.Option(help="Peak learning rate; it then falls to 0.")] = 1e-3,
@@ -70,7 +74,7 @@ def train_command(
     minutes: Annotated[
         float,
         typer.Option(
-            help="Stop after so long, with a bundle and exit code 1: --resume continues.",
+            help="Stop after so long, with a bundle and exit code 4: --resume continues.",
             show_default="no limit",
         ),
     ] = math.inf,
@@ -130,4 +134,4 @@ def train_command(
         weather=not no_weather,
     )
     if not train_and_report(data, out, training, resume, notice):
-        raise typer.Exit(SOME_CRASHED)
+        raise typer.Exit(TIME_IS_UP)

@@ -31,6 +31,8 @@ WRONG_USE = 2
 """Exit code for wrong input."""
 BROKEN_MACHINE = 3
 """Exit code for a failed engine or machine."""
+TIME_IS_UP = 4
+"""Exit code of a collection or training that --minutes ended; --resume continues it."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells use it."""
 BROKEN_PIPE = 141

@@ -130,11 +130,11 @@ class PolicyCaller:
         self._has_answered = True
         return command
 
-    def on_answer(self, hears: Callable[[object], None]) -> None:
+    def on_answer(self, callback: Callable[[object], None]) -> None:
         """Set a callback for raw answers, before checks and limits."""
-        self._on_answer = hears
+        self._on_answer = callback
 
-    def on_wait(self, hears: Callable[[str], None]) -> None:
+    def on_reason(self, callback: Callable[[str], None]) -> None:
         """Set a callback for the reasons for which the policy waits. Most policies give none."""
 
     def ended(self) -> None:

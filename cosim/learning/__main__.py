@@ -6,8 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from cosim.core.errors import SOME_CRASHED, CosimError
-from cosim.learning.settings import BATCHES, PLANNED_STEPS, Training
+from cosim.core.errors import TIME_IS_UP, CosimError
+from cosim.learning.settings import NETWORK_DEFAULTS, PLANNED_STEPS, Training, batches_in_words
 from cosim.learning.training import train_and_report
 
 
@@ -27,8 +27,8 @@ def _main() -> None:
         "--steps", type=int, help=f"in all; by default {PLANNED_STEPS}, or as planned before"
     )
     parser.add_argument("--seed", type=int, default=default.seed)
-    parser.add_argument("--network", default=default.network, choices=list(BATCHES))
-    parser.add_argument("--batch", type=int, help=f"by default {dict(BATCHES)}")
+    parser.add_argument("--network", default=default.network, choices=list(NETWORK_DEFAULTS))
+    parser.add_argument("--batch", type=int, help=f"by default {batches_in_words()}")
     parser.add_argument("--rate", type=float, default=default.rate)
     parser.add_argument("--device", default=default.device)
     parser.add_argument("--minutes", type=float, default=default.minutes, help="stop after so long")
@@ -49,7 +49,7 @@ def _main() -> None:
         )
     except CosimError as error:
         raise SystemExit(f"error: {error}") from None
-    raise SystemExit(0 if whole else SOME_CRASHED)
+    raise SystemExit(0 if whole else TIME_IS_UP)
 
 
 if __name__ == "__main__":

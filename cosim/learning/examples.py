@@ -22,15 +22,14 @@ from cosim.learning.network import (
     CRUISE_MPS,
     GOAL_MOST_M,
     GOAL_UNIT_M,
-    HEIGHT_PX,
     HISTORY,
     PICTURE_INTERVAL,
     SPEED_MEAN_MPS,
     SPEED_UNIT_MPS,
     TURN_UNIT_RADPS,
     WAYPOINTS,
-    WIDTH_PX,
 )
+from cosim.learning.packed_checks import check_pictures, check_rows, common_meta
 
 HELD_OUT: Final = 0.1
 """Share of episodes that are held out."""
@@ -57,7 +56,6 @@ CHANGE_SHARE: Final = 0.3
 Only one row in fifty is such a change; trained on the others alone, a network keeps its speed.
 """
 _ROUNDING: Final = 1e-4
-LISTED: Final = ("policy", "learner")
 _SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal", "robot")
 
 
@@ -92,17 +90,7 @@ class Examples:
 
     def __init__(self, paths: Sequence[Path], seed: int, device: torch.device) -> None:
         packed = [_checked(path) for path in paths]
-        self.meta: dict[str, Any] = dict(packed[0].meta)
-        for path, other in zip(paths[1:], packed[1:], strict=True):
-            for field in _SAME_META:
-                if other.meta.get(field) != self.meta.get(field):
-                    raise RunError(
-                        f"{path}: {field} is {other.meta.get(field)}, and {self.meta.get(field)} "
-                        f"in {paths[0]}: train on demonstrations that were collected alike"
-                    )
-        self.meta |= {
-            name: [value for one in packed for value in one.meta.get(name, [])] for name in LISTED
-        }
+        self.meta = common_meta(paths, packed, _SAME_META)
         first_rows = np.cumsum([0, *(len(one) for one in packed)])
         first_episodes = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         history = np.concatenate(
@@ -272,25 +260,11 @@ def _select(first: Tensor, one: Batch, other: Batch) -> Batch:
 def _checked(path: Path) -> Packed:
     """Load a file. Raises RunError if this network cannot learn from it."""
     packed = read_packed(path)
-    size = packed.frames.shape[1:3]
-    ahead = packed.waypoints.shape[1]
-    if not len(packed):
-        raise RunError(f"{path}: holds no demonstration: collect more episodes")
-    if size != (HEIGHT_PX, WIDTH_PX):
-        raise RunError(
-            f"{path}: pictures of {size[1]} x {size[0]} pixels, wanted are {WIDTH_PX} x "
-            f"{HEIGHT_PX}: cosim collect --camera {WIDTH_PX}x{HEIGHT_PX}"
-        )
-    if ahead < WAYPOINTS:
-        raise RunError(f"{path}: {ahead} waypoints a row, wanted are {WAYPOINTS}")
+    check_rows(path, packed)
+    check_pictures(path, packed.frames)
     if (fastest := float(np.abs(packed.command[:, 1]).max())) > TURN_UNIT_RADPS + _ROUNDING:
         raise RunError(
             f"{path}: the expert turns at {fastest:.2f} rad/s, and this network at "
             f"{TURN_UNIT_RADPS:g} at most: cosim collect with the courier"
-        )
-    if np.isnan(packed.goal).any():
-        raise RunError(
-            f"{path}: goals are no points ({packed.meta.get('goal')}): cosim collect --goal "
-            f"route_point"
         )
     return packed

@@ -40,10 +40,10 @@ MEMORY_OUTPUTS: Final = {
 }
 
 
-def build_memory_graph(parameters: Parameters, keeps: bool = True) -> bytes:
+def build_memory_graph(parameters: Parameters, carries: bool = True) -> bytes:
     """Build the graph of a step, equal to `memory_network.forward_steps` and `network.plan`.
 
-    keeps: whether the memory is carried; else the output is 0.
+    carries: whether the memory is carried; else the output is 0.
     """
     g = GraphWriter(parameters, STRIDES)
     grey, contrast = g.constant("grey", 0.5), g.constant("contrast", 4.0)
@@ -55,10 +55,10 @@ def build_memory_graph(parameters: Parameters, keeps: bool = True) -> bytes:
             for name in stage:
                 x = g.relu(g.conv(x, name, {"stem": 5, "narrow": 1}.get(name, 3)))
     image = g.relu(g.linear(g.add("Flatten", [x]), "seen"))
-    told = g.relu(g.linear(g.add("Concat", ["goal", "speeds"], axis=1), "told"))
-    joined = g.relu(g.linear(g.add("Concat", [image, told], axis=1), "joined"))
+    inputs = g.relu(g.linear(g.add("Concat", ["goal", "speeds"], axis=1), "inputs"))
+    joined = g.relu(g.linear(g.add("Concat", [image, inputs], axis=1), "joined"))
     after = _remembered(g, joined)
-    g.add("Mul", [after, g.constant("keeps", float(keeps))], NEXT)
+    g.add("Mul", [after, g.constant("carries", float(carries))], NEXT)
     known = g.relu(g.linear(g.add("Concat", [joined, after], axis=1), "known"))
     g.plan(known)
     for name in AUXILIARY:
@@ -70,9 +70,9 @@ def build_memory_graph(parameters: Parameters, keeps: bool = True) -> bytes:
 def _remembered(g: GraphWriter, joined: str) -> str:
     """Add the gated recurrent unit; return the memory after the step."""
     sides = g.constant("gates", [MEMORY] * 3, np.int64)
-    names = [[f"{kind}{k}" for k in range(3)] for kind in ("arriving", "kept")]
+    names = [[f"{kind}{k}" for k in range(3)] for kind in ("arriving", "recurrent")]
     g.split(g.linear(joined, "arriving"), sides, names[0])
-    g.split(g.linear("memory", "kept"), sides, names[1])
+    g.split(g.linear("memory", "recurrent"), sides, names[1])
     (reset_in, update_in, new_in), (reset_was, update_was, new_was) = names
     reset = g.add("Sigmoid", [g.add("Add", [reset_in, reset_was])])
     update = g.add("Sigmoid", [g.add("Add", [update_in, update_was])])

@@ -35,7 +35,7 @@ EVENTS: Final = 9
 """Classes of events: none, and the eight kinds."""
 
 _IMAGE: Final = 320
-_TOLD: Final = 64
+_INPUTS: Final = 64
 _JOINED: Final = 320
 _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
     "stem": (24, 3 * PICTURES, 5, 5),
@@ -52,10 +52,10 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
     "block5b": (160, 160, 3, 3),
     "narrow": (64, 160, 1, 1),
     "seen": (_IMAGE, 64 * 6 * 10),
-    "told": (_TOLD, 4),
-    "joined": (_JOINED, _IMAGE + _TOLD),
+    "inputs": (_INPUTS, 4),
+    "joined": (_JOINED, _IMAGE + _INPUTS),
     "arriving": (3 * MEMORY, _JOINED),
-    "kept": (3 * MEMORY, MEMORY),
+    "recurrent": (3 * MEMORY, MEMORY),
     "known": (_JOINED, _JOINED + MEMORY),
     "speed": (1, _JOINED),
     "turn": (TURN_BINS, _JOINED),
@@ -114,13 +114,13 @@ def new_memory_parameters(seed: int) -> dict[str, Tensor]:
     parameters: dict[str, Tensor] = {}
     for name, shape in _SHAPES.items():
         quiet = name.endswith("b") or name in HEADS
-        gates = name in ("arriving", "kept")
+        gates = name in ("arriving", "recurrent")
         fan = math.prod(shape[1:])
         scale = 0.02 if quiet else math.sqrt((1.0 if gates else 2.0) / fan)
         parameters[f"{name}.weight"] = scale * torch.randn(shape, generator=draws)
         parameters[f"{name}.bias"] = torch.zeros(shape[0])
     parameters["speed.bias"] += 0.8
-    parameters["kept.bias"][MEMORY : 2 * MEMORY] += 1.0  # at first the memory mostly stays
+    parameters["recurrent.bias"][MEMORY : 2 * MEMORY] += 1.0  # at first the memory mostly stays
     return parameters
 
 
@@ -145,17 +145,17 @@ def _linear(parameters: Parameters, x: Tensor, name: str) -> Tensor:
     return functional.linear(x, parameters[f"{name}.weight"], parameters[f"{name}.bias"])
 
 
-def remembered(parameters: Parameters, joined: Tensor, memory: Tensor, keeps: bool) -> Tensor:
-    """Return (B, T, MEMORY) the memory after each step. keeps: False clears it at each step."""
+def remembered(parameters: Parameters, joined: Tensor, memory: Tensor, carries: bool) -> Tensor:
+    """Return (B, T, MEMORY) the memory after each step. carries: False clears it at each step."""
     arriving = _linear(parameters, joined, "arriving")
     found = []
     for step in arriving.unbind(1):
-        kept = _linear(parameters, memory, "kept")
-        reset, update = (step[:, : 2 * MEMORY] + kept[:, : 2 * MEMORY]).sigmoid().chunk(2, 1)
-        new = (step[:, 2 * MEMORY :] + reset * kept[:, 2 * MEMORY :]).tanh()
+        recurrent = _linear(parameters, memory, "recurrent")
+        reset, update = (step[:, : 2 * MEMORY] + recurrent[:, : 2 * MEMORY]).sigmoid().chunk(2, 1)
+        new = (step[:, 2 * MEMORY :] + reset * recurrent[:, 2 * MEMORY :]).tanh()
         after = update * memory + (1.0 - update) * new
         found.append(after)
-        memory = after if keeps else memory
+        memory = after if carries else memory
     return torch.stack(found, 1)
 
 
@@ -165,20 +165,20 @@ def forward_steps(
     goal: Tensor,
     speeds: Tensor,
     memory: Tensor,
-    keeps: bool = True,
+    carries: bool = True,
 ) -> MemoryOutput:
     """Compute the raw outputs of T steps.
 
     pictures: (B, T, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first
     goal, speeds: (B, T, 2), see `network.forward`
     memory: (B, MEMORY) before the first step, 0 at the start of an episode
-    keeps: whether the memory is carried from step to step
+    carries: whether the memory is carried from step to step
     """
     batch, steps = goal.shape[:2]
     image = encoded(parameters, pictures.flatten(0, 1))
-    told = _linear(parameters, torch.cat([goal, speeds], 2).flatten(0, 1), "told").relu()
-    joined = _linear(parameters, torch.cat([image, told], 1), "joined").relu()
-    after = remembered(parameters, joined.unflatten(0, (batch, steps)), memory, keeps)
+    inputs = _linear(parameters, torch.cat([goal, speeds], 2).flatten(0, 1), "inputs").relu()
+    joined = _linear(parameters, torch.cat([image, inputs], 1), "joined").relu()
+    after = remembered(parameters, joined.unflatten(0, (batch, steps)), memory, carries)
     both = torch.cat([joined, after.flatten(0, 1)], 1)
     known = _linear(parameters, both, "known").relu()
     raw = {name: _linear(parameters, known, name).float() for name in HEADS}
@@ -193,5 +193,5 @@ def forward_steps(
         raw["free"],
         raw["signal"],
         raw["event"],
-        after[:, -1] if keeps else torch.zeros_like(memory),
+        after[:, -1] if carries else torch.zeros_like(memory),
     )

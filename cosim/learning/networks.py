@@ -1,4 +1,4 @@
-"""Table of the networks that `cosim train` trains; `cosim.learning.settings.BATCHES` names them."""
+"""Table of the networks that `cosim train` trains, named as in `settings.NETWORK_DEFAULTS`."""
 
 from __future__ import annotations
 

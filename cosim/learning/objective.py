@@ -76,12 +76,12 @@ class PlanErrors:
         self._rows += rows
         for name, value in (
             ("loss", loss * rows),
-            ("goers", both.sum()),
+            ("moving", both.sum()),
             ("speed", speeds[both, 0].abs().sum()),
             ("turn", speeds[both, 1].abs().sum()),
             ("stops", targets.stop.sum()),
-            ("seen", (stops & (targets.stop > 0.0)).sum()),
-            ("said", stops.sum()),
+            ("stops_found", (stops & (targets.stop > 0.0)).sum()),
+            ("stops_predicted", stops.sum()),
             ("ends", targets.driven[:, -1].sum()),
             ("way", (off_m * targets.driven[:, -1]).sum()),
         ):
@@ -94,12 +94,12 @@ class PlanErrors:
         and recall and precision of stops.
         """
         sums = self._sums
-        goers, ends = max(sums["goers"], 1.0), max(sums["ends"], 1.0)
+        moving, ends = max(sums["moving"], 1.0), max(sums["ends"], 1.0)
         return {
             "held_out_loss": sums["loss"] / max(self._rows, 1),
-            "speed_error_mps": sums["speed"] / goers,
-            "turn_error_radps": sums["turn"] / goers,
+            "speed_error_mps": sums["speed"] / moving,
+            "turn_error_radps": sums["turn"] / moving,
             "way_error_m": sums["way"] / ends,
-            "stops_found": sums["seen"] / max(sums["stops"], 1.0),
-            "stops_right": sums["seen"] / max(sums["said"], 1.0),
+            "stops_found": sums["stops_found"] / max(sums["stops"], 1.0),
+            "stops_right": sums["stops_found"] / max(sums["stops_predicted"], 1.0),
         }

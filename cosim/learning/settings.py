@@ -11,8 +11,22 @@ from typing import Any, Final, NamedTuple
 
 from cosim.core.errors import RunError, UsageError, unknown
 
-BATCHES: Final[Mapping[str, int]] = MappingProxyType({"small": 256, "sidewalk": 48})
-"""Networks, with their default numbers of examples or windows in a step."""
+
+class NetworkDefaults(NamedTuple):
+    """Row of a network.
+
+    batch: default number of examples or windows per step
+    has_ablations: whether it has the settings of ablations
+    """
+
+    batch: int
+    has_ablations: bool = False
+
+
+NETWORK_DEFAULTS: Final[Mapping[str, NetworkDefaults]] = MappingProxyType(
+    {"small": NetworkDefaults(256), "sidewalk": NetworkDefaults(48, has_ablations=True)}
+)
+"""Table of the networks; `cosim.learning.networks` has what needs PyTorch."""
 PLANNED_STEPS: Final = 20_000
 """Default number of steps of a training."""
 _EVALUATIONS: Final = 20
@@ -32,13 +46,22 @@ TO_INSTALL: Final = (
 _ABLATIONS: Final = ("share", "memory", "auxiliary", "decoys", "weather")
 
 
+def batches_in_words() -> str:
+    """Return the default numbers of examples of all networks.
+
+    >>> batches_in_words()
+    '256 of small, 48 of sidewalk'
+    """
+    return ", ".join(f"{one.batch} of {name}" for name, one in NETWORK_DEFAULTS.items())
+
+
 @dataclass(frozen=True, kw_only=True)
 class Training:
     """Settings of a training. Raises UsageError.
 
-    network: a name in BATCHES
+    network: a name in NETWORK_DEFAULTS
     steps: total number; None for those of the continued training, else PLANNED_STEPS
-    batch: examples or windows per step; None for that of BATCHES
+    batch: examples or windows per step; None for that of NETWORK_DEFAULTS
     rate: highest learning rate
     device: "" for the GPU if available
     begin: bundle with the initial parameters; None for new ones
@@ -68,12 +91,14 @@ class Training:
     weather: bool = True
 
     def __post_init__(self) -> None:
-        if self.network not in BATCHES:
-            raise unknown("network", self.network, BATCHES)
+        if self.network not in NETWORK_DEFAULTS:
+            raise unknown("network", self.network, NETWORK_DEFAULTS)
         if self.share > 1.0:
             raise UsageError(f"--share must be at most 1, not {self.share:g}")
-        if self.network == "small" and (changed := [name for name, _ in self.ablations]):
-            raise UsageError(f"--network small has no {', '.join(changed)}: use sidewalk")
+        changed = [name for name, _ in self.ablations]
+        if changed and not NETWORK_DEFAULTS[self.network].has_ablations:
+            able = " or ".join(name for name, one in NETWORK_DEFAULTS.items() if one.has_ablations)
+            raise UsageError(f"--network {self.network} has no {', '.join(changed)}: use {able}")
         for field in ("steps", "batch", "rate", "minutes", "share"):
             value = getattr(self, field)
             if value is not None and not value > 0:
@@ -82,7 +107,7 @@ class Training:
     @property
     def size(self) -> int:
         """Return the number of examples or windows per step."""
-        return BATCHES[self.network] if self.batch is None else self.batch
+        return NETWORK_DEFAULTS[self.network].batch if self.batch is None else self.batch
 
     @property
     def called(self) -> str:

@@ -124,6 +124,8 @@ def _train(
         state.step += 1
         over = time.monotonic() - began_s > 60.0 * training.minutes
         scheduled = is_evaluated(state.step, steps)
+        if over and not scheduled:  # an evaluation may outlast the time that is left
+            _write_checkpoint(checkpoint, state, spec)
         if scheduled or over:
             parts = {f"{name}_loss": float(part) for name, part in loss_parts.items()}
             row = {
@@ -133,8 +135,8 @@ def _train(
             }
             if not math.isfinite(sum(row.values())):
                 raise RunError(
-                    f"{folder}: nothing is learned any more at step {state.step}: train "
-                    f"anew, at a lower --rate"
+                    f"{folder}: losses are not finite at step {state.step}: train again, at a "
+                    f"lower --rate"
                 )
             write_curve(folder, [*state.curve, row])
             # An evaluation at the time limit is only in the file, so that a resumed training
@@ -248,7 +250,9 @@ def _read_checkpoint(
         averaged = {name: value.to(device) for name, value in checkpoint["averaged"].items()}
         step = checkpoint["step"]
     except Exception as error:
-        raise RunError(f"{path}: cannot be continued: {error}: delete it and train anew") from error
+        raise RunError(
+            f"{path}: cannot be continued: {error}: delete it and train again"
+        ) from error
     refuse_another(path, was, spec)
     steps = planned_steps(path, training.steps, plans[-1], step)
     return _State(

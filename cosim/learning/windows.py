@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -29,7 +29,6 @@ from cosim.learning.examples import (
     CHANGE_SHARE,
     DARK,
     HELD_OUT,
-    LISTED,
     SHIFT_PX,
     STOPS_MPS,
     TINT,
@@ -45,6 +44,7 @@ from cosim.learning.network import (
     WAYPOINTS,
     WIDTH_PX,
 )
+from cosim.learning.packed_checks import check_pictures, check_rows, common_meta
 from cosim.learning.settings import Training
 
 STEPS: Final = 40
@@ -69,7 +69,8 @@ class Windows:
     goal, speeds: (B, T, 2) inputs
     valid: (B, T) whether a step belongs to the episode; of the fields below only such rows exist
     speed, turn, stop, way, driven: see `objective.PlanTargets`
-    near: (N, LABELLED_PEOPLE, 6), free: (N, FREE_RAYS), scene: (N, 2) labels
+    near: (N, LABELLED_PEOPLE, 6), free: (N, FREE_RAYS), scene: (N, 2) labels; (N, 0) unless
+        auxiliary heads are trained
     """
 
     pictures: Tensor
@@ -97,7 +98,7 @@ class WindowExamples:
     def __init__(self, paths: Sequence[Path], training: Training, device: torch.device) -> None:
         with ThreadPoolExecutor(_READERS) as readers:
             packed = list(readers.map(lambda path: _checked(path, training), paths))
-        self.meta = _common_meta(paths, packed)
+        self.meta = common_meta(paths, packed, _SAME_META)
         self._device = device
         self._frames = _pictures(paths, [len(one) for one in packed], device)
         firsts = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
@@ -125,11 +126,9 @@ class WindowExamples:
             arrays = [getattr(one, name) for one in packed]
             return torch.from_numpy(np.concatenate(arrays)).to(device)
 
-        self._rows = {
-            name: joined(name)
-            for name in ("state", "goal", "command", "waypoints", "driven", *LABELS)
-            if getattr(packed[0], name).size
-        }
+        labels = LABELS if training.auxiliary else ()
+        arrays = ("state", "goal", "command", "waypoints", "driven", *labels)
+        self._rows = {name: joined(name) for name in arrays}
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
         changes = self.learned[((command < STOPS_MPS) != (state < STOPS_MPS))[self.learned]]
         self._changes = changes if len(changes) else self.learned
@@ -292,49 +291,21 @@ def _pictures(paths: Sequence[Path], counts: Sequence[int], device: torch.device
 def _fill(place: Tensor, path: Path) -> None:
     """Load the pictures of a file into a tensor. Raises RunError for another size."""
     frames = read_frames(path)
-    high, wide = frames.shape[1:3]
-    if (high, wide) != (HEIGHT_PX, WIDTH_PX):
-        raise RunError(
-            f"{path}: pictures of {wide} x {high} pixels, wanted are {WIDTH_PX} x {HEIGHT_PX}: "
-            f"cosim collect --camera {WIDTH_PX}x{HEIGHT_PX}"
-        )
+    check_pictures(path, frames)
     place.copy_(torch.from_numpy(frames))
-
-
-def _common_meta(paths: Sequence[Path], packed: Sequence[Packed]) -> dict[str, Any]:
-    """Return the metadata of all files. Raises RunError if they were collected differently."""
-    meta = dict(packed[0].meta)
-    for path, other in zip(paths[1:], packed[1:], strict=True):
-        for field in _SAME_META:
-            if other.meta.get(field) != meta.get(field):
-                raise RunError(
-                    f"{path}: {field} is {other.meta.get(field)}, and {meta.get(field)} in "
-                    f"{paths[0]}: train on demonstrations that were collected alike"
-                )
-    return meta | {
-        name: [value for one in packed for value in one.meta.get(name, [])] for name in LISTED
-    }
 
 
 def _checked(path: Path, training: Training) -> Packed:
     """Load a file without its pictures. Raises RunError if this network cannot learn from it."""
     packed = read_packed(path, pictures=False)
-    if not len(packed):
-        raise RunError(f"{path}: holds no demonstration: collect more episodes")
-    if packed.waypoints.shape[1] < WAYPOINTS:
-        raise RunError(
-            f"{path}: {packed.waypoints.shape[1]} waypoints a row, wanted are {WAYPOINTS}"
-        )
-    if np.isnan(packed.goal).any():
-        raise RunError(
-            f"{path}: goals are no points ({packed.meta.get('goal')}): cosim collect --goal "
-            f"route_point"
-        )
-    if training.auxiliary and not packed.scene.size:
+    check_rows(path, packed)
+    if not training.auxiliary:
+        return packed
+    if not packed.scene.size:
         raise RunError(
             f"{path}: has no labels for auxiliary heads: cosim collect --labels, or train with "
             f"--no-auxiliary"
         )
-    if packed.scene.size and (packed.scene.max(axis=0) >= [SIGNALS, EVENTS]).any():
+    if (packed.scene.max(axis=0) >= [SIGNALS, EVENTS]).any():
         raise RunError(f"{path}: labels of another version: collect it again")
     return packed

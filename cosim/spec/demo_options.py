@@ -43,7 +43,7 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     scan, imu, people: sensors that are recorded with the pictures, as in a manifest.
     labels: whether labels of the simulator are stored, for auxiliary heads.
     astray: share of the episodes that begin aside of the route, turned away from it.
-    weathers: weathers that take turns, in place of the scenarios' own.
+    weathers: names from which the weather of each episode is drawn, in place of its own.
 
     Raises SpecError.
     """

@@ -101,7 +101,7 @@ class Demonstrator(PolicyCaller):
         """Return the encoded demonstration; b"" if the episode crashed or was not solved."""
         if log is None or not (self._collecting.unsolved or solved(record, log)):
             return b""
-        return self._rows.demonstration(scenario, log).encoded()
+        return self._rows.demonstration(scenario, record, log).encoded()
 
 
 def solved(record: Record, log: Log) -> bool:
@@ -208,7 +208,7 @@ class _Rows:
             np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
         ]
 
-    def demonstration(self, scenario: Scenario, log: Log) -> Demonstration:
+    def demonstration(self, scenario: Scenario, record: Record, log: Log) -> Demonstration:
         """Return the demonstration, with waypoints of the trajectory up to the next reset."""
         collecting = self._collecting
         assert self._clip is not None, "an episode has a picture before its first command"
@@ -224,7 +224,12 @@ class _Rows:
         )
         extras = {name: np.stack(rows) for name, rows in self._extras.items()}
         if "scene" in extras:
-            extras["scene"][:, 1] = event_numbers(scenario, self._persons)
+            triggered = {
+                one.id: round(one.triggered_at_s / log.tick_s)
+                for one in record.events
+                if one.triggered_at_s is not None
+            }
+            extras["scene"][:, 1] = event_numbers(scenario, self._persons, self._ticks, triggered)
         return Demonstration(
             state=numbers[:, 0:2].astype(np.float32),
             goal=numbers[:, 2:4].astype(np.float32),

@@ -5,13 +5,13 @@ near   (LABELLED_PEOPLE, 6) nearest people ahead: 1, x, y, vx, vy in the robot's
 free   (FREE_RAYS,) distances in m that the robot's middle can drive at bearings from
        FREE_HALF_RAD on the left to FREE_HALF_RAD on the right; 0 outside of the free ground
 scene  (2,) signal of the next crossing on the route, see `signal_ahead`; 1 plus the index of the
-       kind of the nearest event ahead, else 0
+       kind of the nearest event ahead, from its trigger on, else 0, see `event_numbers`
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final, get_args
 
@@ -79,15 +79,35 @@ def event_person(known: Privileged | None) -> str:
     return next((people.ids[row] for row in rows if directed[row]), "")
 
 
-def event_numbers(scenario: Scenario, persons: list[str]) -> NDArray[np.float32]:
-    """Return the label of the event of each person; 0 for "", and for decoys."""
+def event_numbers(
+    scenario: Scenario,
+    persons: Sequence[str],
+    ticks: Sequence[int],
+    triggered: Mapping[str, int],
+) -> NDArray[np.float32]:
+    """Return the label of the event of each row (n,).
+
+    It is 0 for the person "", before the event's trigger, and if nothing happens in the event
+    (`Event.decoy`). Until the trigger an event and its decoy are equal. A decoy with the other side
+    free is an event like any other.
+
+    persons: id of the nearest event pedestrian of each row.
+    ticks: tick of each row.
+    triggered: tick of the trigger by the id of the event.
+    """
     known = {
-        name: EVENT_NUMBERS.get(event.kind, 0)
+        name: (EVENT_NUMBERS.get(event.kind, 0), triggered[event.id])
         for event in scenario.events
-        if not (event.decoy or scenario.decoy_of)
+        if event.id in triggered and not event.decoy
         for name in event.names
     }
-    return np.array([known.get(person, 0) for person in persons], np.float32)
+    found = [
+        number if tick >= first else 0
+        for tick, (number, first) in zip(
+            ticks, (known.get(person, (0, 0)) for person in persons), strict=True
+        )
+    ]
+    return np.array(found, np.float32)
 
 
 def signal_ahead(known: Privileged) -> int:

@@ -12,17 +12,24 @@ import numpy as np
 
 import cosim
 from cosim import Command, Manifest, Observation
+from cosim.core.errors import UsageError
 
 
 class Blinded:
-    """The policy that the environment variable POLICY names, with black pictures."""
+    """The policy that the environment variable POLICY names, with black pictures.
+
+    Its name ends with the start of the policy's hash, because runs of two policies must differ.
+    """
 
     def __init__(self) -> None:
-        self._policy = cosim.load_policy(os.environ["POLICY"])
+        if not (name := os.environ.get("POLICY")):
+            raise UsageError("set POLICY, the policy that drives: POLICY=onnx:FOLDER cosim run ...")
+        self._policy = cosim.load_policy(name)
 
     @property
     def manifest(self) -> Manifest:
-        return replace(self._policy.manifest, name=f"{self._policy.manifest.name}-black")
+        seen = self._policy.manifest
+        return replace(seen, name=f"{seen.name}-black-{self._policy.source_hash[:8]}")
 
     def reset(self, episode_id: str, seed: int) -> None:
         self._policy.reset(episode_id, seed)

@@ -5,28 +5,40 @@
 #
 # Works in pieces: stops after MINUTES (9 by default), and continues when called again, until it prints "all done".
 # In round 0 the expert drives, disturbed; in later rounds the learner drives, and the expert's answers are stored. A round collects
-# for COLLECT minutes (8), with JOBS processes (16), in CITIES new cities (48), a multiple of GPUS. COSIM, PYTHON: see small_policy.sh.
+# for COLLECT minutes (7, less than MINUTES) in all, with JOBS processes (16), in CITIES new cities (48), a multiple of GPUS.
+# COSIM, PYTHON: see small_policy.sh.
 # ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
-# SEEDS: trained on all rounds at the end ("0 1 2"). GPUS: they draw the pictures, and train one network each (1).
-# ABLATIONS=1: trains seed 0 again with each single change. SPLIT, SUITES: what is scored (val; all three).
+# SEEDS: trained on all rounds at the end ("0 1 2"; "" for none). GPUS: number of GPUs (1); each trains one network at a time.
+# ABLATIONS=1: trains seed 0 again with each change of docs/demonstrations.md. SPLIT, SUITES: what is scored (val; all three).
+# The table of a suite is WORK/SUITE.md: all policies, compared with the first one.
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
 # MOST: most episodes of a collection with events (100000).
-# ROBOTS: which drive beside the courier ("scout dog"). WEATHERS: drawn for each episode.
+# ROBOTS: further robots that collect, besides the courier ("scout dog"). WEATHERS: names from which each episode's is drawn.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
 W=${1:?a folder to work in}
 . "$here/scenarios/examples/pieces.sh"
-ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-8} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
+ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-7} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
 SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
 MOST=${MOST:-100000} ROBOTS=${ROBOTS-"scout dog"} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
 mkdir -p "$W/demos" "$W/nets" "$W/runs"
 
-gather() { # name, share of JOBS, GPU, most episodes, words...: as many episodes as fit in COLLECT minutes
-  local name=$1 gpu=$3 most=$4 jobs; jobs=$(awk "BEGIN { n = int($2 * $JOBS + 0.5); print n < 1 ? 1 : n }"); shift 4
-  GLCONTEXT_DEVICE_INDEX=$gpu step "collect-$name" bash -c '"$@" || [ $? = 1 ]' - $COSIM collect "$@" --minutes "$COLLECT" \
-    --episodes "$most" --fov 60 --labels --format raw --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
-}
-round() { # number, words of who drives...: collections beside each other, then their arrays
+awk "BEGIN { exit !($COLLECT < ${MINUTES:-9}) }" || { echo "COLLECT=$COLLECT must be less than MINUTES=${MINUTES:-9}"; exit 2; }
+
+gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes as fit in COLLECT minutes, over all calls
+  name=$1 gpu=$3 most=$4 jobs=$(awk "BEGIN { n = int($2 * $JOBS + 0.5); print n < 1 ? 1 : n }"); shift 4
+  export USED=$W/log/collect-$name.seconds LAST
+  [ -e "$W/log/collect-$name.done" ] && return 0
+  rest=$(awk "BEGIN { n = int(60 * $COLLECT) - $(cat "$USED" 2> /dev/null || echo 0); print n < 1 ? 1 : n }")
+  now=$((END - SECONDS - MARGIN_S)); [ "$now" -lt "$rest" ] || now=$rest
+  LAST=$((now == rest))
+  # Exit code 4: the time is up. The collection is done if this was the rest of its time.
+  GLCONTEXT_DEVICE_INDEX=$gpu step "collect-$name" bash -c '"$@"; code=$?; [ $code = 4 ] || exit $code
+    echo $(($(cat "$USED" 2> /dev/null || echo 0) + SECONDS)) > "$USED"; [ $LAST = 1 ]' - \
+    $COSIM collect "$@" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --fov 60 --labels --format raw \
+    --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
+)
+round() { # number, words of the driver...: collects in parallel, then packs
   local k=$1 first=$((900 + 100 * $1)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0; shift
   local common=(--city-size 1000 --seed "$k" --astray 0.3 --unsolved "$@")
   local all=(--cities $first:$((first + CITIES)) "${common[@]}")
@@ -54,9 +66,9 @@ parts() { # last round: the packed files up to it
 }
 sidewalk() { # name, last round, words...
   local name=$1 last=$2; shift 2
-  learn "$name" $(parts "$last") --network sidewalk --batch "$BATCH" --steps "$STEPS" --rate 5e-4 "$@"
+  learn "$name" $(parts "$last") --network sidewalk --batch "$BATCH" --steps "$STEPS" --rate 5e-4 --name "sidewalk-${name#sidewalk-}" "$@"
 }
-together() { # what, names...: trainings beside each other, one a GPU
+together() { # what, names...: trains in parallel, one network on each GPU
   local what=$1 number=0 name; shift
   for name in "$@"; do
     CUDA_VISIBLE_DEVICES=$((number % GPUS)) "$what" "$name" &
@@ -90,14 +102,25 @@ done
 names=()
 for number in $SEEDS; do names+=("sidewalk-$number"); done
 together seed "${names[@]}"
+first=${names[0]:-}
 if [ "${ABLATIONS:-0}" = 1 ]; then
-  changes=(share-0.01 share-0.1 whole no-memory no-auxiliary no-decoys no-weather)
+  changes=(share-0.01 share-0.1 no-memory no-auxiliary no-decoys no-weather)
+  [ -n "$FROM" ] && changes+=(whole)  # without FROM it is sidewalk-0
   together ablation "${changes[@]}"
   names+=("${changes[@]}")
 fi
 for suite in $SUITES; do
   for name in "${names[@]}"; do score "$suite-$name" "$suite" "onnx:$W/nets/$name"; done
 done
-export POLICY=onnx:$W/nets/${names[0]}
-[[ " $SUITES " = *" reactive "* ]] && score reactive-black reactive "$here/scenarios/examples/black_pictures.py:Blinded"
+if [ -n "$first" ] && [[ " $SUITES " = *" reactive "* ]]; then
+  export POLICY=onnx:$W/nets/$first
+  score reactive-black reactive "$here/scenarios/examples/black_pictures.py:Blinded"
+fi
+for suite in $SUITES; do
+  runs=()
+  for name in "${names[@]}" black; do [ -e "$W/runs/$suite-$name/run.json" ] && runs+=("$W/runs/$suite-$name"); done
+  [ ${#runs[@]} -gt 1 ] || continue
+  $COSIM compare "${runs[@]}" -o "$W/$suite.md" > "$W/log/compare-$suite.txt" 2>&1 || { tail -n 3 "$W/log/compare-$suite.txt"; exit 1; }
+  echo "$suite:"; cat "$W/$suite.md"
+done
 echo "all done"

@@ -4,12 +4,12 @@
 #
 #   scenarios/examples/small_policy.sh WORK
 #
-# Works in pieces: stops after MINUTES (9 by default) and goes on where it was when called again, until it says "all done".
-# JOBS: processes that simulate (16). COSIM: the command (cosim). PYTHON: the one that has PyTorch, onnx and numpy, any from
-# 3.11 on (python3); it needs nothing else of this project but its folder. Made for 16 cores and a GPU; on two cores set
-# OMP_NUM_THREADS=2 and BATCH=64 (256), and take fewer demonstrations by UNIT (1500) and EACH (500, AGAIN: 200 a
-# round), and fewer steps by STEPS (16000) and MORE (8000, of the fine-tuning). EVENTS: which are learned (all eight). MALLOC_...: memory of a step is
-# kept for the next one; giving it back and taking it again was a third of the time.
+# Works in pieces: stops after MINUTES (9 by default), and continues when called again, until it prints "all done".
+# JOBS: number of environment processes (16). COSIM: the command (cosim).
+# PYTHON: a Python from 3.11 on with PyTorch, onnx and numpy (python3); it needs only the folder of this project.
+# For 16 cores and a GPU. On two cores set OMP_NUM_THREADS=2 and BATCH=64 (256).
+# Fewer demonstrations: UNIT (1500), EACH (500 of each event), AGAIN (200 of each event in a round).
+# Fewer steps: STEPS (16000), MORE (8000, of the fine-tuning). EVENTS: kinds that are learned (all eight).
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
 W=${1:?a folder to work in}

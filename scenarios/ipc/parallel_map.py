@@ -32,7 +32,7 @@ def parallel_map(
     """
     with ExitStack() as stack:
         if min(jobs, len(items)) > 1:
-            pool = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_deaf_to_ctrl_c)
+            pool = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_ignore_ctrl_c)
             stack.callback(pool.shutdown, cancel_futures=True)
             results = pool.map(function, items)
         else:
@@ -48,6 +48,6 @@ def parallel_map(
             yield result
 
 
-def _deaf_to_ctrl_c() -> None:
+def _ignore_ctrl_c() -> None:
     """Ignore Ctrl-C in this process; its parent ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

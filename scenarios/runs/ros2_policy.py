@@ -87,11 +87,11 @@ class Ros2Policy:
     """Policy that is a ROS 2 node, reached over a Zenoh session that the first episode opens.
 
     took_ms: Time of each answer of the episode.
-    hears_wait: Called with the reasons for which the policy waits.
+    on_reason: Called with the reasons for which the policy waits.
     """
 
     def __init__(self, name: str, settings: Ros2Settings) -> None:
-        self.hears_wait: Callable[[str], None] = ignore
+        self.on_reason: Callable[[str], None] = ignore
         self.settings = settings
         self.manifest = settings.manifest(name)
         self.took_ms: list[float] = []
@@ -390,7 +390,7 @@ class Ros2Policy:
         if len(there := list(self._drivers(node).values())) > 1:
             words = f"there are {two_publishers(there[0], there[1])}"
             self._remark(Fault(CMD_VEL, "publishers", words))
-            self.hears_wait(words)
+            self.on_reason(words)
 
     def _drivers(self, node: Ros2Node) -> dict[bytes, Endpoint]:
         """Return the publishers of /cmd_vel with a type that is read, by gid."""
@@ -423,7 +423,7 @@ class Ros2Policy:
         words = self._diagnosis(node, self._remarks.kinds) or otherwise
         if words and words not in self._hints:
             self._hints.add(words)
-            self.hears_wait(f"waits for {waits_for}: {words}")
+            self.on_reason(f"waits for {waits_for}: {words}")
 
 
 def _report(words: str) -> None:
@@ -449,8 +449,8 @@ class Ros2Driver(PolicyCaller):
         median, most = np.quantile(self._ros2.took_ms, [0.5, 0.95])
         return {"answer_median_ms": float(median), "answer_p95_ms": float(most)}
 
-    def on_wait(self, hears: Callable[[str], None]) -> None:
-        self._ros2.hears_wait = hears
+    def on_reason(self, callback: Callable[[str], None]) -> None:
+        self._ros2.on_reason = callback
 
     def close(self) -> None:
         self._ros2.close()

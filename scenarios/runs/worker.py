@@ -283,7 +283,7 @@ def run_job(
         from scenarios.episodes.demonstrator import Demonstrator
 
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
-    driver.on_wait(lambda reason: say(Waits(name, reason)))
+    driver.on_reason(lambda reason: say(Waits(name, reason)))
     watcher = _Watcher(job, say)
     watches: list[Watch] = [watcher.watch]
     if commands is not None:

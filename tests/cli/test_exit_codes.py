@@ -126,6 +126,7 @@ def test_the_documents_list_the_exit_codes() -> None:
         errors.SOME_CRASHED,
         errors.WRONG_USE,
         errors.BROKEN_MACHINE,
+        errors.TIME_IS_UP,
         errors.INTERRUPTED,
         errors.BROKEN_PIPE,
     ):

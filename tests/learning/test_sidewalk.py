@@ -262,6 +262,8 @@ def test_settings_of_ablations_are_checked(data: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="cosim collect --labels, or train with --no-auxiliary"):
         WindowExamples([tmp_path / "plain.npz"], BRISK, CPU)
     plain = replace(BRISK, auxiliary=False, steps=1, share=0.5)
+    mixed = WindowExamples([data, tmp_path / "plain.npz"], plain, CPU)
+    assert mixed.windows(np.array([0]), 2).scene.shape == (2, 0)
     assert train([tmp_path / "plain.npz"], tmp_path / "net", plain, False, ignore).whole
     with pytest.raises(RunError, match=r"of another training: share 0\.5, not 1\.0"):
         train([tmp_path / "plain.npz"], tmp_path / "net", replace(plain, share=1.0), True, ignore)
@@ -274,7 +276,7 @@ def test_from_the_simulator_to_a_drive(tmp_path: Path, cosim: Cosim) -> None:
     words = ("collect", "unit", "--event", "crosswalk", "--cities", "900:901", "--city-size", "500")
     words += ("--labels", "--format", "raw", "--fov", "60", "--astray", "0.5", "--episodes", "2")
     begun = cosim(*words, "--out", "demos", "--minutes", "1e-9", cwd=tmp_path)
-    assert begun.returncode == 1 and "The time is up after 0 episodes" in begun.stderr
+    assert begun.returncode == 4 and "The time is up after 0 episodes" in begun.stderr
     done = cosim(*words, "--out", "demos", "--resume", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     parts = pack_raw([tmp_path / "demos"], tmp_path / "d.npz", part=1)

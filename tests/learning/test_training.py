@@ -175,16 +175,32 @@ def test_a_training_that_was_stopped_ends_as_one_in_one_piece(data: Path, tmp_pa
         assert (tmp_path / "pieces" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
+def test_a_training_killed_in_its_last_evaluation_loses_no_step(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the time limit the checkpoint is written before the evaluation."""
+
+    def killed(*_: object) -> dict[str, float]:
+        raise KeyboardInterrupt
+
+    brisk = replace(BRISK, minutes=1e-9)
+    with monkeypatch.context() as patch:
+        patch.setattr("cosim.learning.training.NETWORKS", {"small": replace(SMALL, errors=killed)})
+        with pytest.raises(KeyboardInterrupt):
+            train([data], tmp_path, brisk, False, ignore)
+    assert train([data], tmp_path, brisk, True, ignore).step == 2
+
+
 def test_a_training_whose_time_is_over_leaves_a_bundle_and_its_curve(
     data: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """`cosim train --minutes`, far too short: exit code 1, a bundle that can be loaded and says at
+    """`cosim train --minutes`, far too short: exit code 4, a bundle that can be loaded and says at
     which step it is, a curve with a row of that step, and how to continue; `--resume` alone ends
     it."""
     words = ("train", str(data), "-o", "small", "--batch", "4", "--device", "cpu", "--seed", "3")
     done = cosim(*words, "--steps", "3", "--minutes", "1e-9", cwd=tmp_path)
     assert (
-        done.returncode == 1 and "stopped at step 1 of 3. Continue with --resume" in done.stderr
+        done.returncode == 4 and "stopped at step 1 of 3. Continue with --resume" in done.stderr
     ), done.stderr
     assert steps_of(tmp_path / "small") == ["step", "1"]
     manifest = json.loads((tmp_path / "small/manifest.json").read_bytes())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -15,14 +16,19 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from cosim.core.errors import CosimError, RunError, SpecError
+from cosim.cli.collect import DemoConfig, _source
+from cosim.core.errors import CosimError, RunError, SpecError, UsageError
 from cosim.core.packed_demos import FREE_RAYS, LABELLED_PEOPLE, read_packed
+from cosim.core.progress import ignore
 from cosim.core.state import Command
+from cosim.policies.load import load_policy
 from cosim.spec.camera import CameraSpec
 from cosim.spec.demo_options import DemoOptions, recording_manifest
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.manifest import Manifest
+from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
+from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Suite, write_suite
 from cosim.spec.sensors import PEOPLE_ROWS, ScanSpec
 from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pictures
@@ -32,8 +38,9 @@ from scenarios.episodes.demonstration import (
     glimpse,
     waypoints_ahead,
 )
-from scenarios.episodes.demonstrator import _Bursts
+from scenarios.episodes.demonstrator import Demonstrator, _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
+from scenarios.tools.dataset.collect import _Rounds
 from scenarios.tools.dataset.collected import Collected
 from scenarios.tools.dataset.lerobot import Filmed, write_lerobot
 from scenarios.tools.dataset.pack import pack_raw
@@ -89,7 +96,7 @@ def shown(episode: int, count: int) -> Demonstration:
 def episodes_of(demonstrations: Sequence[Demonstration]) -> list[Collected]:
     found = []
     for k, one in enumerate(demonstrations):
-        scenario = short_way(f"s-{k:03d}")
+        scenario = short_way(f"s-{k:03d}").in_weather("rain" if k == 1 else "")
         record = record_of(scenario, Manifest("p"))
         found.append(Collected(scenario, record, lambda one=one: one))  # type: ignore[misc]
     return found
@@ -227,7 +234,7 @@ def test_packed_rows_are_those_that_were_kept(
     data_set: Path, demonstrations: list[Demonstration]
 ) -> None:
     """Two data sets in one file: every array is theirs, one after the other, the episodes counted
-    on, and pictures are made smaller on request."""
+    on, with the weather of each, and pictures are made smaller on request."""
     packed = packed_sets([data_set, data_set], (32, 24))
     for name in ("state", "goal", "command", "waypoints", "driven", "disturbed"):
         once = np.concatenate([getattr(one, name) for one in demonstrations])
@@ -235,6 +242,7 @@ def test_packed_rows_are_those_that_were_kept(
     assert np.bincount(packed.episode).tolist() == [*LENGTHS, *LENGTHS]
     assert packed.frames.shape == (2 * sum(LENGTHS), 24, 32, 3)
     assert packed.meta["scenarios"] == ["s-000", "s-001", "s-002"] * 2
+    assert packed.meta["weathers"] == ["clear", "rain", "clear"] * 2
 
 
 def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
@@ -278,7 +286,8 @@ def test_raw_demonstrations_are_packed_in_parts(
     tmp_path: Path, demonstrations: list[Demonstration]
 ) -> None:
     """Of an unfinished collection what is there, in the order of its scenarios, by two processes as
-    by one; one that was put back is two episodes; weathers are those of the scenarios. A folder without any is named."""
+    by one; one that was put back is two episodes; weathers are those of the scenarios. Older parts are deleted, and runs
+    are in the order of their numbers. A folder without any is named."""
     ways = [short_way(f"s-{k:03d}") for k in range(4)]
     ways[1] = ways[1].in_weather("rain")
     run = tmp_path / "raw/runs/00"
@@ -308,8 +317,20 @@ def test_raw_demonstrations_are_packed_in_parts(
     assert first.frame[LENGTHS[0] + 8] == 0
     seen = np.stack([glimpse(rgb) for rgb in first.frames[LENGTHS[0] :]]).astype(float)
     assert np.abs(seen - demonstrations[1].glimpses).mean() < 4.0
+    (tmp_path / "e-f-001.npz").touch()
+    pack_raw([tmp_path / "raw"], tmp_path / "e.npz", part=1)
     pack_raw([tmp_path / "raw"], tmp_path / "e.npz", (32, 24), part=9)
+    assert [path.name for path in sorted(tmp_path.glob("e-*"))] == ["e-000.npz", "e-f-001.npz"]
     assert read_packed(tmp_path / "e-000.npz").frames.shape == (sum(LENGTHS), 24, 32, 3)
+    for number, way in ((100, ways[3]), (11, ways[2])):
+        whole = Suite(name="ways", version="1", scenarios=(way,))
+        folder = tmp_path / f"many/runs/{number:02d}"
+        (folder / "episodes" / way.id).mkdir(parents=True)
+        write_suite(whole, folder / "scenarios.json")
+        (folder / f"episodes/{way.id}/demonstration.npz").write_bytes(demonstrations[0].encoded())
+    (tmp_path / "many/about.json").write_text(json.dumps(ABOUT))
+    (part,) = pack_raw([tmp_path / "many"], tmp_path / "m.npz")
+    assert read_packed(part.path).meta["scenarios"] == ["s-002", "s-003"]
     with pytest.raises(RunError, match="no collection of the format raw"):
         pack_raw([tmp_path], tmp_path / "d.npz")
 
@@ -470,6 +491,33 @@ def test_cities_of_the_suites_are_refused(words: str) -> None:
     asked for."""
     with pytest.raises(CosimError, match=f"--cities {words}: .*900:940"):
         fresh_cities(words)
+
+
+@pytest.mark.parametrize(
+    ("suite", "more", "words"),
+    [
+        ("reactive", {"weathers": "rain,fog"}, "--weathers and --weather do not go together"),
+        ("unit", {"cities": "900:901", "decoys": True}, "new scenarios of unit have no decoys"),
+    ],
+    ids=["weathers", "decoys"],
+)
+def test_options_that_contradict_each_other_are_refused(
+    suite: str, more: dict[str, Any], words: str
+) -> None:
+    """Two ways to set the weather, and decoys of a suite that has none."""
+    with pytest.raises(UsageError, match=words):
+        _source(RunConfig(suite=suite, weather="snow"), DemoConfig(**more))
+
+
+def test_raw_demonstrations_name_the_robot_of_their_scenarios(tmp_path: Path) -> None:
+    """It is that of the suite's scenarios, unless another robot is requested."""
+    way = short_way("s").driven_by("scout")
+    whole = Suite(name="ways", version="1", scenarios=(way,))
+    demonstrator = Demonstrator(load_policy("orca"), DemoOptions(format="raw"), "route_point")
+    for requested, robot in (("", "scout"), ("courier", "courier")):
+        options = EpisodeOptions(robot=requested)
+        rounds = _Rounds(whole, tmp_path, "orca", demonstrator, options, 1, math.inf, ignore)
+        assert rounds.robot == robot
 
 
 def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:

@@ -18,6 +18,7 @@ from cosim.episode.interfaces import Observation, Privileged
 from cosim.spec.demo_options import DemoOptions
 from cosim.spec.events import Event
 from cosim.spec.robot import COURIER
+from cosim.spec.scenario import Scenario
 from scenarios.episodes.labels import (
     DOINGS,
     EVENT_NUMBERS,
@@ -27,6 +28,7 @@ from scenarios.episodes.labels import (
     label_rows,
     signal_ahead,
 )
+from scenarios.events import EVENT_KINDS
 from scenarios.tools.dataset.variety import varied
 from tests.support.driven_runs import short_way
 
@@ -104,24 +106,36 @@ def test_the_signal_is_that_of_the_next_crossing() -> None:
     assert signal_ahead(state(crossings=far)) == 0
 
 
-def test_the_event_is_that_of_the_nearest_directed_person() -> None:
-    """Its kind has a number; a decoy, in which nothing happens, has none."""
+def event_of(kind: str, **changes: object) -> Event:
+    fields: dict[str, object] = {"id": "e1", "kind": kind, "x_m": 5.0, "y_m": 0.0}
+    fields |= {"heading_rad": 0.0, "route_s_m": 5.0, "half_width_m": 1.0}
+    return Event(**(fields | changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["gesturing", "frontal", "obstructing", "queueing"])
+def test_the_event_is_that_of_the_nearest_directed_person_from_its_trigger_on(kind: str) -> None:
+    """Before the trigger an event has no label. A decoy in which nothing happens never has one; one
+    with the other side free has the label of its kind."""
     person = event_person(state())
-    event = Event(
-        id="e1",
-        kind="gesturing",
-        x_m=5.0,
-        y_m=0.0,
-        heading_rad=0.0,
-        route_s_m=5.0,
-        half_width_m=1.0,
-    )
-    scenario = msgspec.structs.replace(short_way("s"), events=(event,))
     assert person == "e1" and event_person(None) == ""
-    number = EVENT_NUMBERS["gesturing"]
-    assert event_numbers(scenario, [person, "", "other"]).tolist() == [number, 0, 0]
-    decoy = msgspec.structs.replace(scenario, id="s-decoy", decoy_of="s")
-    assert event_numbers(decoy, [person]).tolist() == [0]
+    event = event_of(kind, free_side=0 if EVENT_KINDS[kind].decoy else 1)
+    scenario = msgspec.structs.replace(short_way("s"), events=(event,))
+    persons, ticks, number = (
+        [person, "", "other", person, person],
+        [8, 8, 8, 4, 0],
+        EVENT_NUMBERS[kind],
+    )
+
+    def labels(scenario: Scenario, triggered: dict[str, int]) -> list[float]:
+        return event_numbers(scenario, persons, ticks, triggered).tolist()
+
+    assert labels(scenario, {"e1": 4}) == [number, 0, 0, number, 0]
+    assert labels(scenario, {}) == [0] * 5
+    decoy = msgspec.structs.replace(
+        scenario, id="s-decoy", decoy_of="s", events=(EVENT_KINDS[kind].decoy_of(event),)
+    )
+    mirrored = EVENT_KINDS[kind].decoy is None
+    assert labels(decoy, {"e1": 4}) == ([number, 0, 0, number, 0] if mirrored else [0] * 5)
 
 
 def test_weather_and_start_are_drawn_by_the_id_and_shared_with_the_decoy() -> None:

@@ -1,9 +1,9 @@
 """Collect a data set of an expert that drives scenarios, with the pictures of a camera.
 
 OUT/collect.json      options of the collection; other options are refused
-OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode; another one is
-                      added if too few are solved. They may be deleted once
-                      the data set is complete
+OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode; one is added if
+                      too few are solved. Of other formats than raw, they may be deleted once the
+                      data set is complete
 OUT/writing           unfinished data set
 OUT/about.json        with the format raw: what `cosim dataset pack` needs beside the runs, in
                       place of the following
@@ -39,7 +39,6 @@ from cosim.results.run_folder import DEMONSTRATION, RunFolder
 from cosim.results.run_spec import brief
 from cosim.spec.demo_options import DemoOptions
 from cosim.spec.options import EpisodeOptions, PolicyHost
-from cosim.spec.robot import COURIER
 from cosim.spec.run_config import DataFormat
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.episodes.demonstration import Demonstration, check_parquet
@@ -105,7 +104,7 @@ def _refuse(path: Path, name: str, mine: object, theirs: object) -> None:
     if mine != theirs:
         raise RunError(
             f"{path} is of another data set: its {name} is {brief(mine)}, now asked for is "
-            f"{brief(theirs)}. Go on with the same command, or choose another --out."
+            f"{brief(theirs)}. Continue with the same command, or choose another --out."
         )
 
 
@@ -192,7 +191,7 @@ def collect(
     spec = rounds.asked(wanted or len(rounds.all), expert)
     _open(out, spec, resume)
     if form == "raw":
-        _write_about(out, spec, demonstrator)
+        _write_about(out, _about(spec, demonstrator, rounds.robot))
     beside = (
         None
         if learner is None
@@ -228,11 +227,11 @@ def collect(
             number = number + 1
         whole = len(found) >= spec.episodes or not rounds.over()
         if not found and whole:
-            told = (
+            reasons = (
                 "; ".join(f"{words} ({count})" for words, count in dropped.most_common())
                 or "none were drawn"
             )
-            raise SpecError(f"{out}: nothing to keep of {run} episodes: {told}")
+            raise SpecError(f"{out}: none of {run} episodes can be stored: {reasons}")
         kept = found[: spec.episodes]
         back = None
         if whole and form == "rosbag2":
@@ -265,14 +264,24 @@ class _Rounds:
         """The scenarios of a suite."""
         return () if isinstance(self.source, Fresh) else self.source.scenarios
 
+    @property
+    def robot(self) -> str:
+        """The robot of the scenarios, in suites with several that of the first one."""
+        return self._whole.scenarios[0].robot
+
+    @property
+    def _whole(self) -> Suite:
+        """The scenarios of a suite with the requested robot, or a placeholder for new ones."""
+        some = self.all or _nowhere(self.source)
+        return with_robot(
+            Suite(name="asked", version="1", scenarios=tuple(some)), self.options.robot
+        )
+
     def asked(self, episodes: int, expert: PolicyCaller) -> CollectSpec:
         """Return the requested options, checked as far as possible without a place. Raises
         UsageError.
         """
-        some = self.all or _nowhere(self.source)
-        whole = with_robot(
-            Suite(name="asked", version="1", scenarios=tuple(some)), self.options.robot
-        )
+        whole = self._whole
         told = run_spec(whole, whole.scenarios, self.policy, self.demonstrator, self.options)
         is_fresh = isinstance(self.source, Fresh)
         return CollectSpec(
@@ -372,8 +381,8 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
             found.refuse_other(spec, out)
             if not resume:
                 raise RunError(
-                    f"{out} already holds a data set, or a part of one. Add --resume to go "
-                    f"on with it."
+                    f"{out} already holds a data set, or a part of one. Add --resume to "
+                    f"continue it."
                 )
             return
         if out.exists() and (
@@ -408,7 +417,7 @@ def _loaded(path: Path) -> Demonstration:
         return Demonstration.decoded(path.read_bytes(), path)
     except OSError as error:
         raise RunError(
-            f"{path}: cannot be read: {error.strerror}: collect it anew, in another --out"
+            f"{path}: cannot be read: {error.strerror}: collect it again, in another --out"
         ) from error
 
 
@@ -460,14 +469,13 @@ def _written(
         writing.rmdir()
     except OSError as error:
         raise unwritable(
-            out, error, "episodes are kept; make room and go on with --resume"
+            out, error, "episodes are stored; make room and continue with --resume"
         ) from error
     return back
 
 
-def _write_about(out: Path, spec: CollectSpec, demonstrator: Demonstrator) -> None:
+def _write_about(out: Path, about: dict[str, Any]) -> None:
     """Write what packing needs beside the runs. Raises MachineError."""
-    about = _about(spec, demonstrator, spec.robot or COURIER.name)
     try:
         write_atomic(out / ABOUT, json.dumps(about, indent=1).encode() + b"\n")
     except OSError as error:

@@ -14,7 +14,7 @@ from cosim.spec.scenario import Scenario
 from scenarios.episodes.demonstration import Demonstration
 
 ABOUT: Final = "about.json"
-"""File of a collection of the format episodes, with the options of its collection."""
+"""File of a collection of the format raw, with the options of its collection."""
 RUNS: Final = "runs"
 """Folder of the run folders of a collection."""
 _SAME: Final = ("rate_hz", "waypoint_s", "waypoints", "goal", "camera", "robot")

@@ -5,8 +5,8 @@ meta/stats.json                      of each feature: min, max, mean, std, count
 meta/tasks.parquet                   the instructions
 meta/episodes/chunk-000/file-000.parquet   of each episode: length, place of rows and pictures,
                                      statistics, scenario,
-                                     structure, place, seed and
-                                     state hash
+                                     structure, place, seed, weather
+                                     and state hash
 meta/cosim.json                      options of the collection
 data/chunk-000/file-000.parquet      the rows
 videos/<key>/chunk-000/file-000.mp4  the pictures, one for each row, in its order, at index / rate
@@ -162,6 +162,7 @@ def _told(one: Collected) -> dict[str, Any]:
         "structure": scenario.structure,
         "place": scenario.place.name,
         "seed": scenario.seed,
+        "weather": scenario.conditions.name,
         "state_hash": one.record.state_hash,
     }
 

@@ -7,13 +7,13 @@ put back becomes several ones, which begin there.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import cv2
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +22,6 @@ from cosim.core.packed_demos import EXTRAS, Packed
 from cosim.core.progress import Progress, ignore
 from cosim.results.run_folder import DEMONSTRATION
 from cosim.spec.scenario import Scenario, read_suite
-from cosim.spec.weather import CLEAR
 from scenarios.episodes.clip import read_pictures
 from scenarios.episodes.demonstration import Demonstration
 from scenarios.ipc.parallel_map import parallel_map
@@ -65,6 +64,8 @@ def pack_raw(
 ) -> list[Part]:
     """Write collections in parts NAME-000.npz and so on, and return these.
 
+    Further parts of this name, which an earlier call wrote, are deleted.
+
     size: width and height of the pictures, instead of their own.
     part: episodes in a part.
 
@@ -80,7 +81,16 @@ def pack_raw(
     paths = [output.with_name(f"{output.stem}-{number:03d}.npz") for number in range(len(parts))]
     work = list(zip(paths, parts, strict=True))
     rows = parallel_map(partial(_write, abouts, size), work, jobs, progress, _STAGE)
+    for old in _parts_of(output):
+        if old not in paths:
+            old.unlink()
     return [Part(path, len(of), count) for (path, of), count in zip(work, rows, strict=True)]
+
+
+def _parts_of(output: Path) -> list[Path]:
+    """Return the existing parts of an output."""
+    name = re.compile(re.escape(output.stem) + r"-[0-9]{3,}\.npz")
+    return [path for path in output.parent.iterdir() if name.fullmatch(path.name)]
 
 
 def _about(folder: Path) -> dict[str, Any]:
@@ -95,7 +105,8 @@ def _about(folder: Path) -> dict[str, Any]:
 def _stored(number: int, folder: Path) -> list[_Stored]:
     """Return the stored demonstrations of a collection, in the order of its scenarios."""
     found = []
-    for run in sorted((folder / RUNS).glob("*/scenarios.json")):
+    runs = (folder / RUNS).glob("*/scenarios.json")
+    for run in sorted(runs, key=lambda path: int(path.parent.name)):
         for scenario in read_suite(run).scenarios:
             path = run.parent / "episodes" / scenario.id / DEMONSTRATION
             if path.exists():
@@ -104,8 +115,7 @@ def _stored(number: int, folder: Path) -> list[_Stored]:
 
 
 def _of(number: int, path: Path, scenario: Scenario) -> _Stored:
-    weather = CLEAR if scenario.weather is msgspec.UNSET else scenario.weather
-    return _Stored(number, path, scenario.id, scenario.structure, weather)
+    return _Stored(number, path, scenario.id, scenario.structure, scenario.conditions.name)
 
 
 def _write(

@@ -37,7 +37,7 @@ class DataSet:
     about: options of its collection.
     rows: its columns.
     films: files of its videos, in order.
-    episodes: `scenario` and `structure` of each.
+    episodes: `scenario`, `structure` and `weather` of each; older ones lack the weather.
     """
 
     folder: Path
@@ -70,7 +70,7 @@ class DataSet:
             first += shown
         if first != len(self):
             raise RunError(
-                f"{self.folder}: {first} pictures and {len(self)} rows: collect it anew, in "
+                f"{self.folder}: {first} pictures and {len(self)} rows: collect it again, in "
                 f"another --out"
             )
 
@@ -95,6 +95,8 @@ def read_data_set(folder: Path) -> DataSet:
             *(f"videos/{video_key}/{at}_index" for at in ("chunk", "file")),
         ]
         (path,) = sorted((folder / "meta/episodes").glob("*/*.parquet"))
+        if "weather" in pq.read_schema(path).names:  # older data sets lack it
+            told.append("weather")
         episodes = pq.read_table(path, columns=told).to_pylist()
         at = dict.fromkeys((one[told[2]], one[told[3]]) for one in episodes)
         names = [

@@ -40,10 +40,10 @@ def _varied(scenario: Scenario, collecting: DemoOptions, seed: int) -> Scenario:
         scenario = scenario.in_weather(
             collecting.weathers[weather.integers(len(collecting.weathers))]
         )
-    return led_astray(scenario, start) if start.random() < collecting.astray else scenario
+    return perturbed_start(scenario, start) if start.random() < collecting.astray else scenario
 
 
-def led_astray(scenario: Scenario, draws: np.random.Generator) -> Scenario:
+def perturbed_start(scenario: Scenario, draws: np.random.Generator) -> Scenario:
     """Return a scenario that begins aside of its route, turned away from it.
 
     Its reference route returns to the original one within _BACK_M.

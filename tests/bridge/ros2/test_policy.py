@@ -235,7 +235,7 @@ def test_a_node_that_cannot_drive_is_described(
         Peer(at, network=network, type_name=type_name),
         pytest.raises(PolicyError, match="is missing after") as error,
     ):
-        driver.on_wait(shown.append)
+        driver.on_reason(shown.append)
         driver.reset("k1", 7)
     assert words in str(error.value)
     assert len(shown) == 1 and shown[0].startswith("waits for a node: ") and words in shown[0]
@@ -285,7 +285,7 @@ def test_a_node_without_commands_is_described(
     with driven(at, start_s=1.6) as driver, Peer(at, reads=False) as peer:
         for topic, name in reads.items():
             peer.node.subscribe(topic, (name,), lambda got: None)
-        driver.on_wait(shown.append)
+        driver.on_reason(shown.append)
         driver.reset("k1", 7)
         with pytest.raises(PolicyError, match="gave no command for") as error:
             driver.act(seen_at(0))
@@ -337,7 +337,7 @@ def test_two_nodes_do_not_drive_together(at: str, capfd: Any) -> None:
     both = r"two publishers of /cmd_vel, /(one|two) and /(one|two): stop one"
     shown: list[str] = []
     with driven(at) as driver, Peer(at, name="one"), Peer(at, name="two"):
-        driver.on_wait(shown.append)
+        driver.on_reason(shown.append)
         driver.reset("k1", 7)
         assert len(shown) == 1 and re.match(f"there are {both}", shown[0])
         assert re.search(f"there are {both}", capfd.readouterr().err)

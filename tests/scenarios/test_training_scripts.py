@@ -1,0 +1,116 @@
+"""The script of a policy with a memory, with commands that only write the files of the real ones."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from cosim.core.errors import UsageError
+from scenarios.examples.black_pictures import Blinded
+
+SCRIPT = Path(__file__).parents[2] / "scenarios/examples/sidewalk_policy.sh"
+COMMAND = """#!/usr/bin/env bash
+echo "$(basename "$0") $*" >> "$CALLS"
+while [ $# -gt 0 ]; do
+  case $1 in
+    collect) command=$1 ;;
+    compare) command=$1 ;;
+    -o | --out) out=$2 ;;
+  esac
+  shift
+done
+case ${command:-} in
+  collect) exit "$CODE" ;;
+  compare) echo "a table" > "$out" ;;
+  *) case $out in *.npz) touch "${out%.npz}-000.npz" ;; *) mkdir -p "$out"; touch "$out/run.json" ;; esac ;;
+esac
+"""
+
+
+def called(
+    folder: Path, code: int = 4, **settings: str
+) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+    """The script with these settings and this exit code of `cosim collect`, and its commands."""
+    for name in ("cosim", "python"):
+        (folder / name).write_text(COMMAND)
+        (folder / name).chmod(0o755)
+    calls = folder / "calls.txt"
+    calls.write_text("")
+    done = subprocess.run(
+        ["bash", str(SCRIPT), str(folder / "work")],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ
+        | {"COSIM": str(folder / "cosim"), "PYTHON": str(folder / "python"), "CALLS": str(calls)}
+        | {
+            "CODE": str(code),
+            "JOBS": "1",
+            "ROUNDS": "1",
+            "ROBOTS": "",
+            "SEEDS": "0",
+            "SUITES": "unit",
+        }
+        | settings,
+    )
+    return done, calls.read_text().splitlines()
+
+
+def test_a_collection_that_crashed_is_not_done(tmp_path: Path) -> None:
+    """An uncaught exception, exit code 1, stops the script; so does a collection whose time is not
+    over. The rest of the time is what the next call collects for."""
+    done, calls = called(tmp_path, code=1)
+    assert done.returncode == 1 and "stopped in collect-0-unit: call again" in done.stdout
+    assert not [*tmp_path.glob("work/log/*.done")] and all("collect" in call for call in calls)
+    (tmp_path / "work/log/collect-0-unit.seconds").write_text("360")
+    done, calls = called(tmp_path, MINUTES="5", COLLECT="4.5")
+    assert done.returncode == 1 and "stopped in collect-0-long: call again" in done.stdout
+    assert [path.name for path in tmp_path.glob("work/log/*.done")] == ["collect-0-unit.done"]
+    minutes = {call.split()[2]: float(call.split("--minutes ")[1].split()[0]) for call in calls}
+    assert minutes["unit"] < 0.1 and 3.0 < minutes["long-horizon"] <= 3.5
+
+
+@pytest.mark.parametrize(
+    ("settings", "table", "names"),
+    [
+        ({"SUITES": "reactive"}, True, ["sidewalk-0"]),
+        ({"SEEDS": ""}, False, []),
+        ({"SEEDS": "0 1"}, True, ["sidewalk-0", "sidewalk-1"]),
+        ({"SEEDS": "1", "ABLATIONS": "1"}, True, ["sidewalk-1", "sidewalk-share-0.01"]),
+    ],
+    ids=["black", "no seed", "seeds", "ablations"],
+)
+def test_the_script_ends_with_a_table(
+    tmp_path: Path, settings: dict[str, str], table: bool, names: list[str]
+) -> None:
+    """Each policy has a name of its own, and all are compared; without a seed nothing is."""
+    done, calls = called(tmp_path, **settings)
+    assert done.returncode == 0 and done.stdout.endswith("all done\n"), done
+    assert ("a table" in done.stdout) == table
+    trained = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
+    assert trained[: len(names)] == names and len(trained) == len(set(trained))
+    assert sum("compare" in call for call in calls) == table
+
+
+def test_a_collection_must_fit_in_a_piece(tmp_path: Path) -> None:
+    """A COLLECT of MINUTES or more is refused, with both."""
+    done, calls = called(tmp_path, COLLECT="9")
+    assert (done.returncode, calls) == (2, [])
+    assert done.stdout == "COLLECT=9 must be less than MINUTES=9\n"
+
+
+def test_black_pictures_have_the_name_and_hash_of_their_policy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So another policy is another run. Without a policy the message says how to set one."""
+    names = set()
+    for policy in ("small", "small-reactive"):
+        monkeypatch.setenv("POLICY", policy)
+        names.add(Blinded().manifest.name.removeprefix(f"{policy}-black-"))
+    assert [len(name) for name in names] == [8, 8]
+    monkeypatch.delenv("POLICY")
+    with pytest.raises(UsageError, match="set POLICY, the policy that drives"):
+        Blinded()
