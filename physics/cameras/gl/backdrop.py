@@ -12,18 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.state import LABELS
+from physics.cameras.gl.full_screen import SPOT
 from physics.cameras.gl.lighting import sky_texels, sky_texture
 from physics.cameras.gl.pool import Part
 from physics.cameras.gl.shading import PICTURES_MAX, SKY_UNIT, programs
 from physics.cameras.gl.variants import Variant
 from physics.cameras.sky import HORIZON_FADE, Sky
 
-_VERTEX: Final = """
+_VERTEX: Final = f"""
 out vec2 spot;
-void main() {
-    spot = vec2(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0);
+void main() {{
+    spot = {SPOT};
     gl_Position = in_picture(vec4(spot, 1.0, 1.0));
-}
+}}
 """
 
 _FRAGMENT: Final = f"""

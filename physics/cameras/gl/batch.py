@@ -31,7 +31,14 @@ from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.pool import Part
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shading import PICTURES_MAX, Pass, SceneBlocks, SeatMaps
-from physics.cameras.gl.shadows import TO_TEXTURE, ShadowLayers, ShadowMaps, ShadowSeat, casting
+from physics.cameras.gl.shadows import (
+    NO_SUN,
+    TO_TEXTURE,
+    ShadowLayers,
+    ShadowMaps,
+    ShadowSeat,
+    casting,
+)
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.splat_layers import Layers, splat_pictures
 from physics.cameras.gl.splats import SplatCloud
@@ -48,9 +55,6 @@ from physics.street.surface import Surface
 _CLOCK: Final = Clock()
 _PEOPLE_MAX: Final = 8192
 """Maximum number of people in a batch; a picture with more is a separate batch."""
-
-
-_NO_SUN: Final = np.eye(4)
 
 
 class Stage(NamedTuple):
@@ -182,7 +186,7 @@ class BatchDrawing:
     def _arrange_blocks(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Upload the blocks of the pictures and of their shadow passes."""
         suns, to_maps = np.empty((2, len(pictures), 4, 4))
-        suns[:], to_maps[:] = _NO_SUN, TO_TEXTURE
+        suns[:], to_maps[:] = NO_SUN, TO_TEXTURE
         views = shots.views()
         for i, one in enumerate(pictures):
             if (shadows := one.stage.shadows) is not None:

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People, PersonKind
-from physics.cameras.gl.cloth import MAPS_UNIT, map_texture
+from physics.cameras.gl.cloth import map_texture
 from physics.cameras.gl.contact import CORNERS, ContactShadows
+from physics.cameras.gl.full_screen import VERTEX as FULL_SCREEN
 from physics.cameras.gl.instances import runs_of
-from physics.cameras.gl.shading import Pass
+from physics.cameras.gl.shading import MAPS_UNIT, Pass
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.skins import mesh_skins, tube_skins
 from physics.cameras.view import PERSON_MARGIN_M
@@ -61,10 +62,6 @@ _FEET: Final = _SHADOWS + len(ALL)
 _KEYS: Final = _FEET + 1
 """Number of forms of a part: outfits by level, plus one level for shadows, and feet."""
 _ENDS: Final = (0, MESH_LEVELS * len(ALL), _SHADOWS, _FEET, _KEYS)
-
-_POSE_VERTEX: Final = """#version 430
-void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
-"""
 
 _POSE_FRAGMENT: Final = """#version 430
 layout(binding = 0) uniform sampler2D baked;
@@ -144,7 +141,9 @@ class CrowdDrawing:
         )
         matrices = np.concatenate([self._clips.matrices, still], axis=1)
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
-        self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
+        self._pose = context.program(
+            vertex_shader="#version 430" + FULL_SCREEN, fragment_shader=_POSE_FRAGMENT
+        )
         self._everywhere = context.vertex_array(self._pose, [])
         self._maps = map_texture(context)
         self._contact = ContactShadows(context)

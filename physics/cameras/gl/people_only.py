@@ -18,6 +18,7 @@ from physics.cameras.gl.layers import LayerTarget
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.readback import Readback
 from physics.cameras.gl.shading import SceneBlocks, SeatMaps
+from physics.cameras.gl.shadows import NO_SUN
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.gl.variants import Variant
@@ -25,7 +26,6 @@ from physics.cameras.sky import sky_of
 from physics.cameras.view import shot
 
 _FIRST: Final = np.zeros(1, dtype=np.intp)
-_NO_SUN: Final = np.eye(4)[None]
 EYE_M = 0.75
 """Height of the eye over flat ground, metres."""
 
@@ -85,19 +85,18 @@ class PeopleAlone:
                 [PeopleSeen(street.people, Clock().time_s(street.tick), _flat, shadows=False)],
                 shots,
             )
-            self._blocks.set(shots.cameras(), _NO_SUN, _NO_SUN, shots.views(), self._rows)
+            self._blocks.set(shots.cameras(), NO_SUN[None], NO_SUN[None], shots.views(), self._rows)
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             gl.front_face = "cw"
             gl.depth_func = "<"
-            self._readback.begin()
-            if self._variant:
-                self._draw_layer()
-            else:
-                self._blocks.bind()
-                self._target.clear()
-                self._crowd.draw("colour", Variant.NONE)
-                self._readback.take()
-            self._readback.send()
+            with self._readback.begin():
+                if self._variant:
+                    self._draw_layer()
+                else:
+                    self._blocks.bind()
+                    self._target.clear()
+                    self._crowd.draw("colour", Variant.NONE)
+                    self._readback.take()
 
     def _draw_layer(self) -> None:
         """Draw the picture as a layer, as on a graphics card."""

@@ -49,6 +49,7 @@ the picture, and `project` selects both. Then eye.w is the layer of the static s
 
 Textures: the shadow maps are bound to units STILL_UNIT (static) and MOVING_UNIT (moving objects).
 SKY_UNIT holds the sky; SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT those of ground and walls.
+MAPS_UNIT holds maps of people.
 Units 0 and 1 are free for drawables; people use them for the time of a batch.
 
 A drawable implements `draw(stage)` and draws itself with its program of that stage:
@@ -84,6 +85,10 @@ FACADES_UNIT: Final = 4
 SKY_UNIT: Final = 5
 STILL_UNIT: Final = 6
 MOVING_UNIT: Final = 7
+MAPS_UNIT: Final = 8
+"""Texture unit of the maps of people, bound for each draw of them."""
+PICTURE_UNIT: Final = MAPS_UNIT
+"""Texture unit of the pictures to be read back, after all draws."""
 ANCHOR_M: Final = 64.0
 PICTURES_MAX: Final = 128
 """Maximum number of pictures of a batch: their blocks fill the uniform block of a layered draw."""

@@ -35,6 +35,8 @@ TO_TEXTURE: Final = np.array(
     [[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
 )
 """Matrix from clip space to texture space."""
+NO_SUN: Final = np.eye(4)
+"""Matrix of a shadow pass that is never drawn."""
 
 
 def shadow_matrix(
