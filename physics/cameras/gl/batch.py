@@ -2,9 +2,9 @@
 
 All pictures of a batch are arranged, posed, culled and uploaded together. On a graphics card,
 pictures by clear day are layers of one array texture: one call draws a material of all of them.
-Pictures with splats, weather or night are drawn one by one, and all pictures on a software
-renderer. Both ways run through the same code: a part of a batch is one or more pictures. Bits do
-not depend on the batch.
+Pictures with splats, weather, night or depth are drawn one by one, and all pictures on a software
+renderer. The same code draws both: a part of a batch is one or more pictures. Pictures are drawn
+in the order of their programs; bits do not depend on it.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from physics.cameras.gl.air import AirDrawing, LinearTarget
 from physics.cameras.gl.backdrop import Backdrop, SkySeat
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.driver import flush
+from physics.cameras.gl.gl_state import blending, polygon_offset
 from physics.cameras.gl.instances import Forms
 from physics.cameras.gl.lamps import casting_people
 from physics.cameras.gl.layers import LayerTarget, LayerTargets
@@ -108,8 +109,8 @@ class Sink(Protocol):
     def take(self, place: int) -> None:
         """Take the picture with a number from the target."""
 
-    def take_layers(self, drawn: LayerTarget, first: int, count: int, place: int) -> None:
-        """Take `count` pictures from the layers from `first` on. place: number of the first one"""
+    def take_layers(self, drawn: LayerTarget, places: Sequence[int]) -> None:
+        """Take pictures from the first layers. places: number of each"""
 
 
 class BatchDrawing:
@@ -136,19 +137,22 @@ class BatchDrawing:
         The caller must hold the context.
         """
         first = 0
-        for few in _batches(pictures):
+        for some in _batches(pictures):
+            order = _order(some)
+            few = [some[i] for i in order]
+            places = [first + i for i in order]
             parts = _parts(few)
             shots = self._arrange(few, parts)
             self._surfaces.bind()
             self._cast(few, parts, shots)
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self._context.front_face = "cw"  # draw upside down, to read the top row first
-            for some in self._together(few, parts, target.size):
-                if Variant.LAYERS in few[some[0].first].stage.variant:
-                    self._draw_layered(few, some[0], target.size, sink, first)
-                else:
-                    for i in self._draw_some(few, some, target):
-                        sink.take(first + i)
+            layered = [part for part in parts if _shared(few[part.first]) is not None]
+            if layered:
+                self._draw_layered(few, layered, target.size, sink, places)
+            for group in self._together(few, parts[len(layered) :], target.size):
+                for i in self._draw_some(few, group, target):
+                    sink.take(places[i])
             first += len(few)
 
     def _arrange(self, pictures: Sequence[PictureOrder], parts: Sequence[Part]) -> Shots:
@@ -261,8 +265,7 @@ class BatchDrawing:
             assert isinstance(shadows, ShadowSeat)
             wanted[shadows.layer] = shots.lattice[i][1:], shadows.to_sun
             number[shadows.layer] = i
-        changed = maps.begin_still(wanted)
-        if changed:
+        with maps.begin_still(wanted) as changed:
             self._seats.bind(still=True)
             for layer in changed:
                 one = Part(part.number, number[layer], number[layer] + 1)
@@ -289,22 +292,24 @@ class BatchDrawing:
     def _draw_layered(
         self,
         pictures: Sequence[PictureOrder],
-        part: Part,
+        parts: Sequence[Part],
         size: tuple[int, int],
         sink: Sink,
-        place: int,
+        places: Sequence[int],
     ) -> None:
-        """Draw the pictures of a part as layers. place: number of the first of the batch"""
-        flush()  # people and shadow maps are on their way
-        stage = pictures[part.first].stage
-        target = self._layers.of(size, len(pictures))
+        """Draw the pictures of the first parts as layers. places: number of each of the batch"""
+        flush()  # the graphics card starts people and shadow maps
+        end = parts[-1].end
+        target = self._layers.of(size, end)
         self._blocks.bind_all()
         self._seats.bind()
-        if isinstance(stage.shadows, ShadowSeat):
-            stage.shadows.maps.bind()
         target.clear()
-        self._draw(part, stage, target)
-        sink.take_layers(target, part.first, part.end - part.first, place + part.first)
+        for part in parts:
+            stage = pictures[part.first].stage
+            if isinstance(stage.shadows, ShadowSeat):
+                stage.shadows.maps.bind()
+            self._draw(part, stage, target)
+        sink.take_layers(target, places[:end])
 
     def _draw_some(
         self, pictures: Sequence[PictureOrder], parts: Sequence[Part], target: Target
@@ -359,23 +364,17 @@ class BatchDrawing:
         gl.depth_func = "<"
         self._draw_pass(part, stage, "colour")
         # Paint and the shade at feet change colours only; labels and depth stay those of the ground.
-        gl.polygon_offset = -1.0, -8.0
-        with target.only("colours"):
+        with polygon_offset(gl, -1.0, -8.0), target.only("colours"):
             self.street.draw_paint(part, style)
-            gl.enable(moderngl.BLEND)
-            gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
-            self.street.draw_decals(part, style)
-            gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
-            gl.disable(moderngl.BLEND)
+            with blending(gl):
+                gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
+                self.street.draw_decals(part, style)
             self._crowd.draw_contact(style.variant & Variant.LAYERS, part.number)
-        gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
         self._draw_sky(part, stage)
         # Glass shows what is behind it; its labels and depth are its own.
-        gl.enable(moderngl.BLEND)
-        with target.only("colours"):
+        with blending(gl), target.only("colours"):
             self.street.draw_panes(part, False, style)
-        gl.disable(moderngl.BLEND)
         with target.only("labels"):
             self.street.draw_panes(part, True, style)
 
@@ -437,18 +436,35 @@ def _batches(pictures: Sequence[PictureOrder]) -> Iterator[Sequence[PictureOrder
         yield pictures[begun:]
 
 
-def _parts(pictures: Sequence[PictureOrder]) -> list[Part]:
-    """Split a batch into parts: pictures in a row that are drawn as layers with the same programs
-    and textures, or single ones.
+def _shared(picture: PictureOrder) -> object:
+    """Return what pictures of one part have in common: the programs and textures of their layers.
+
+    None for a picture that is not drawn as a layer.
     """
+    stage = picture.stage
+    if not isinstance(stage.backdrop, SkySeat):
+        return None
+    maps = stage.shadows.maps if isinstance(stage.shadows, ShadowSeat) else None
+    return stage.scene.style, id(maps), id(stage.backdrop.skies)
+
+
+def _order(pictures: Sequence[PictureOrder]) -> list[int]:
+    """Return the order in which pictures are drawn: layers by part, then others by splats."""
+    ranks: dict[object, int] = {}
+    keys = []
+    for one in pictures:
+        shared = _shared(one)
+        key = id(one.stage.cloud) if shared is None else shared
+        keys.append((shared is None, ranks.setdefault(key, len(ranks))))
+    return sorted(range(len(pictures)), key=keys.__getitem__)
+
+
+def _parts(pictures: Sequence[PictureOrder]) -> list[Part]:
+    """Split a batch into parts: pictures in a row that share their programs, or single ones."""
     parts: list[Part] = []
     last: object = None
     for i, one in enumerate(pictures):
-        stage = one.stage
-        shared: object = None
-        if isinstance(stage.backdrop, SkySeat):
-            maps = stage.shadows.maps if isinstance(stage.shadows, ShadowSeat) else None
-            shared = stage.scene.style, id(maps), id(stage.backdrop.skies)
+        shared = _shared(one)
         if shared is not None and shared == last:
             parts[-1] = parts[-1]._replace(end=i + 1)
         else:

@@ -106,7 +106,7 @@ class PeopleAlone:
         self._seats.bind()
         self._layers.clear()
         self._crowd.draw("colour", self._variant)
-        self._readback.take_layers(self._layers, 0, 1, 0)
+        self._readback.take_layers(self._layers, (0,))
 
     def end(self) -> Frame:
         """Return the oldest pending picture."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
 import moderngl
+import numpy as np
 
-from physics.cameras.gl.shading import PICTURE_UNIT
+from physics.cameras.gl.shading import PICTURE_UNIT, PICTURES_MAX
 
 _BINDING: Final = 2
 _GROUP: Final = 64
@@ -18,23 +20,29 @@ def write_picture(
 ) -> None:
     """Queue a copy of a picture into a buffer. offset: bytes, a multiple of 4"""
     picture.use(PICTURE_UNIT)
-    _run(context, _program(context, False), picture.size, buffer, (0, 1), offset)
+    program = _program(context, False)
+    program["first_word"] = offset // 4
+    _run(context, program, picture.size, buffer, 1)
 
 
 def write_layers(
     context: moderngl.Context,
     pictures: moderngl.TextureArray,
     buffer: moderngl.Buffer,
-    layers: tuple[int, int],
-    offset: int,
+    places: Sequence[int],
 ) -> None:
-    """Queue a copy of pictures that are layers, one after another, into a buffer.
+    """Queue a copy of pictures that are the first layers into a buffer.
 
-    layers: first layer and count
-    offset: bytes, a multiple of 4
+    places: number of each in the buffer, at most PICTURES_MAX
     """
     pictures.use(PICTURE_UNIT)
-    _run(context, _program(context, True), pictures.size[:2], buffer, layers, offset)
+    program = _program(context, True)
+    numbers = np.zeros(PICTURES_MAX, dtype=np.int32)
+    numbers[: len(places)] = places
+    uniform = program["places"]
+    assert isinstance(uniform, moderngl.Uniform)
+    uniform.write(numbers)
+    _run(context, program, pictures.size[:2], buffer, len(places))
 
 
 def _run(
@@ -42,13 +50,10 @@ def _run(
     program: moderngl.ComputeShader,
     size: tuple[int, ...],
     buffer: moderngl.Buffer,
-    layers: tuple[int, int],
-    offset: int,
+    count: int,
 ) -> None:
-    first, count = layers
     words = size[0] * size[1]
     buffer.bind_to_storage_buffer(_BINDING)
-    program["places"] = first, offset // 4, words
     # Without this barrier, llvmpipe reads stale texels where a picture was cleared but not drawn.
     context.memory_barrier()
     program.run((words + _GROUP - 1) // _GROUP, count)
@@ -56,27 +61,36 @@ def _run(
 
 
 @lru_cache(maxsize=2)
-def _program(context: moderngl.Context, layered: bool) -> moderngl.ComputeShader:
-    sampler, texel = ("sampler2DArray", "ivec3(xy, layer)") if layered else ("sampler2D", "xy")
+def _program(context: moderngl.Context, layers: bool) -> moderngl.ComputeShader:
+    layered = "#define LAYERED\n" if layers else ""
     return context.compute_shader(
         f"""#version 430
+{layered}
         layout(local_size_x = {_GROUP}) in;
-        layout(binding = {PICTURE_UNIT}) uniform {sampler} pictures;
         layout(std430, binding = {_BINDING}) writeonly buffer Bytes {{ uint words[]; }};
-        uniform ivec3 places;  // first layer, first word, words of a picture
+#ifdef LAYERED
+        layout(binding = {PICTURE_UNIT}) uniform sampler2DArray pictures;
+        uniform int places[{PICTURES_MAX}];
+        #define AT(xy) ivec3(xy, gl_WorkGroupID.y)
+#else
+        layout(binding = {PICTURE_UNIT}) uniform sampler2D pictures;
+        uniform int first_word;
+        #define AT(xy) xy
+#endif
         void main() {{
-            int word = int(gl_GlobalInvocationID.x), nth = int(gl_WorkGroupID.y);
-            if (word >= places.z) return;
-            int wide = textureSize(pictures, 0).x, colours = 3 * places.z;
-            int layer = places.x + nth;
+            ivec2 size = textureSize(pictures, 0).xy;
+            int word = int(gl_GlobalInvocationID.x), whole = size.x * size.y, colours = 3 * whole;
+            if (word >= whole) return;
             vec4 four;
             for (int i = 0; i < 4; i++) {{
                 int k = 4 * word + i, at = k < colours ? k / 3 : k - colours;
-                ivec2 xy = ivec2(at % wide, at / wide);
-                vec4 seen = texelFetch(pictures, {texel}, 0);
+                vec4 seen = texelFetch(pictures, AT(ivec2(at % size.x, at / size.x)), 0);
                 four[i] = seen[k < colours ? k - 3 * at : 3];
             }}
-            words[places.y + nth * places.z + word] = packUnorm4x8(four);
+#ifdef LAYERED
+            int first_word = places[gl_WorkGroupID.y] * whole;
+#endif
+            words[first_word + word] = packUnorm4x8(four);
         }}
         """
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
@@ -129,11 +129,10 @@ class Readback:
         """Queue a copy of the target to a place of the most recent batch."""
         self._target.copy(self._buffer, place * self._each)
 
-    def take_layers(self, drawn: LayerTarget, first: int, count: int, place: int) -> None:
-        """Queue a copy of `count` layers from `first` on to places of the most recent batch."""
+    def take_layers(self, drawn: LayerTarget, places: Sequence[int]) -> None:
+        """Queue a copy of the first layers to places of the most recent batch."""
         assert drawn.colour is not None
-        offset = place * self._each
-        write_layers(self._context, drawn.colour, self._buffer, (first, count), offset)
+        write_layers(self._context, drawn.colour, self._buffer, places)
 
     def end(self) -> Pictures:
         """Return the pictures of the oldest batch, as `Target.read` does.
@@ -240,10 +239,10 @@ class SinglePicture:
         """Read the target."""
         self._found = [self.target.read()]
 
-    def take_layers(self, drawn: LayerTarget, first: int, count: int, place: int) -> None:
-        """Read a layer."""
+    def take_layers(self, drawn: LayerTarget, places: Sequence[int]) -> None:
+        """Read the first layer."""
         with self._readback.begin():
-            self._readback.take_layers(drawn, first, count, place)
+            self._readback.take_layers(drawn, places)
         self._found = self._readback.end()
 
     def end(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

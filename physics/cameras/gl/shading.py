@@ -93,7 +93,6 @@ ANCHOR_M: Final = 64.0
 PICTURES_MAX: Final = 128
 """Maximum number of pictures of a batch: their blocks fill the uniform block of a layered draw."""
 SEATS_BINDING: Final = 1
-_USED_ROWS: Final = 21
 _BLOCK_ROWS: Final = 32
 """Rows (vec4) of a block; graphics cards require aligned starts of blocks."""
 
@@ -125,16 +124,25 @@ layout(std140, binding = 0) uniform Scene {{
 """
 
 _BLOCKS: Final = f"""#version 430
-#extension GL_ARB_shader_viewport_layer_array : require
-struct Scene {{
-{_DECLARED}    vec4 unused[{_BLOCK_ROWS - _USED_ROWS}];
-}};
-layout(std140, binding = 0) uniform Scenes {{ Scene scenes[{PICTURES_MAX}]; }};
+EXTENSION
+layout(std140, binding = 0) uniform Scenes {{ vec4 rows[{_BLOCK_ROWS * PICTURES_MAX}]; }};
 """
-_OF_PICTURE: Final = "".join(
-    f"{kind} {name} = scenes[PICTURE].{name};\n" for kind, name in _MEMBERS
-)
-"""Values of one block under the names that they have without layers."""
+_LAYER_EXTENSION: Final = "#extension GL_ARB_shader_viewport_layer_array : require"
+"""For vertex shaders, which select the layer; other shaders have no such extension."""
+
+
+def _of_picture() -> str:
+    """Return GLSL of the values of one block under the names that they have without layers."""
+    lines, row = [], 0
+    for kind, name in _MEMBERS:
+        size = 4 if kind == "mat4" else 1
+        rows = ", ".join(f"rows[{_BLOCK_ROWS} * PICTURE + {row + i}]" for i in range(size))
+        lines.append(f"{kind} {name} = {kind}({rows});\n")
+        row += size
+    return "".join(lines)
+
+
+_OF_PICTURE: Final = _of_picture()
 
 _VERTEX = """
 invariant gl_Position;  // the same depth in all programs
@@ -180,11 +188,11 @@ layout(binding = 7) uniform sampler2DShadow moving_shadow;
 #define MOVING(p) texture(moving_shadow, p)
 #endif
 vec3 on_map(vec3 at, vec3 normal) { return (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz; }
-float sunlit_on(vec3 on_map) {
+float sunlit_on(vec3 spot) {
 #ifdef SHADOWS
-    vec2 off = abs(on_map.xy - 0.5);
+    vec2 off = abs(spot.xy - 0.5);
     float inside = clamp((0.5 - max(off.x, off.y)) * 20.0, 0.0, 1.0);
-    float lit = min(STILL(on_map), MOVING(on_map));
+    float lit = min(STILL(spot), MOVING(spot));
     return 1.0 - sun.w * inside * (1.0 - lit);
 #else
     return 1.0;
@@ -331,14 +339,12 @@ def programs(
     """
     variant = Variant(shadows)
     layers = Variant.LAYERS in variant
-    head = (_BLOCKS if layers else _BLOCK) + variant.defines
-    before = head + (_SEATS if layers else "") + _DECODED + _SHADOW
-    before += _LAYERS_VERTEX if layers else _VERTEX
+    head = (_BLOCKS.replace("EXTENSION", "") if layers else _BLOCK) + variant.defines
     head += _LAYERS_FRAGMENT if layers else ""
     weather = BLOCK if variant & Variant.WEATHER else ""
     return Programs(
         context.program(
-            vertex_shader=before + vertex,
+            vertex_shader=_before_vertex(variant) + vertex,
             fragment_shader=head
             + weather
             + _DECODED
@@ -347,10 +353,19 @@ def programs(
             + fragment,
         ),
         context.program(
-            vertex_shader=before + vertex,
+            # These programs draw into the shadow maps, so they must not read them.
+            vertex_shader=_before_vertex(variant & ~Variant.SHADOWS) + vertex,
             fragment_shader=f"#version 430\n{cut_out}" if cut_out else _NOTHING,
         ),
     )
+
+
+def _before_vertex(variant: Variant) -> str:
+    """Return the GLSL before a drawable's vertex shader."""
+    if Variant.LAYERS in variant:
+        head = _BLOCKS.replace("EXTENSION", _LAYER_EXTENSION)
+        return head + variant.defines + _SEATS + _DECODED + _SHADOW + _LAYERS_VERTEX
+    return _BLOCK + variant.defines + _DECODED + _SHADOW + _VERTEX
 
 
 def anchor_of(eye_m: Floats) -> Floats:

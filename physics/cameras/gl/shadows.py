@@ -19,6 +19,7 @@ import moderngl
 import numpy as np
 
 from cosim.core.geometry import Floats
+from physics.cameras.gl.gl_state import polygon_offset
 from physics.cameras.gl.layers import DepthLayers
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Pass
@@ -78,9 +79,8 @@ def casting(context: moderngl.Context) -> Iterator[None]:
     """Set the GL state for drawing shadow maps within a `with` block."""
     context.enable_only(moderngl.DEPTH_TEST)
     context.depth_func = "<"
-    context.polygon_offset = 1.5, 4.0
-    yield
-    context.polygon_offset = 0.0, 0.0
+    with polygon_offset(context, 1.5, 4.0):
+        yield
 
 
 class SunView:
@@ -130,6 +130,7 @@ class ShadowMaps(SunView):
         """
         key = (*lattice.anchor, *lattice.middle, *light.to_sun.tolist())
         if key != self._drawn_for:
+            self._drawn_for = None
             self._draw("still", draw)
             self._drawn_for = key
         self._draw("moving", draw)
@@ -186,8 +187,9 @@ class ShadowLayers:
         self._seats.remove(layer)
         self._drawn.pop(layer, None)
 
-    def begin_still(self, wanted: Mapping[int, object]) -> list[int]:
-        """Clear the static maps to be drawn, and return their layers.
+    @contextmanager
+    def begin_still(self, wanted: Mapping[int, object]) -> Iterator[list[int]]:
+        """Clear the static maps to be drawn within a `with` block, and return their layers.
 
         wanted: what the map of each layer depends on
         """
@@ -195,11 +197,12 @@ class ShadowLayers:
             self._drawn.clear()
         changed = [layer for layer, key in wanted.items() if self._drawn.get(layer) != key]
         for layer in changed:
+            self._drawn.pop(layer, None)
             self._still.clear(layer)
-            self._drawn[layer] = wanted[layer]
         if changed:
             self._still.use()
-        return changed
+        yield changed
+        self._drawn.update((layer, wanted[layer]) for layer in changed)
 
     def begin_moving(self, pictures: int, clear: bool) -> None:
         """Draw into the maps of the moving objects of a batch from now on."""
@@ -213,7 +216,6 @@ class ShadowLayers:
         self._moving.bind(MOVING_UNIT)
 
 
-@lru_cache(maxsize=8)
 def shadow_layers(context: moderngl.Context, high_px: int) -> ShadowLayers:
     """Return the context's maps for pictures of a height, with the same lifetime."""
     return _layers_of(context, sides_px(high_px))

@@ -15,6 +15,7 @@ import numpy as np
 from cosim.core.geometry import Floats
 from physics.cameras.gl import corners, walls
 from physics.cameras.gl.context import is_card
+from physics.cameras.gl.gl_state import depth_only
 from physics.cameras.gl.instances import MATERIALS, POOLED, Forms, Material, ThingArrays
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.pool import Draws, MeshPool, Part, Pool
@@ -100,6 +101,7 @@ class StreetDrawing:
     def leave(self, seat: int) -> None:
         """Return a number from `seat`."""
         self._seats.append(seat)
+        self._scenes = ()
 
     @property
     def seats(self) -> int:
@@ -183,24 +185,22 @@ class StreetDrawing:
                 self._draws.draw(array, step, i, i + 1)
 
     def _draw_walls(self, style: Style, part: Part) -> None:
-        """Draw the picture of walls, which hide one another, and shade only what is seen.
+        """Draw the walls of pictures.
 
-        The depth comes first on a software renderer, which spends its time on shading.
+        A software renderer first draws their depths alone, so that hidden walls are not shaded.
         """
         gl = self._context
         step = _STEP["colour", "walls"]
         if is_card(gl) or not self._draws.count(step, part.first, part.end):
             self._draw_tiles("walls", "colour", style, part)
             return
-        frame = gl.fbo
-        frame.color_mask = False, False, False, False
-        frame.use()
-        self._draws.draw(self._tile_array("walls", style)[1], step, part.first, part.end)
-        frame.color_mask = True, True, True, True
-        frame.use()
+        with depth_only(gl.fbo):
+            self._draws.draw(self._tile_array("walls", style)[1], step, part.first, part.end)
         gl.depth_func = "<="
-        self._draw_tiles("walls", "colour", style, part)
-        gl.depth_func = "<"
+        try:
+            self._draw_tiles("walls", "colour", style, part)
+        finally:
+            gl.depth_func = "<"
 
     def _draw_tiles(self, kind: TileKind, stage: Pass, style: Style, part: Part) -> None:
         step = _STEP["colour" if stage == "colour" else "still", kind]
