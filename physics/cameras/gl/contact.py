@@ -63,7 +63,7 @@ class ContactShadows:
         """
         if layers not in self._arrays:
             drawn = programs(self._context, _VERTEX, _FRAGMENT, layers).colour
-            layout = ("1i4 8x 1f4 1i4/i", "person", "tall", "seat")
+            layout = ("1i4 8x 1f4 1i4/i", "person", "tall", "scene_id")
             content = [(instances, *(layout if layers else ("1i4 8x 1f4 4x/i", *layout[1:3])))]
             self._arrays[layers] = self._context.vertex_array(drawn, content)
         with blending(self._context):

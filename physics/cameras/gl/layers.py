@@ -119,7 +119,7 @@ class DepthLayers:
         """Create the texture; return its name."""
         name = ctypes.c_uint(0)
         error = function("glGetError", "", "u")
-        error()  # of an earlier call
+        error()  # clears the error of an earlier call
         function("glGenTextures", "ip")(1, ctypes.addressof(name))
         function("glActiveTexture", "u")(_TEXTURE0 + self._context.default_texture_unit)
         function("glBindTexture", "uu")(_TEXTURE_2D_ARRAY, name.value)

@@ -17,7 +17,7 @@ from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.layers import LayerTarget
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.readback import Readback
-from physics.cameras.gl.shading import SceneBlocks, SeatMaps
+from physics.cameras.gl.shading import SceneBlocks, SceneMaps
 from physics.cameras.gl.shadows import NO_SUN
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
@@ -51,7 +51,7 @@ class PeopleAlone:
             )
             self._readback = Readback(gl, self._target)
             self._layers = LayerTarget(gl, self._size)
-            self._seats = SeatMaps(gl)
+            self._scene_maps = SceneMaps(gl)
             self._variant = Variant.LAYERS if draws_layers(gl) else Variant.NONE
         self._context = gl
         return self
@@ -65,7 +65,7 @@ class PeopleAlone:
         with self._context:
             for thing in (
                 *(self._crowd, self._blocks, self._target, self._readback),
-                *(self._layers, self._seats),
+                *(self._layers, self._scene_maps),
             ):
                 thing.release()
 
@@ -102,8 +102,8 @@ class PeopleAlone:
         """Draw the picture as a layer, as on a graphics card."""
         self._layers.room(1)
         self._blocks.bind_all()
-        self._seats.set(1, _FIRST, _FIRST)
-        self._seats.bind()
+        self._scene_maps.set(1, _FIRST, _FIRST)
+        self._scene_maps.bind()
         self._layers.clear()
         self._crowd.draw("colour", self._variant)
         self._readback.take_layers(self._layers, (0,))

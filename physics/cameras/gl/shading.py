@@ -44,7 +44,7 @@ Uniform block `Scene` (binding SCENE_BINDING, one per pass and picture, from `Sc
     vec4 backdrop          with layers: rgb linear, all around the horizon; w layer of the sky
 
 With `Variant.LAYERS` one draw fills layers of array textures, one for each picture. The attribute
-`seat` of an instance is that of its scene; the buffer `Seats` maps it to the block and the layer of
+`scene_id` of an instance is that of its scene; the buffer `SceneMap` maps it to the block and the layer of
 the picture, and `project` selects both. Then eye.w is the layer of the static shadow map.
 
 Textures: the shadow maps are bound to units STILL_UNIT (static) and MOVING_UNIT (moving objects).
@@ -92,7 +92,7 @@ PICTURE_UNIT: Final = MAPS_UNIT
 ANCHOR_M: Final = 64.0
 PICTURES_MAX: Final = 128
 """Maximum number of pictures of a batch: their blocks fill the uniform block of a layered draw."""
-SEATS_BINDING: Final = 1
+SCENE_MAPS_BINDING: Final = 1
 _BLOCK_ROWS: Final = 32
 """Rows (vec4) of a block; graphics cards require aligned starts of blocks."""
 
@@ -151,11 +151,11 @@ vec4 in_picture(vec4 clip) { return clip; }
 vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
 """
 
-_SEATS: Final = f"""
-layout(std430, binding = {SEATS_BINDING}) readonly buffer Seats {{ ivec2 seats[]; }};
-in int seat;
+_SCENE_MAP: Final = f"""
+layout(std430, binding = {SCENE_MAPS_BINDING}) readonly buffer SceneMap {{ ivec2 scene_map[]; }};
+in int scene_id;
 flat out int picture;
-ivec2 block_layer = seats[seat];
+ivec2 block_layer = scene_map[scene_id];
 #define PICTURE block_layer.x
 {_OF_PICTURE}"""
 _LAYERS_VERTEX: Final = """
@@ -364,7 +364,7 @@ def _before_vertex(variant: Variant) -> str:
     """Return the GLSL before a drawable's vertex shader."""
     if Variant.LAYERS in variant:
         head = _BLOCKS.replace("EXTENSION", _LAYER_EXTENSION)
-        return head + variant.defines + _SEATS + _DECODED + _SHADOW + _LAYERS_VERTEX
+        return head + variant.defines + _SCENE_MAP + _DECODED + _SHADOW + _LAYERS_VERTEX
     return _BLOCK + variant.defines + _DECODED + _SHADOW + _VERTEX
 
 
@@ -452,8 +452,8 @@ class SceneBlocks:
         self._buffer.release()
 
 
-class SeatMaps:
-    """Buffers `Seats`: blocks and layers of the scenes of a batch, for pictures and static maps."""
+class SceneMaps:
+    """Buffers `SceneMap`: blocks and layers of the scenes of a batch, for pictures and static maps."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
@@ -461,30 +461,30 @@ class SeatMaps:
         self._buffers: list[moderngl.Buffer] = []
         self._held: tuple[int, bytes, bytes] | None = None
 
-    def set(self, count: int, seats: NDArray[np.intp], maps: NDArray[np.intp]) -> None:
+    def set(self, count: int, scene_ids: NDArray[np.intp], maps: NDArray[np.intp]) -> None:
         """Upload the places of N scenes.
 
-        count: number above all seats
-        seats, maps: (N,) seats, and layers of the static shadow maps
+        count: number above all ids
+        scene_ids, maps: (N,) ids, and layers of the static shadow maps
         """
         if count > self._room:
             self.release()
             self._room = 2 * count
             self._buffers = [self._context.buffer(reserve=8 * self._room) for _ in range(2)]
             self._held = None
-        wanted = count, seats.tobytes(), maps.tobytes()
+        wanted = count, scene_ids.tobytes(), maps.tobytes()
         if wanted == self._held:
             return
         self._held = wanted
-        pictures = np.arange(len(seats))
+        pictures = np.arange(len(scene_ids))
         for buffer, layers in zip(self._buffers, (pictures, maps), strict=True):
             rows = np.zeros((count, 2), dtype=np.int32)
-            rows[seats, 0], rows[seats, 1] = pictures, layers
+            rows[scene_ids, 0], rows[scene_ids, 1] = pictures, layers
             buffer.write(rows)
 
     def bind(self, still: bool = False) -> None:
         """Bind the places of pictures, or of static shadow maps, for later draws."""
-        self._buffers[still].bind_to_storage_buffer(SEATS_BINDING)
+        self._buffers[still].bind_to_storage_buffer(SCENE_MAPS_BINDING)
 
     def release(self) -> None:
         for buffer in self._buffers:

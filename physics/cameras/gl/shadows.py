@@ -152,7 +152,7 @@ class ShadowMaps(SunView):
         self._moving.release()
 
 
-class ShadowSeat(SunView):
+class ShadowSlot(SunView):
     """A scene in `ShadowLayers`. layer: of its static map; to_sun: x, y, z"""
 
     def __init__(self, maps: ShadowLayers, light: Lighting) -> None:
@@ -173,18 +173,18 @@ class ShadowLayers:
         self._still, self._moving = (
             DepthLayers(context, (side, side), shadow=True) for side in sides
         )
-        self._seats: set[int] = set()
+        self._taken: set[int] = set()
         self._drawn: dict[int, object] = {}
 
     def take(self) -> int:
         """Return an unused layer of the static maps."""
-        layer = next(i for i in count() if i not in self._seats)
-        self._seats.add(layer)
+        layer = next(i for i in count() if i not in self._taken)
+        self._taken.add(layer)
         return layer
 
     def give(self, layer: int) -> None:
         """Return a layer from `take`."""
-        self._seats.remove(layer)
+        self._taken.remove(layer)
         self._drawn.pop(layer, None)
 
     @contextmanager
@@ -193,7 +193,7 @@ class ShadowLayers:
 
         wanted: what the map of each layer depends on
         """
-        if self._still.room(max(self._seats, default=0) + 1):
+        if self._still.room(max(self._taken, default=0) + 1):
             self._drawn.clear()
         changed = [layer for layer, key in wanted.items() if self._drawn.get(layer) != key]
         for layer in changed:
