@@ -89,12 +89,18 @@ def test_layers_hold_the_pictures_of_single_cameras(
             assert _same(frame, single[k][tick]), (tick, k)
 
 
+@pytest.mark.parametrize("layers", [False, True])
 def test_environments_join_and_leave_an_atlas(
-    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch
+    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool
 ) -> None:
     """An environment in an atlas gets the pictures of its own camera, whichever environments join,
     leave or fail."""
     from physics.cameras.gl.atlas import Atlas
+    from physics.cameras.gl.crowd import CrowdDrawing
+    from physics.cameras.gl.street import StreetDrawing
+
+    def fails(*arguments: object) -> None:
+        raise ZeroDivisionError
 
     busy = busy_street(camera_city(300.0), 8, 4)
     near = worlds[0].robot
@@ -104,6 +110,7 @@ def test_environments_join_and_leave_an_atlas(
     asked = [(busy.robot, street) for street in busy.streets]
     seats = list(zip((worlds[0], other, worlds[2]), lights, strict=True))
     a, b, c = (_alone(world, light, asked) for world, light in seats)
+    monkeypatch.setattr(context, "LAYERS", layers)
     with Atlas(SPEC) as atlas:
         first, second = (atlas.join(*seat) for seat in seats[:2])
         found = atlas.render([(second, *asked[0]), (first, *asked[0])])
@@ -124,8 +131,26 @@ def test_environments_join_and_leave_an_atlas(
             atlas.begin([(third, *asked[3]), (second, *asked[3])])
         again = atlas.join(*seats[0])
         assert again not in (first, second, third)
+        for drawing, name in ((StreetDrawing, "draw"), (CrowdDrawing, "draw_contact")):
+            with monkeypatch.context() as broken, pytest.raises(ZeroDivisionError):
+                broken.setattr(drawing, name, fails)
+                atlas.begin([(third, *asked[3]), (again, *asked[3])])
         assert all(map(_same, atlas.render([(k, *asked[3]) for k in (again, third)]), (a[3], c[3])))
         assert atlas.render([]) == []
+
+
+def test_a_driver_without_what_layers_need_draws_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers that are forced fail with the names of the extensions and limits that are missing."""
+    limits = (("GL_MAX_UNIFORM_BLOCK_SIZE", 1 << 30), ("GL_MAX_VERTEX_SHADER_STORAGE_BLOCKS", 1))
+    monkeypatch.setattr(context, "LAYERS", True)
+    with context.context() as gl, monkeypatch.context() as lacking:
+        assert context.draws_layers(gl)
+        lacking.setattr(context, "_LAYER_EXTENSIONS", ("GL_ARB_none", "GL_ARB_clear_texture"))
+        lacking.setattr(context, "_LAYER_LIMITS", limits)
+        context.missing_for_layers.cache_clear()
+        with pytest.raises(EngineError, match=r"lacks GL_ARB_none, GL_MAX_UNIFORM_BLOCK_SIZE of"):
+            context.draws_layers(gl)
+    context.missing_for_layers.cache_clear()
 
 
 def test_a_picture_whose_drawing_or_wait_failed_is_not_returned(

@@ -42,9 +42,11 @@ def context() -> moderngl.Context:
             f"{PACKAGES}; with a GPU its driver's EGL library), or use --camera bullet."
         ) from error
     if missing := [name for name in _REQUIRED if name not in made.extensions]:
+        driver = f"{made.info['GL_RENDERER']} ({made.info['GL_VERSION']})"
+        made.release()
         raise EngineError(
-            f"the gl camera needs {', '.join(missing)}, which {made.info['GL_RENDERER']} "
-            f"({made.info['GL_VERSION']}) lacks: install a newer driver, or use --camera bullet"
+            f"the gl camera needs {', '.join(missing)}, which {driver} lacks: install a newer "
+            "driver, or use --camera bullet"
         )
     made.__exit__(
         None, None, None
@@ -78,8 +80,8 @@ def draws_layers(context: moderngl.Context) -> bool:
     Raises EngineError where LAYERS is set, and the driver cannot draw layers.
     """
     if LAYERS is None:
-        return is_card(context) and not _missing_for_layers(context)
-    if LAYERS and (missing := _missing_for_layers(context)):
+        return is_card(context) and not missing_for_layers(context)
+    if LAYERS and (missing := missing_for_layers(context)):
         raise EngineError(
             f"this graphics driver cannot draw pictures as layers: it lacks {', '.join(missing)}"
         )
@@ -87,7 +89,7 @@ def draws_layers(context: moderngl.Context) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _missing_for_layers(context: moderngl.Context) -> list[str]:
+def missing_for_layers(context: moderngl.Context) -> list[str]:
     """Return the extensions and limits that drawing layers needs, and the driver lacks."""
     lacks = [name for name in _LAYER_EXTENSIONS if name not in context.extensions]
     info: dict[str, Any] = dict(context.info)
