@@ -52,21 +52,6 @@ for _name in ("getLaneID", "getLanePosition", "setSpeed"):
     setattr(libsumo.vehicle, _name, getattr(_native, f"vehicle_{_name}"))
 
 
-class _Entries:
-    """Adds persons to SUMO, and counts them."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def add(self, *arguments: Any, **named: Any) -> None:
-        """Call SUMO's `person.add`."""
-        self.count += 1
-        _native.person_add(*arguments, **named)
-
-
-_entries: Final = _Entries()
-libsumo.person.add = _entries.add
-
 _ERRORS: Final = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 
@@ -276,10 +261,9 @@ def _waiting_s(query: Callable[[str], float], near: NearPersons | NearVehicles) 
 
 
 class NearReader:
-    """Reads persons and vehicles near a point, once after every step.
+    """Reads persons and vehicles near a point.
 
-    Names are sorted again only where SUMO's list of them may have changed. Persons must enter by
-    `person.add` alone.
+    Names are sorted again only where SUMO's list of them may have changed.
 
     crowd: names of the persons to read; those of persons that are in SUMO already never change.
     """
@@ -287,7 +271,7 @@ class NearReader:
     def __init__(self, crowd: Container[str]) -> None:
         self._crowd = crowd
         self._persons: tuple[str, ...] = ()
-        self._present = -1, 0
+        self._counted_at = -1, -1.0
         self._listed: Sequence[str] = ()
         self._vehicles: tuple[str, ...] = ()
         self._reach: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
@@ -301,7 +285,17 @@ class NearReader:
 
         While they are the same, the names are the same tuple.
         """
-        self._update_names()
+        try:
+            self._update_names()
+            return self._read(x_m, y_m, persons_m, vehicles_m)
+        except libsumo.TraCIException:  # a person left, and another was loaded for later
+            self._counted_at = -1, -1.0
+            self._update_names()
+            return self._read(x_m, y_m, persons_m, vehicles_m)
+
+    def _read(
+        self, x_m: float, y_m: float, persons_m: float, vehicles_m: float
+    ) -> tuple[NearPersons, NearVehicles]:
         persons, vehicles = self._persons, self._vehicles
         k, n = len(persons), len(persons) + len(vehicles)
         places = chain(
@@ -335,14 +329,19 @@ class NearReader:
         )
 
     def _update_names(self) -> None:
-        """Sort names that may have changed: persons leave where their number changes, and enter
-        only by `person.add`."""
-        state = _native.person_getIDCount(), _entries.count
-        if state != self._present:
-            self._present = state
+        """Sort names that may have changed.
+
+        Persons are the same while no step has been missed, none departed in the last one, and their
+        number has not changed.
+        """
+        count, now_s = _native.person_getIDCount(), _native.simulation_getTime()
+        counted, at_s = self._counted_at
+        missed = now_s - at_s > 1.5 * _native.simulation_getDeltaT() or now_s < at_s
+        if missed or count != counted or _native.simulation_getDepartedPersonNumber():
             names = tuple(filter(self._crowd.__contains__, sorted(_native.person_getIDList())))
             if names != self._persons:
                 self._persons = names
+        self._counted_at = count, now_s
         if (listed := _native.vehicle_getIDList()) != self._listed:
             self._listed = listed
             self._vehicles = tuple(sorted(listed))

@@ -27,6 +27,14 @@ _MOST_CORNERS: Final = 524_288
 _MOST_RAYS: Final = 8_192
 """Number of rays of a call; Bullet fails above twice of it."""
 
+_API_VERSION: Final = 202010061
+"""Version of the C interface with the structures and statuses below."""
+_RAYS_CAST: Final = 65
+_BODY_REMOVED: Final = 75
+_SHAPE_CREATED: Final = 80
+_BODY_CREATED: Final = 84
+"""Types of status after success, of `EnumSharedMemoryServerStatus`."""
+
 _HIT: Final = np.dtype(
     [
         ("share", np.float64),
@@ -83,20 +91,22 @@ class TriangleRays:
             corners.size,
         )
         call.b3CreateCollisionSetFlag(command, number, p.GEOM_FORCE_CONCAVE_TRIMESH)
-        shape = call.b3GetStatusCollisionShapeUniqueId(self._sent(command))
+        shape = call.b3GetStatusCollisionShapeUniqueId(self._sent(command, _SHAPE_CREATED))
+        if shape < 0:
+            raise EngineError(f"Bullet made no shape of {len(mesh)} triangles")
         command = call.b3CreateMultiBodyCommandInit(client)
         still, level = _doubles(0.0, 0.0, 0.0), _doubles(*UPRIGHT)
         at = _doubles(*middle.tolist())
         call.b3CreateMultiBodyBase(command, 0.0, shape, -1, at, level, still, level)
         call.b3CreateMultiBodyUseMaximalCoordinates(command)
-        body: int = call.b3GetStatusBodyIndex(self._sent(command))
-        if shape < 0 or body < 0:
+        body: int = call.b3GetStatusBodyIndex(self._sent(command, _BODY_CREATED))
+        if body < 0:
             raise EngineError(f"Bullet made no body of {len(mesh)} triangles")
         return body
 
     def remove(self, body: int) -> None:
         """Remove a body."""
-        self._sent(self._call.b3InitRemoveBodyCommand(self._client, body))
+        self._sent(self._call.b3InitRemoveBodyCommand(self._client, body), _BODY_REMOVED)
 
     def hit_shares(self, begin_m: Floats, end_m: Floats) -> Floats:
         """Return the share of each line at which it first hits a triangle, (N,); inf without a hit.
@@ -116,7 +126,7 @@ class TriangleRays:
         call.b3RaycastBatchAddRays(
             client, command, begin_m.ctypes.data, end_m.ctypes.data, len(begin_m)
         )
-        self._sent(command)
+        self._sent(command, _RAYS_CAST)
         call.b3GetRaycastInformation(client, ctypes.byref(self._answer))
         if self._answer.count != len(begin_m):
             raise EngineError(f"Bullet answered {self._answer.count} of {len(begin_m)} rays")
@@ -124,9 +134,12 @@ class TriangleRays:
         hits = np.frombuffer((ctypes.c_char * size).from_address(self._answer.hits), dtype=_HIT)
         return np.where(hits["body"] >= 0, hits["share"], np.inf)
 
-    def _sent(self, command: int) -> int:
-        """Run a command; return its status."""
+    def _sent(self, command: int, expected: int) -> int:
+        """Run a command; return its status. Raises EngineError for a type that is not expected."""
         status: int = self._call.b3SubmitClientCommandAndWaitStatus(self._client, command)
+        kind = self._call.b3GetStatusType(status) if status else -1
+        if kind != expected:
+            raise EngineError(f"Bullet failed: a command ended with status {kind}, not {expected}")
         return status
 
 
@@ -148,6 +161,7 @@ _FUNCTIONS: Final[Mapping[str, tuple[Any, ...]]] = MappingProxyType(
         "CreateMultiBodyCommandInit": (_POINTER, _POINTER),
         "CreateMultiBodyBase": (_INT, _POINTER, ctypes.c_double, _INT, _INT, *[_POINTER] * 4),
         "CreateMultiBodyUseMaximalCoordinates": (None, _POINTER),
+        "GetStatusType": (_INT, _POINTER),
         "GetStatusBodyIndex": (_INT, _POINTER),
         "InitRemoveBodyCommand": (_POINTER, _POINTER, _INT),
         "CreateRaycastBatchCommandInit": (_POINTER, _POINTER),
@@ -162,6 +176,12 @@ _FUNCTIONS: Final[Mapping[str, tuple[Any, ...]]] = MappingProxyType(
 @lru_cache(maxsize=1)
 def _interface() -> Any:
     """Return PyBullet's library with the types of the functions used here."""
+    if p.getAPIVersion() != _API_VERSION:
+        raise EngineError(
+            f"PyBullet has the interface {p.getAPIVersion()}, not {_API_VERSION}: install the "
+            "locked PyBullet"
+        )
+    # PyDLL holds Python's lock during calls, as Bullet's global variables allow one thread only.
     library = ctypes.PyDLL(p.__file__)
     for name, (result, *arguments) in _FUNCTIONS.items():
         try:

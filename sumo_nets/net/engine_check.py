@@ -68,9 +68,9 @@ def reference_hashes() -> dict[str, str]:
         ]
         engine.start([*arguments, "--seed", "7", "--no-step-log"])
         try:
+            reader = engine.NearReader(_WALKERS)
             for _ in range(2 * _SECONDS):
                 sumo.simulationStep()
-                reader = engine.NearReader(_WALKERS)  # these persons enter on their own
                 persons, vehicles = reader.near(0.0, 0.0, 1e3, 1e3)
                 for one in (vehicles, persons):
                     seen.update(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -56,13 +60,16 @@ def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -
     assert not np.array_equal(single[0][0].rgb, single[1][0].rgb)
 
 
+@pytest.mark.parametrize("staged", [False, True])
 @pytest.mark.parametrize("layers", [False, True])
 def test_layers_hold_the_pictures_of_single_cameras(
-    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool
+    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool, staged: bool
 ) -> None:
     """Pictures drawn as layers of one texture, among pictures that are not, are those of single
-    cameras; and they stay when later ones are drawn."""
+    cameras, also when staged as on a graphics card; and they stay when later ones are drawn."""
+    from physics.cameras.gl import atlas as module
     from physics.cameras.gl.atlas import Atlas
+    from physics.cameras.gl.readback import Readback
 
     monkeypatch.setattr(context, "LAYERS", False)
     busy = busy_street(camera_city(300.0), 8, 9)
@@ -70,6 +77,7 @@ def test_layers_hold_the_pictures_of_single_cameras(
     asked = [(busy.robot, street) for street in busy.streets]
     single = [_alone(worlds[k % 3], light, asked) for k, light in enumerate(lights)]
     monkeypatch.setattr(context, "LAYERS", layers)
+    monkeypatch.setattr(module, "Readback", partial(Readback, staged=staged))
     with Atlas(SPEC) as atlas:
         keys = [atlas.join(worlds[k % 3], light) for k, light in enumerate(lights)]
         order = [(0, 1, 2, 3), (3, 0), (1, 2), (0, 3, 1), (2, 1, 0), (1,), (3, 2, 0), (0, 0, 1)]
@@ -81,12 +89,18 @@ def test_layers_hold_the_pictures_of_single_cameras(
             assert _same(frame, single[k][tick]), (tick, k)
 
 
+@pytest.mark.parametrize("layers", [False, True])
 def test_environments_join_and_leave_an_atlas(
-    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch
+    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool
 ) -> None:
     """An environment in an atlas gets the pictures of its own camera, whichever environments join,
     leave or fail."""
     from physics.cameras.gl.atlas import Atlas
+    from physics.cameras.gl.crowd import CrowdDrawing
+    from physics.cameras.gl.street import StreetDrawing
+
+    def fails(*arguments: object) -> None:
+        raise ZeroDivisionError
 
     busy = busy_street(camera_city(300.0), 8, 4)
     near = worlds[0].robot
@@ -96,6 +110,7 @@ def test_environments_join_and_leave_an_atlas(
     asked = [(busy.robot, street) for street in busy.streets]
     seats = list(zip((worlds[0], other, worlds[2]), lights, strict=True))
     a, b, c = (_alone(world, light, asked) for world, light in seats)
+    monkeypatch.setattr(context, "LAYERS", layers)
     with Atlas(SPEC) as atlas:
         first, second = (atlas.join(*seat) for seat in seats[:2])
         found = atlas.render([(second, *asked[0]), (first, *asked[0])])
@@ -116,8 +131,64 @@ def test_environments_join_and_leave_an_atlas(
             atlas.begin([(third, *asked[3]), (second, *asked[3])])
         again = atlas.join(*seats[0])
         assert again not in (first, second, third)
+        for drawing, name in ((StreetDrawing, "draw"), (CrowdDrawing, "draw_contact")):
+            with monkeypatch.context() as broken, pytest.raises(ZeroDivisionError):
+                broken.setattr(drawing, name, fails)
+                atlas.begin([(third, *asked[3]), (again, *asked[3])])
         assert all(map(_same, atlas.render([(k, *asked[3]) for k in (again, third)]), (a[3], c[3])))
         assert atlas.render([]) == []
+
+
+def test_a_driver_without_what_layers_need_draws_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers that are forced fail with the names of the extensions and limits that are missing."""
+    limits = (("GL_MAX_UNIFORM_BLOCK_SIZE", 1 << 30), ("GL_MAX_VERTEX_SHADER_STORAGE_BLOCKS", 1))
+    monkeypatch.setattr(context, "LAYERS", True)
+    with context.context() as gl, monkeypatch.context() as lacking:
+        assert context.draws_layers(gl)
+        lacking.setattr(context, "_LAYER_EXTENSIONS", ("GL_ARB_none", "GL_ARB_clear_texture"))
+        lacking.setattr(context, "_LAYER_LIMITS", limits)
+        context.missing_for_layers.cache_clear()
+        with pytest.raises(EngineError, match=r"lacks GL_ARB_none, GL_MAX_UNIFORM_BLOCK_SIZE of"):
+            context.draws_layers(gl)
+    context.missing_for_layers.cache_clear()
+
+
+def test_a_picture_whose_drawing_or_wait_failed_is_not_returned(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After an error in a drawing, or in waiting for the driver, `end` returns later pictures."""
+    from physics.cameras.gl import readback
+    from physics.cameras.gl.crowd import CrowdDrawing
+    from physics.cameras.gl.people_only import PeopleAlone
+
+    busy = busy_street(camera_city(300.0), 8, 3)
+    pose, streets = busy.robot.pose, busy.streets
+    original = readback.function
+
+    def waits(result: int) -> Callable[..., Callable[..., Any]]:
+        def replaced(name: str, *kinds: str) -> Callable[..., Any]:
+            wait = name == "glClientWaitSync"
+            return (lambda *arguments: result) if wait else original(name, *kinds)
+
+        return replaced
+
+    with PeopleAlone((96, 54), 60.0) as eyes:
+        first, second = eyes.render(pose, streets[0]), eyes.render(pose, streets[2])
+        assert not _same(first, second)
+        for _ in range(3):
+            with monkeypatch.context() as broken, pytest.raises(ZeroDivisionError):
+                broken.setattr(CrowdDrawing, "draw", lambda *arguments: 1 / 0)
+                eyes.begin(pose, streets[0])
+        eyes.begin(pose, streets[2])
+        assert _same(eyes.end(), second)
+        for result in (0x911B, 0x911D):  # timeout expired, wait failed
+            eyes.begin(pose, streets[0])
+            with monkeypatch.context() as broken, pytest.raises(EngineError, match="did not fini"):
+                broken.setattr(readback, "function", waits(result))
+                eyes.end()
+        eyes.begin(pose, streets[2])
+        assert _same(eyes.end(), second)
+        eyes.begin(pose, streets[0])  # is pending when the drawing ends
 
 
 def _alone(world: BulletWorld, light: Light, asked: list[tuple[RobotState, Street]]) -> list[Frame]:

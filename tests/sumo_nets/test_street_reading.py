@@ -18,7 +18,7 @@ from sumo_nets.city.store import city_net
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.lights import WaitingSpots
 from sumo_nets.crowd.proxy import KEEP_ROUTE, KEEP_ROUTE_ON_ROAD, LEAD_MIN_M, MATCH_M, Walks
-from sumo_nets.engine import NearReader, sumo
+from sumo_nets.engine import NearReader, libsumo, sumo, sumo_errors
 from sumo_nets.net.snapshot import street_map_of
 
 CITY = City(seed=2, size_m=600.0)
@@ -172,3 +172,28 @@ def test_who_waits_before_a_crossing_stands_on_its_nearest_corner(street_map: St
     stays = (spots == at).all(axis=1)
     assert stays.any() and not stays.all()
     assert np.array_equal(kerbs.behind(asked, spots)[stays], spots[stays])
+
+
+@pytest.mark.engine
+def test_a_person_removed_while_another_is_loaded_is_not_read(crowd: SumoCrowd) -> None:
+    """The persons read are those on the street, also where others enter later on their own."""
+    x_m, y_m = crowd.street.people.xy.mean(axis=0).tolist()
+    reader = NearReader({"first", "second"})
+    edge = sumo.person.getRoadID(crowd.street.people.ids[0])
+
+    def read() -> tuple[str, ...]:
+        sumo.simulationStep()
+        return reader.near(x_m, y_m, 1e5, 1.0)[0].names
+
+    try:
+        for name in ("first", "second"):
+            depart_s = sumo.simulation.getTime() if name == "first" else 1e6
+            libsumo.person.add(name, edge, 1.0, depart=depart_s)
+            sumo.person.appendWalkingStage(name, [edge], 2.0, speed=0.001)
+            if name == "first":
+                assert read() == ("first",)
+                sumo.person.remove("first")
+        assert read() == ()
+    finally:
+        with sumo_errors("removing a person"):
+            sumo.person.remove("second")

@@ -10,6 +10,7 @@ from typing import Final
 
 import moderngl
 
+from physics.cameras.gl.full_screen import VERTEX as FULL_SCREEN
 from physics.cameras.gl.shading import SKY_UNIT, programs
 from physics.cameras.gl.targets import Frame, Target
 from physics.cameras.gl.variants import Variant
@@ -17,7 +18,6 @@ from physics.cameras.gl.weather_shaders import (
     AIR_COLOUR_UNIT,
     AIR_DEPTH_UNIT,
     AIR_FRAGMENT,
-    AIR_VERTEX,
 )
 
 _SIZES_MAX: Final = 4
@@ -78,7 +78,7 @@ class AirDrawing:
     def _array(self, variant: Variant) -> moderngl.VertexArray:
         plain = variant & ~Variant.SHADOWS
         if plain not in self._arrays:
-            program = programs(self._context, AIR_VERTEX, AIR_FRAGMENT, plain).colour
+            program = programs(self._context, FULL_SCREEN, AIR_FRAGMENT, plain).colour
             self._arrays[plain] = self._context.vertex_array(program, [])
         return self._arrays[plain]
 

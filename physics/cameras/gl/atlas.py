@@ -3,9 +3,8 @@
 Environments join and leave at any time, each with a world, a light and a robot; a batch holds any
 subset.
 Each picture has the same bits as that of a separate `GlCamera`.
-It is copied behind the previous one into a buffer on the graphics card.
-Waiting for that buffer dominates the cost, so call `begin` for the next pictures before `end` for
-the last ones.
+All pictures of a batch are read back together, while the next are drawn: call `begin` for the next
+batch before `end` for the last one.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from physics.cameras.lens import drawn
 from physics.dynamics.world import BulletWorld
 
 _PIXELS_MAX: Final = 1 << 25
-"""Maximum number of pixels of pending pictures, 128 MiB."""
+"""Maximum number of pixels of a batch: 128 MiB of memory, for each of two pending batches."""
 SeatKey = NewType("SeatKey", int)
 """Key of an environment in an atlas, from `join` to `leave`; keys are never reused."""
 _Seen = Sequence[tuple[SeatKey, RobotState, Street]]
@@ -112,25 +111,18 @@ class Atlas:
             )
         batch = [(self._camera(key), robot, street) for key, robot, street in seen]
         pictures = [camera.mounted_picture(robot, street) for camera, robot, street in batch]
-        with gl:
-            self._readback.begin(len(batch))
-            try:
-                batch_drawing(gl).draw(pictures, self._target, self._readback)
-                self._readback.send()
-            except BaseException:
-                self._readback.forget()
-                raise
+        with gl, self._readback.begin(len(batch)):
+            batch_drawing(gl).draw(pictures, self._target, self._readback)
         self._begun.append(batch)
 
     def end(self) -> list[Frame]:
         """Return the pictures of the oldest pending `begin`, in the order of its robots."""
         with self._running_context:
+            batch = self._begun.popleft() if self._begun else []
             pictures = self._readback.end()
         return [
             camera.through_lens(Frame(*picture), robot, street)
-            for picture, (camera, robot, street) in zip(
-                pictures, self._begun.popleft(), strict=True
-            )
+            for picture, (camera, robot, street) in zip(pictures, batch, strict=True)
         ]
 
     def _camera(self, key: SeatKey) -> GlCamera:

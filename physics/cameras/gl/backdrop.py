@@ -12,18 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.state import LABELS
+from physics.cameras.gl.full_screen import SPOT
 from physics.cameras.gl.lighting import sky_texels, sky_texture
-from physics.cameras.gl.pool import Part
+from physics.cameras.gl.pool import PictureRange
 from physics.cameras.gl.shading import PICTURES_MAX, SKY_UNIT, programs
 from physics.cameras.gl.variants import Variant
 from physics.cameras.sky import HORIZON_FADE, Sky
 
-_VERTEX: Final = """
+_VERTEX: Final = f"""
 out vec2 spot;
-void main() {
-    spot = vec2(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0);
+void main() {{
+    spot = {SPOT};
     gl_Position = in_picture(vec4(spot, 1.0, 1.0));
-}
+}}
 """
 
 _FRAGMENT: Final = f"""
@@ -85,7 +86,7 @@ class Backdrop:
         self.sky.release()
 
 
-class SkySeat:
+class SkySlot:
     """A sky in `SkyLayers`. layer: of the array; around: rgb all around the horizon"""
 
     def __init__(self, skies: SkyLayers, sky: Sky) -> None:
@@ -107,9 +108,9 @@ class SkyLayers:
         self._context = context
         self._held: list[tuple[bytes, int, NDArray[np.float16]] | None] = []
         self._texture: moderngl.TextureArray | None = None
-        self._seats: moderngl.Buffer | None = None
+        self._scene_ids: moderngl.Buffer | None = None
         self._commands: moderngl.Buffer | None = None
-        self._set_for: tuple[bytes, Sequence[Part]] | None = None
+        self._set_for: tuple[bytes, Sequence[PictureRange]] | None = None
 
     def hold(self, sky: Sky) -> int:
         """Return the layer of a sky. `drop` it when it is not needed any more."""
@@ -134,25 +135,25 @@ class SkyLayers:
         key, users, texels = held
         self._held[layer] = (key, users - 1, texels) if users > 1 else None
 
-    def set(self, seats: NDArray[np.intp], parts: Sequence[Part]) -> None:
-        """Prepare the draws of a batch. seats: of the scenes of its pictures"""
-        wanted = seats.tobytes(), parts
+    def set(self, scene_ids: NDArray[np.intp], parts: Sequence[PictureRange]) -> None:
+        """Prepare the draws of a batch. scene_ids: of the scenes of its pictures"""
+        wanted = scene_ids.tobytes(), parts
         if wanted == self._set_for:
             return
         self._set_for = wanted
-        if self._seats is None or self._commands is None:
-            self._seats = self._context.buffer(reserve=4 * PICTURES_MAX)
+        if self._scene_ids is None or self._commands is None:
+            self._scene_ids = self._context.buffer(reserve=4 * PICTURES_MAX)
             self._commands = self._context.buffer(reserve=20 * PICTURES_MAX)
             program = programs(self._context, _VERTEX, _FRAGMENT, Variant.LAYERS).colour
-            content = [(self._seats, "1i4/i", "seat")]
+            content = [(self._scene_ids, "1i4/i", "scene_id")]
             self._array = self._context.vertex_array(program, content)
         commands = np.zeros((len(parts), 5), dtype=np.uint32)
         for row, part in zip(commands, parts, strict=True):
             row[:4] = 3, part.end - part.first, 0, part.first
-        self._seats.write(seats.astype(np.int32))
+        self._scene_ids.write(scene_ids.astype(np.int32))
         self._commands.write(commands)
 
-    def draw(self, part: Part) -> None:
+    def draw(self, part: PictureRange) -> None:
         """Draw the skies of a part after its streets."""
         assert self._commands is not None
         self._bind()

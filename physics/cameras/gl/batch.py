@@ -2,9 +2,9 @@
 
 All pictures of a batch are arranged, posed, culled and uploaded together. On a graphics card,
 pictures by clear day are layers of one array texture: one call draws a material of all of them.
-Pictures with splats, weather or night are drawn one by one, and all pictures on a software
-renderer. Both ways run through the same code: a part of a batch is one or more pictures. Bits do
-not depend on the batch.
+Pictures with splats, weather, night or depth are drawn one by one, and all pictures on a software
+renderer. The same code draws both: a part of a batch is one or more pictures. Pictures are drawn
+in the order of their programs; bits do not depend on it.
 """
 
 from __future__ import annotations
@@ -21,17 +21,25 @@ from cosim.core.clock import Clock
 from cosim.core.state import RobotState, Street
 from cosim.spec.robot import Robot
 from physics.cameras.gl.air import AirDrawing, LinearTarget
-from physics.cameras.gl.backdrop import Backdrop, SkySeat
+from physics.cameras.gl.backdrop import Backdrop, SkySlot
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.driver import flush
+from physics.cameras.gl.gl_state import blending, polygon_offset
 from physics.cameras.gl.instances import Forms
 from physics.cameras.gl.lamps import casting_people
 from physics.cameras.gl.layers import LayerTarget, LayerTargets
 from physics.cameras.gl.lighting import Lighting
-from physics.cameras.gl.pool import Part
+from physics.cameras.gl.pool import PictureRange
 from physics.cameras.gl.scene import GlScene
-from physics.cameras.gl.shading import PICTURES_MAX, Pass, SceneBlocks, SeatMaps
-from physics.cameras.gl.shadows import TO_TEXTURE, ShadowLayers, ShadowMaps, ShadowSeat, casting
+from physics.cameras.gl.shading import PICTURES_MAX, Pass, SceneBlocks, SceneMaps
+from physics.cameras.gl.shadows import (
+    NO_SUN,
+    TO_TEXTURE,
+    ShadowLayers,
+    ShadowMaps,
+    ShadowSlot,
+    casting,
+)
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.splat_layers import Layers, splat_pictures
 from physics.cameras.gl.splats import SplatCloud
@@ -50,13 +58,10 @@ _PEOPLE_MAX: Final = 8192
 """Maximum number of people in a batch; a picture with more is a separate batch."""
 
 
-_NO_SUN: Final = np.eye(4)
-
-
 class Stage(NamedTuple):
     """Resources of a camera: street scene, optional shadow maps, backdrop, light.
 
-    shadows, backdrop: seats where pictures are drawn as layers
+    shadows, backdrop: slots where pictures are drawn as layers
     cloud: splats of the place, None without
     season: of people's clothes
     rain: most people hold umbrellas
@@ -66,8 +71,8 @@ class Stage(NamedTuple):
     surface: Surface
     model: Robot
     scene: GlScene
-    shadows: ShadowMaps | ShadowSeat | None
-    backdrop: Backdrop | SkySeat
+    shadows: ShadowMaps | ShadowSlot | None
+    backdrop: Backdrop | SkySlot
     light: Lighting
     cloud: SplatCloud | None = None
     season: Season = "mild"
@@ -104,8 +109,8 @@ class Sink(Protocol):
     def take(self, place: int) -> None:
         """Take the picture with a number from the target."""
 
-    def take_layers(self, drawn: LayerTarget, first: int, count: int, place: int) -> None:
-        """Take `count` pictures from the layers from `first` on. place: number of the first one"""
+    def take_layers(self, drawn: LayerTarget, places: Sequence[int]) -> None:
+        """Take pictures from the first layers. places: number of each"""
 
 
 class BatchDrawing:
@@ -121,7 +126,7 @@ class BatchDrawing:
         self.street = StreetDrawing(context, forms)
         self._crowd = CrowdDrawing(context)
         self._traffic = TrafficDrawing(context, forms, self.street.things)
-        self._blocks, self._seats = SceneBlocks(context), SeatMaps(context)
+        self._blocks, self._scene_maps = SceneBlocks(context), SceneMaps(context)
         self._layers = LayerTargets(context)
         self._pictures = splat_pictures(context)
         self._weather, self._air = WeatherBlocks(context), AirDrawing(context)
@@ -132,36 +137,38 @@ class BatchDrawing:
         The caller must hold the context.
         """
         first = 0
-        for few in _batches(pictures):
+        for some in _batches(pictures):
+            order = _order(some)
+            few = [some[i] for i in order]
+            places = [first + i for i in order]
             parts = _parts(few)
             shots = self._arrange(few, parts)
             self._surfaces.bind()
             self._cast(few, parts, shots)
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self._context.front_face = "cw"  # draw upside down, to read the top row first
-            for some in self._together(few, parts, target.size):
-                if Variant.LAYERS in few[some[0].first].stage.variant:
-                    self._draw_layered(few, some[0], target.size, sink, first)
-                else:
-                    for i in self._draw_some(few, some, target):
-                        sink.take(first + i)
+            layered = [part for part in parts if _shared(few[part.first]) is not None]
+            if layered:
+                self._draw_layered(few, layered, target.size, sink, places)
+            for group in self._together(few, parts[len(layered) :], target.size):
+                for i in self._draw_some(few, group, target):
+                    sink.take(places[i])
             first += len(few)
 
-    def _arrange(self, pictures: Sequence[PictureOrder], parts: Sequence[Part]) -> Shots:
+    def _arrange(self, pictures: Sequence[PictureOrder], parts: Sequence[PictureRange]) -> Shots:
         shots = Shots([one.taken for one in pictures])
         for one, lattice in zip(pictures, shots.lattice, strict=True):
             one.stage.scene.arrange(one.taken.view, lattice, one.street)
         scenes = [one.stage.scene for one in pictures]
         self.street.set(scenes)
-        watched = []
-        driven = []
-        for stage, _, _, _, street, robot, body in pictures:
-            surface = stage.surface
+        watched, driven = [], []
+        for one in pictures:
+            stage, surface = one.stage, one.stage.surface
             shadows = stage.shadows is not None
             watched.append(
                 PeopleSeen(
-                    street.people,
-                    _CLOCK.time_s(street.tick),
+                    one.street.people,
+                    _CLOCK.time_s(one.street.tick),
                     surface.heights,
                     shadows,
                     surface.seed,
@@ -169,47 +176,52 @@ class BatchDrawing:
                     stage.rain,
                 )
             )
-            driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
+            driven.append(
+                Driven(one.street.vehicles, surface, stage.model, one.robot, one.body, shadows)
+            )
         part = np.repeat(np.arange(len(parts)), [one.end - one.first for one in parts])
-        seats = np.array([scene.seat for scene in scenes])
-        self._crowd.set(watched, shots, part, seats)
-        self._traffic.set(driven, shots, part, seats)
+        scene_ids = np.array([scene.id for scene in scenes])
+        self._crowd.set(watched, shots, part, scene_ids)
+        self._traffic.set(driven, shots, part, scene_ids)
         self._arrange_blocks(pictures, shots)
-        self._arrange_layers(pictures, parts, seats)
+        self._arrange_layers(pictures, parts, scene_ids)
         self._arrange_weather(pictures, shots)
         return shots
 
     def _arrange_blocks(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Upload the blocks of the pictures and of their shadow passes."""
         suns, to_maps = np.empty((2, len(pictures), 4, 4))
-        suns[:], to_maps[:] = _NO_SUN, TO_TEXTURE
+        suns[:], to_maps[:] = NO_SUN, TO_TEXTURE
         views = shots.views()
         for i, one in enumerate(pictures):
             if (shadows := one.stage.shadows) is not None:
                 matrices = shadows.matrices(shots.lattice[i], one.stage.light)
                 suns[i], to_maps[i] = matrices
-                if isinstance(shadows, ShadowSeat):
+                if isinstance(shadows, ShadowSlot):
                     views[i, 0, 3] = shadows.layer
         lights = np.array([one.rows for one in pictures])
         self._blocks.set(shots.cameras(), suns, to_maps, views, lights)
 
     def _arrange_layers(
-        self, pictures: Sequence[PictureOrder], parts: Sequence[Part], seats: NDArray[np.intp]
+        self,
+        pictures: Sequence[PictureOrder],
+        parts: Sequence[PictureRange],
+        scene_ids: NDArray[np.intp],
     ) -> None:
         """Upload the layers of the scenes whose pictures are drawn together."""
         stages = [one.stage for one in pictures]
         if not any(Variant.LAYERS in stage.variant for stage in stages):
             return
         maps = [
-            stage.shadows.layer if isinstance(stage.shadows, ShadowSeat) else 0 for stage in stages
+            stage.shadows.layer if isinstance(stage.shadows, ShadowSlot) else 0 for stage in stages
         ]
-        self._seats.set(self.street.seats, seats, np.array(maps))
+        self._scene_maps.set(self.street.scene_ids_end, scene_ids, np.array(maps))
         for skies in {
             id(stage.backdrop.skies): stage.backdrop.skies
             for stage in stages
-            if isinstance(stage.backdrop, SkySeat)
+            if isinstance(stage.backdrop, SkySlot)
         }.values():
-            skies.set(seats, parts)
+            skies.set(scene_ids, parts)
 
     def _arrange_weather(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Upload weather and lamps of the pictures that have these."""
@@ -223,13 +235,15 @@ class BatchDrawing:
                 self._weather.put(i, look, lamps, people, anchor, one.street.tick)
         self._weather.upload()
 
-    def _cast(self, pictures: Sequence[PictureOrder], parts: Sequence[Part], shots: Shots) -> None:
+    def _cast(
+        self, pictures: Sequence[PictureOrder], parts: Sequence[PictureRange], shots: Shots
+    ) -> None:
         """Update the shadow maps of all pictures."""
         begun = set[int]()
         with casting(self._context):
             for part in parts:
                 stage = pictures[part.first].stage
-                if isinstance(stage.shadows, ShadowSeat):
+                if isinstance(stage.shadows, ShadowSlot):
                     maps = stage.shadows.maps
                     self._cast_layered(pictures, part, shots, maps, id(maps) not in begun)
                     begun.add(id(maps))
@@ -242,7 +256,7 @@ class BatchDrawing:
     def _cast_layered(
         self,
         pictures: Sequence[PictureOrder],
-        part: Part,
+        part: PictureRange,
         shots: Shots,
         maps: ShadowLayers,
         begins: bool,
@@ -254,22 +268,21 @@ class BatchDrawing:
         number = {}
         for i in range(part.first, part.end):
             shadows = pictures[i].stage.shadows
-            assert isinstance(shadows, ShadowSeat)
+            assert isinstance(shadows, ShadowSlot)
             wanted[shadows.layer] = shots.lattice[i][1:], shadows.to_sun
             number[shadows.layer] = i
-        changed = maps.begin_still(wanted)
-        if changed:
-            self._seats.bind(still=True)
+        with maps.begin_still(wanted) as changed:
+            self._scene_maps.bind(still=True)
             for layer in changed:
-                one = Part(part.number, number[layer], number[layer] + 1)
+                one = PictureRange(part.number, number[layer], number[layer] + 1)
                 self._draw_pass(one, stage, "still")
-        self._seats.bind()
+        self._scene_maps.bind()
         maps.begin_moving(len(pictures), begins)
         self._draw_pass(part, stage, "moving")
 
     def _together(
-        self, pictures: Sequence[PictureOrder], parts: Sequence[Part], size: tuple[int, int]
-    ) -> Iterator[Sequence[Part]]:
+        self, pictures: Sequence[PictureOrder], parts: Sequence[PictureRange], size: tuple[int, int]
+    ) -> Iterator[Sequence[PictureRange]]:
         """Split parts into those that are drawn together: pictures in a row with splats of the same
         cloud.
         """
@@ -285,25 +298,27 @@ class BatchDrawing:
     def _draw_layered(
         self,
         pictures: Sequence[PictureOrder],
-        part: Part,
+        parts: Sequence[PictureRange],
         size: tuple[int, int],
         sink: Sink,
-        place: int,
+        places: Sequence[int],
     ) -> None:
-        """Draw the pictures of a part as layers. place: number of the first of the batch"""
-        flush()  # people and shadow maps are on their way
-        stage = pictures[part.first].stage
-        target = self._layers.of(size, len(pictures))
+        """Draw the pictures of the first parts as layers. places: number of each of the batch"""
+        flush()  # the graphics card starts people and shadow maps
+        end = parts[-1].end
+        target = self._layers.of(size, end)
         self._blocks.bind_all()
-        self._seats.bind()
-        if isinstance(stage.shadows, ShadowSeat):
-            stage.shadows.maps.bind()
+        self._scene_maps.bind()
         target.clear()
-        self._draw(part, stage, target)
-        sink.take_layers(target, part.first, part.end - part.first, place + part.first)
+        for part in parts:
+            stage = pictures[part.first].stage
+            if isinstance(stage.shadows, ShadowSlot):
+                stage.shadows.maps.bind()
+            self._draw(part, stage, target)
+        sink.take_layers(target, places[:end])
 
     def _draw_some(
-        self, pictures: Sequence[PictureOrder], parts: Sequence[Part], target: Target
+        self, pictures: Sequence[PictureOrder], parts: Sequence[PictureRange], target: Target
     ) -> Iterator[int]:
         """Draw pictures that belong together into the target; yield the number of each.
 
@@ -348,34 +363,28 @@ class BatchDrawing:
             self._weather.bind(i)
             picture.stage.scene.bind_lamps()
 
-    def _draw(self, part: Part, stage: Stage, target: Frame) -> None:
+    def _draw(self, part: PictureRange, stage: Stage, target: Frame) -> None:
         """Draw a part without splats. Its blocks and shadow maps must be bound."""
         gl = self._context
         style = stage.scene.style
         gl.depth_func = "<"
         self._draw_pass(part, stage, "colour")
         # Paint and the shade at feet change colours only; labels and depth stay those of the ground.
-        gl.polygon_offset = -1.0, -8.0
-        with target.only("colours"):
+        with polygon_offset(gl, -1.0, -8.0), target.only("colours"):
             self.street.draw_paint(part, style)
-            gl.enable(moderngl.BLEND)
-            gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
-            self.street.draw_decals(part, style)
-            gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
-            gl.disable(moderngl.BLEND)
+            with blending(gl):
+                gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
+                self.street.draw_decals(part, style)
             self._crowd.draw_contact(style.variant & Variant.LAYERS, part.number)
-        gl.polygon_offset = 0.0, 0.0
         gl.depth_func = "<="
         self._draw_sky(part, stage)
         # Glass shows what is behind it; its labels and depth are its own.
-        gl.enable(moderngl.BLEND)
-        with target.only("colours"):
+        with blending(gl), target.only("colours"):
             self.street.draw_panes(part, False, style)
-        gl.disable(moderngl.BLEND)
         with target.only("labels"):
             self.street.draw_panes(part, True, style)
 
-    def _draw_layers(self, part: Part, picture: PictureOrder, layers: Layers) -> None:
+    def _draw_layers(self, part: PictureRange, picture: PictureOrder, layers: Layers) -> None:
         """Draw objects before the sky, and the scan's mesh apart."""
         gl = self._context
         self._bind(part.first, picture)
@@ -392,13 +401,13 @@ class BatchDrawing:
         self.street.draw_mesh(part, picture.stage.scene.style)
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
-    def _draw_sky(self, part: Part, stage: Stage) -> None:
-        if isinstance(stage.backdrop, SkySeat):
+    def _draw_sky(self, part: PictureRange, stage: Stage) -> None:
+        if isinstance(stage.backdrop, SkySlot):
             stage.backdrop.skies.draw(part)
         else:
             stage.backdrop.draw()
 
-    def _draw_pass(self, part: Part, stage: Stage, which: Pass) -> None:
+    def _draw_pass(self, part: PictureRange, stage: Stage, which: Pass) -> None:
         variant = stage.variant
         self._crowd.draw(which, variant, part.number)
         self.street.draw(part, which, stage.scene.style)
@@ -433,21 +442,38 @@ def _batches(pictures: Sequence[PictureOrder]) -> Iterator[Sequence[PictureOrder
         yield pictures[begun:]
 
 
-def _parts(pictures: Sequence[PictureOrder]) -> list[Part]:
-    """Split a batch into parts: pictures in a row that are drawn as layers with the same programs
-    and textures, or single ones.
+def _shared(picture: PictureOrder) -> object:
+    """Return what pictures of one part have in common: the programs and textures of their layers.
+
+    None for a picture that is not drawn as a layer.
     """
-    parts: list[Part] = []
+    stage = picture.stage
+    if not isinstance(stage.backdrop, SkySlot):
+        return None
+    maps = stage.shadows.maps if isinstance(stage.shadows, ShadowSlot) else None
+    return stage.scene.style, id(maps), id(stage.backdrop.skies)
+
+
+def _order(pictures: Sequence[PictureOrder]) -> list[int]:
+    """Return the order in which pictures are drawn: layers by part, then others by splats."""
+    ranks: dict[object, int] = {}
+    keys = []
+    for one in pictures:
+        shared = _shared(one)
+        key = id(one.stage.cloud) if shared is None else shared
+        keys.append((shared is None, ranks.setdefault(key, len(ranks))))
+    return sorted(range(len(pictures)), key=keys.__getitem__)
+
+
+def _parts(pictures: Sequence[PictureOrder]) -> list[PictureRange]:
+    """Split a batch into parts: pictures in a row that share their programs, or single ones."""
+    parts: list[PictureRange] = []
     last: object = None
     for i, one in enumerate(pictures):
-        stage = one.stage
-        shared: object = None
-        if isinstance(stage.backdrop, SkySeat):
-            maps = stage.shadows.maps if isinstance(stage.shadows, ShadowSeat) else None
-            shared = stage.scene.style, id(maps), id(stage.backdrop.skies)
+        shared = _shared(one)
         if shared is not None and shared == last:
             parts[-1] = parts[-1]._replace(end=i + 1)
         else:
-            parts.append(Part(len(parts), i, i + 1))
+            parts.append(PictureRange(len(parts), i, i + 1))
         last = shared
     return parts

@@ -20,13 +20,13 @@ from cosim.spec.run_config import Appearance
 from cosim.spec.scenario import Light
 from cosim.spec.weather import CLEAR, WEATHERS, Weather
 from physics.cameras.camera_base import WorldCamera
-from physics.cameras.gl.backdrop import Backdrop, SkySeat, sky_layers
+from physics.cameras.gl.backdrop import Backdrop, SkySlot, sky_layers
 from physics.cameras.gl.batch import PictureOrder, Stage, batch_drawing
 from physics.cameras.gl.context import context, draws_layers
 from physics.cameras.gl.lighting import Lighting, lighting_of
 from physics.cameras.gl.readback import SinglePicture
 from physics.cameras.gl.scene import GlScene
-from physics.cameras.gl.shadows import ShadowMaps, ShadowSeat, shadow_layers
+from physics.cameras.gl.shadows import ShadowMaps, ShadowSlot, shadow_layers
 from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
 from physics.cameras.gl.weather import Look, exposed, look_of, weathered_sky
 from physics.cameras.view import Shot, View
@@ -85,9 +85,9 @@ class GlCamera(WorldCamera):
                 scene = GlScene(gl, drawing.street, world, light, splats is not None, look, layers)
                 cloud = None if splats is None else splat_pictures(gl).cloud(splats)
                 shadows = self._shadows(gl, layers) if light.shadows else None
-                sky: Backdrop | SkySeat
+                sky: Backdrop | SkySlot
                 if layers:
-                    sky = SkySeat(sky_layers(gl, self._sky.radiance.shape[:2]), self._sky)
+                    sky = SkySlot(sky_layers(gl, self._sky.radiance.shape[:2]), self._sky)
                 else:
                     sky = Backdrop(gl, self._sky, 0 if look is None else look.variant)
                 clothes = self._season, self._rain
@@ -98,9 +98,9 @@ class GlCamera(WorldCamera):
             self._context = gl
         return self
 
-    def _shadows(self, gl: moderngl.Context, layers: bool) -> ShadowMaps | ShadowSeat:
+    def _shadows(self, gl: moderngl.Context, layers: bool) -> ShadowMaps | ShadowSlot:
         high = self._pinhole.height
-        return ShadowSeat(shadow_layers(gl, high), self._light) if layers else ShadowMaps(gl, high)
+        return ShadowSlot(shadow_layers(gl, high), self._light) if layers else ShadowMaps(gl, high)
 
     def close(self) -> None:
         """Free the camera's resources; a second call does nothing."""
@@ -145,7 +145,7 @@ class GlCamera(WorldCamera):
             light = self._light.seen(math.radians(key[0]), math.radians(key[1]))
             rows = np.zeros((8, 4), dtype=np.float32)
             rows[:7] = light.rows()
-            if isinstance(sky := self._stage.backdrop, SkySeat):
+            if isinstance(sky := self._stage.backdrop, SkySlot):
                 rows[7] = *sky.around, sky.layer
             self._lights[key] = light, rows
         return self._lights[key]

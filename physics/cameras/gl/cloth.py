@@ -17,11 +17,10 @@ from typing import Final
 import moderngl
 
 from cosim.core.state import LABELS
+from physics.cameras.gl.shading import MAPS_UNIT
 from physics.people.body import COATS
 from physics.people.cloth_maps import COLUMNS, ROWS, SIDE_M, TALL_M, cloth_maps
 
-MAPS_UNIT: Final = 8
-"""Texture unit of the maps; `targets` uses it after people are drawn."""
 TEXELS_PER_M: Final = ROWS / TALL_M
 _SHINE: Final = {"skin": 0.25, "lips": 0.3, "hair": 0.9, "shoes": 0.5, "metal": 1.0, "fur": 0.3}
 _SHINES: Final = ", ".join(str(_SHINE.get(coat, 0.08)) for coat in COATS)

@@ -6,6 +6,7 @@ from typing import Final
 
 import moderngl
 
+from physics.cameras.gl.gl_state import blending
 from physics.cameras.gl.shading import programs
 from physics.people.skeleton import INDEX
 
@@ -62,12 +63,11 @@ class ContactShadows:
         """
         if layers not in self._arrays:
             drawn = programs(self._context, _VERTEX, _FRAGMENT, layers).colour
-            layout = ("1i4 8x 1f4 1i4/i", "person", "tall", "seat")
+            layout = ("1i4 8x 1f4 1i4/i", "person", "tall", "scene_id")
             content = [(instances, *(layout if layers else ("1i4 8x 1f4 4x/i", *layout[1:3])))]
             self._arrays[layers] = self._context.vertex_array(drawn, content)
-        self._context.enable(moderngl.BLEND)
-        self._arrays[layers].render_indirect(commands, moderngl.TRIANGLES, count, first)
-        self._context.disable(moderngl.BLEND)
+        with blending(self._context):
+            self._arrays[layers].render_indirect(commands, moderngl.TRIANGLES, count, first)
 
     def release(self) -> None:
         """Free the arrays; they are made again when needed."""

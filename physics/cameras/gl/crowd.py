@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People, PersonKind
-from physics.cameras.gl.cloth import MAPS_UNIT, map_texture
+from physics.cameras.gl.cloth import map_texture
 from physics.cameras.gl.contact import CORNERS, ContactShadows
+from physics.cameras.gl.full_screen import VERTEX as FULL_SCREEN
 from physics.cameras.gl.instances import runs_of
-from physics.cameras.gl.shading import Pass
+from physics.cameras.gl.shading import MAPS_UNIT, Pass
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.skins import mesh_skins, tube_skins
 from physics.cameras.view import PERSON_MARGIN_M
@@ -45,10 +46,10 @@ _CONTACT_M: Final = 25.0
 """Maximum distance from the eye of people whose feet darken the ground, metres."""
 
 _INSTANCE: Final = np.dtype(
-    [("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4"), ("seat", "i4")]
+    [("person", "i4"), ("dress", "i4"), ("girth", "f4"), ("tall", "f4"), ("scene_id", "i4")]
 )
 """person: row of the matrix texture; dress: row of the colour texture; tall: of the modelled man
-relative to the family; seat: of the scene."""
+relative to the family; scene_id: of the scene."""
 _SIT: Final = list(GESTURES).index("sit")
 _SEAT_AHEAD_M: Final = SEATED_BACK_M - 0.1
 """Shift of people in wheelchairs, so that their hips are nearly at their place, metres."""
@@ -62,13 +63,9 @@ _KEYS: Final = _FEET + 1
 """Number of forms of a part: outfits by level, plus one level for shadows, and feet."""
 _ENDS: Final = (0, MESH_LEVELS * len(ALL), _SHADOWS, _FEET, _KEYS)
 
-_POSE_VERTEX: Final = """#version 430
-void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
-"""
-
 _POSE_FRAGMENT: Final = """#version 430
 layout(binding = 0) uniform sampler2D baked;
-layout(binding = 1) uniform sampler2D told;
+layout(binding = 1) uniform sampler2D pose_inputs;
 out vec4 row;
 vec4 blended(int column, vec4 frames, vec4 weights) {
     vec4 sum = vec4(0.0);
@@ -78,8 +75,8 @@ vec4 blended(int column, vec4 frames, vec4 weights) {
 }
 void main() {
     int column = int(gl_FragCoord.x), person = int(gl_FragCoord.y), axis = column % 3;
-    vec4 frames = texelFetch(told, ivec2(0, person), 0), weights = texelFetch(told, ivec2(1, person), 0);
-    vec4 place = texelFetch(told, ivec2(2, person), 0), turn = texelFetch(told, ivec2(3, person), 0);
+    vec4 frames = texelFetch(pose_inputs, ivec2(0, person), 0), weights = texelFetch(pose_inputs, ivec2(1, person), 0);
+    vec4 place = texelFetch(pose_inputs, ivec2(2, person), 0), turn = texelFetch(pose_inputs, ivec2(3, person), 0);
     vec4 own = blended(column, frames, weights);
     if (axis < 2) {
         vec4 other = blended(column + (axis == 0 ? 1 : -1), frames, weights);
@@ -133,6 +130,24 @@ class _Worn(NamedTuple):
     sits: NDArray[np.bool_]
 
 
+class _Shown(NamedTuple):
+    """N people in view, or whose shadows may be.
+
+    rows: (N,) of all people
+    whose: (N,) pictures
+    xy: (N, 2) world metres
+    far_m: (N,) distances from the eyes
+    seen, casts: (N,) in view, casting shadows
+    """
+
+    rows: NDArray[np.intp]
+    whose: NDArray[np.intp]
+    xy: Floats
+    far_m: Floats
+    seen: NDArray[np.bool_]
+    casts: NDArray[np.bool_]
+
+
 class CrowdDrawing:
     """Drawing of the people of the pictures of a batch."""
 
@@ -144,8 +159,10 @@ class CrowdDrawing:
         )
         matrices = np.concatenate([self._clips.matrices, still], axis=1)
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
-        self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
-        self._everywhere = context.vertex_array(self._pose, [])
+        self._pose_program = context.program(
+            vertex_shader="#version 430" + FULL_SCREEN, fragment_shader=_POSE_FRAGMENT
+        )
+        self._everywhere = context.vertex_array(self._pose_program, [])
         self._maps = map_texture(context)
         self._contact = ContactShadows(context)
         self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level))
@@ -163,35 +180,47 @@ class CrowdDrawing:
         watched: Sequence[PeopleSeen],
         shots: Shots,
         parts: NDArray[np.intp] | None = None,
-        seats: NDArray[np.intp] | None = None,
+        scene_ids: NDArray[np.intp] | None = None,
     ) -> None:
         """Upload the people of all pictures, each on the ground.
 
         parts: part of the batch of each picture, in order; each its own by default
-        seats: of the scenes of the pictures
+        scene_ids: of the scenes of the pictures
 
         Binds a framebuffer, and texture units 0 and 1 until all pictures are drawn.
         """
-        counts = [len(one.people) for one in watched]
         parts = np.arange(len(watched)) if parts is None else parts
-        seats = np.zeros(len(watched), dtype=np.intp) if seats is None else seats
+        scene_ids = np.zeros(len(watched), dtype=np.intp) if scene_ids is None else scene_ids
         self._split = [[0] * len(_ENDS)] * (int(parts[-1]) + 1)
-        if not sum(counts):
+        if (shown := _shown(watched, shots)) is None:
             return
-        whose = np.repeat(np.arange(len(watched)), counts)
-        xy = _joined([one.people.xy for one in watched])
-        casting = np.array([CAST_M if one.shadows else 0.0 for one in watched])
-        far_m = shots.far_m(whose, xy)
-        seen = shots.sees(whose, xy, PERSON_MARGIN_M)
-        casts = far_m < casting[whose]
-        rows = (seen | casts).nonzero()[0]
-        if not len(rows):
-            return
-        whose, xy, far_m = whose[rows], xy[rows], far_m[rows]
-        seen, casts = seen[rows], casts[rows]
-        z_m = _heights(watched, whose, xy)
         worn = self._dress([one.dressed for one in watched])
-        outfit, bodies = worn.outfit[rows], worn.bodies[rows]
+        rows, whose = shown.rows, shown.whose
+        z_m = _heights(watched, whose, shown.xy)
+        far_m = self._pose(watched, shots, shown, worn, z_m)
+        outfit = worn.outfit[rows]
+        table = np.empty(len(rows), dtype=_INSTANCE)
+        table["person"], table["dress"] = np.arange(len(rows)), rows
+        table["girth"], table["tall"] = worn.girth[rows], _TALL[outfit]
+        table["scene_id"] = scene_ids[whose]
+        level = levels(shots, whose, far_m, z_m)
+        near = shown.seen & (far_m < _CONTACT_M)
+        self._set_draws(parts[whose], outfit, level, (shown.seen, shown.casts, near), table)
+        self._draw_poses(len(rows))
+
+    def _pose(
+        self,
+        watched: Sequence[PeopleSeen],
+        shots: Shots,
+        shown: _Shown,
+        worn: _Worn,
+        z_m: Floats,
+    ) -> Floats:
+        """Upload frames, places and headings of people; return (N,) distances from the eyes.
+
+        z_m: (N,) ground heights
+        """
+        rows, whose, xy, far_m = shown.rows, shown.whose, shown.xy, shown.far_m
         heading = _joined([one.people.heading for one in watched])[rows]
         strides = _joined([one.people.strides for one in watched])[rows]
         pace = _joined([one.people.pace for one in watched])[rows]
@@ -204,24 +233,22 @@ class CrowdDrawing:
             xy = xy + (sits * _SEAT_AHEAD_M)[:, None] * np.column_stack([cos, sin])
             far_m = shots.far_m(whose, xy)
         time_s = np.array([one.time_s for one in watched])[whose]
-        posed = poses_of(bodies, pace, strides, loops, time_s, self._clips)
-        told = np.zeros((len(rows), 4, 4), dtype=np.float32)
-        told[:, 0], told[:, 1] = posed.rows, posed.weights
-        told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = xy - shots.anchor[whose], z_m, posed.scale
-        told[:, 3, 0], told[:, 3, 1] = cos, sin
-        self._told.write(told, viewport=(0, 0, 4, len(rows)))
-        table = np.empty(len(rows), dtype=_INSTANCE)
-        table["person"], table["dress"] = np.arange(len(rows)), rows
-        table["girth"], table["tall"] = worn.girth[rows], _TALL[outfit]
-        table["seat"] = seats[whose]
-        level = levels(shots, whose, far_m, z_m)
-        near = seen & (far_m < _CONTACT_M)
-        self._set_draws(parts[whose], outfit, level, (seen, casts, near), table)
+        posed = poses_of(worn.bodies[rows], pace, strides, loops, time_s, self._clips)
+        inputs = np.zeros((len(rows), 4, 4), dtype=np.float32)
+        inputs[:, 0], inputs[:, 1] = posed.rows, posed.weights
+        inputs[:, 2, :2], inputs[:, 2, 2] = xy - shots.anchor[whose], z_m
+        inputs[:, 2, 3] = posed.scale
+        inputs[:, 3, 0], inputs[:, 3, 1] = cos, sin
+        self._pose_inputs.write(inputs, viewport=(0, 0, 4, len(rows)))
+        return far_m
+
+    def _draw_poses(self, people: int) -> None:
+        """Draw the joint matrices of people, and bind them and the colours."""
         self._posed.use()
-        self._posed.viewport = (0, 0, _ROW, len(rows))
+        self._posed.viewport = (0, 0, _ROW, people)
         self._context.enable_only(moderngl.NOTHING)
         self._baked.use(0)
-        self._told.use(1)
+        self._pose_inputs.use(1)
         self._everywhere.render(moderngl.TRIANGLES, vertices=3)
         self._matrices.use(0)
         self._dyed.use(1)
@@ -265,7 +292,7 @@ class CrowdDrawing:
 
     def release(self) -> None:
         self._release_room()
-        for thing in (self._baked, self._maps, self._everywhere, self._pose):
+        for thing in (self._baked, self._maps, self._everywhere, self._pose_program):
             thing.release()
 
     def _set_draws(
@@ -324,7 +351,7 @@ class CrowdDrawing:
         """Enlarge the buffers for more people."""
         self._release_room()
         self._room = room
-        self._told = _texture(self._context, (4, room), 4, "f4")
+        self._pose_inputs = _texture(self._context, (4, room), 4, "f4")
         self._dyed = _texture(self._context, (len(COATS), room), 4, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
         self._posed = self._context.framebuffer([self._matrices])
@@ -332,7 +359,7 @@ class CrowdDrawing:
         self._commands = self._context.buffer(reserve=3 * room * 20)
         self._held = [
             self._posed,
-            self._told,
+            self._pose_inputs,
             self._dyed,
             self._matrices,
             self._instances,
@@ -351,6 +378,23 @@ class CrowdDrawing:
 def _joined(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Concatenate arrays of pictures."""
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _shown(watched: Sequence[PeopleSeen], shots: Shots) -> _Shown | None:
+    """Return the people to be drawn in pictures or their shadow maps; None without any."""
+    counts = [len(one.people) for one in watched]
+    if not sum(counts):
+        return None
+    whose = np.repeat(np.arange(len(watched)), counts)
+    xy = _joined([one.people.xy for one in watched])
+    casting = np.array([CAST_M if one.shadows else 0.0 for one in watched])
+    far_m = shots.far_m(whose, xy)
+    seen = shots.sees(whose, xy, PERSON_MARGIN_M)
+    casts = far_m < casting[whose]
+    rows = (seen | casts).nonzero()[0]
+    if not len(rows):
+        return None
+    return _Shown(rows, whose[rows], xy[rows], far_m[rows], seen[rows], casts[rows])
 
 
 def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats) -> Floats:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Final
 
+from cosim.core.errors import EngineError
+
 _KINDS: Final = {
     "u": ctypes.c_uint,
     "i": ctypes.c_int,
@@ -22,13 +24,20 @@ def function(name: str, kinds: str, result: str = "") -> Callable[..., Any]:
 
     kinds, result: one letter for each argument and for the result: u and i for 32 bits, l for a
         size, q for 64 bits, p for a pointer
+    Raises EngineError where the driver lacks the function.
     """
     egl = ctypes.CDLL("libEGL.so.1")
     egl.eglGetProcAddress.restype = ctypes.c_void_p
     egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
+    address = egl.eglGetProcAddress(name.encode())
+    if not address:
+        raise EngineError(
+            f"the graphics driver has no function {name}: install a driver with OpenGL 4.4, or use "
+            "--camera bullet"
+        )
     returns = _KINDS[result] if result else None
     called = ctypes.CFUNCTYPE(returns, *(_KINDS[kind] for kind in kinds))
-    return called(egl.eglGetProcAddress(name.encode()))
+    return called(address)
 
 
 def flush() -> None:

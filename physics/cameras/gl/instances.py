@@ -33,8 +33,8 @@ INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 
 channel.
 """
 
-POOLED: Final = np.dtype([*INSTANCE.descr, ("seat", "i4")])
-"""Row of INSTANCE in a pool, with the seat of its scene."""
+POOLED: Final = np.dtype([*INSTANCE.descr, ("scene_id", "i4")])
+"""Row of INSTANCE in a pool, with the id of its scene."""
 
 _OWN = 255
 _PAINT = 0
@@ -288,7 +288,7 @@ class Things:
         self,
         form: NDArray[np.intp],
         rows: CornerRows,
-        seat: int | NDArray[np.intp],
+        scene_id: int | NDArray[np.intp],
         part: NDArray[np.intp] | None = None,
         parts: int = 1,
     ) -> None:
@@ -296,7 +296,7 @@ class Things:
 
         form: (N,) numbers of forms
         rows: (N,) rows of INSTANCE
-        seat: of their scene, or (N,)
+        scene_id: of their scene, or (N,)
         part: (N,) index of the part, below `parts`
         """
         self.clear(parts)
@@ -322,8 +322,8 @@ class Things:
             self.draws[material] = [own[i:j] for i, j in pairwise(ends)]
         pooled = np.empty((len(form), POOLED.itemsize), dtype=np.uint8)
         pooled[:, : INSTANCE.itemsize] = rows[order].view(np.uint8).reshape(len(form), -1)
-        seats = pooled.view(POOLED)["seat"][:, 0]
-        seats[:] = seat if isinstance(seat, int) else seat[order]
+        ids = pooled.view(POOLED)["scene_id"][:, 0]
+        ids[:] = scene_id if isinstance(scene_id, int) else scene_id[order]
         self._rows.write(self._start, pooled)
 
     def clear(self, parts: int = 1) -> None:
@@ -356,7 +356,7 @@ class ThingArrays:
             self._bound = self._forms.version, self._rows.version
         if (material, variant) not in self._arrays:
             at_corners, triangles = self._forms.buffers()
-            names = ("thing_at", "thing_turn", "thing_paint", "seat")
+            names = ("thing_at", "thing_turn", "thing_paint", "scene_id")
             content = [(at_corners, *LAYOUT), (self._rows.buffer, "3f 4f 4f1 1i4/i", *names)]
             self._arrays[material, variant] = [
                 self._context.vertex_array(program, content, triangles, skip_errors=True)

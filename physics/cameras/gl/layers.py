@@ -14,6 +14,7 @@ import moderngl
 
 from cosim.core.errors import EngineError
 from physics.cameras.gl.driver import function
+from physics.cameras.gl.shading import PICTURES_MAX
 from physics.cameras.gl.targets import Frame
 
 _SIZES_MAX: Final = 4
@@ -57,18 +58,26 @@ class DepthLayers:
         """Ensure `layers` layers, and return whether this discarded all of them."""
         if layers <= self.layers:
             return False
-        layers = max(layers, self.layers * 3 // 2)
+        layers = max(layers, min(self.layers * 3 // 2, PICTURES_MAX))
         self.release()
+        self._name = self._texture(layers)
+        try:
+            if self._shadow:
+                self._frame = self._framebuffer()
+        except BaseException:
+            self.release()
+            raise
         self.layers = layers
-        self._name = self._texture()
-        width, height = self._size
-        if self._shadow:
-            # A stand-in with the same size, as moderngl does not create empty framebuffers.
-            depth = self._context.depth_texture((width, height))
-            self._frame = self._context.framebuffer(depth_attachment=depth)
-            self.attach(self._frame)
-            depth.release()
         return True
+
+    def _framebuffer(self) -> moderngl.Framebuffer:
+        """Create the framebuffer of shadow maps."""
+        # It needs another depth at first, as moderngl does not create empty framebuffers.
+        depth = self._context.depth_texture(self._size)
+        frame = self._context.framebuffer(depth_attachment=depth)
+        self.attach(frame)
+        depth.release()
+        return frame
 
     def attach(self, frame: moderngl.Framebuffer) -> None:
         """Make them the depths of a framebuffer."""
@@ -106,15 +115,16 @@ class DepthLayers:
             self._name = 0
         self.layers = 0
 
-    def _texture(self) -> int:
+    def _texture(self, layers: int) -> int:
+        """Create the texture; return its name."""
         name = ctypes.c_uint(0)
         error = function("glGetError", "", "u")
-        error()  # of an earlier call
+        error()  # clears the error of an earlier call
         function("glGenTextures", "ip")(1, ctypes.addressof(name))
         function("glActiveTexture", "u")(_TEXTURE0 + self._context.default_texture_unit)
         function("glBindTexture", "uu")(_TEXTURE_2D_ARRAY, name.value)
         function("glTexStorage3D", "uiuiii")(
-            _TEXTURE_2D_ARRAY, 1, _DEPTH_COMPONENT24, *self._size, self.layers
+            _TEXTURE_2D_ARRAY, 1, _DEPTH_COMPONENT24, *self._size, layers
         )
         set_to = function("glTexParameteri", "uui")
         filter_ = _LINEAR if self._shadow else _NEAREST
@@ -125,8 +135,9 @@ class DepthLayers:
         for key, value in values.items():
             set_to(_TEXTURE_2D_ARRAY, key, value)
         if error():
+            function("glDeleteTextures", "ip")(1, ctypes.addressof(name))
             raise EngineError(
-                f"the graphics driver has no memory for {self.layers} layers of "
+                f"the graphics driver has no memory for {layers} layers of "
                 f"{self._size[0]} x {self._size[1]} pixels: draw fewer or smaller pictures at a time"
             )
         return name.value
@@ -140,25 +151,34 @@ class LayerTarget(Frame):
         self.size = size
         self._depth = DepthLayers(context, size)
         self.colour: moderngl.TextureArray | None = None
+        self._made: list[moderngl.TextureArray | moderngl.Framebuffer] = []
 
     def room(self, layers: int) -> None:
         """Ensure `layers` layers. Growing discards earlier pictures."""
-        if self._depth.room(layers):
-            if self.colour is not None:
-                self.frame.release()
-                self.colour.release()
+        if not self._depth.room(layers):
+            return
+        self._release_colour()
+        try:
             self.colour = self._context.texture_array((*self.size, self._depth.layers), 4)
+            self._made.append(self.colour)
             self.colour.filter = moderngl.NEAREST, moderngl.NEAREST
             self.frame = self._context.framebuffer([self.colour])
+            self._made.append(self.frame)
             self._depth.attach(self.frame)
-            self.frame.depth_mask = True  # moderngl knows of no depths
+            # moderngl masks the depths of a framebuffer that it created without any.
+            self.frame.depth_mask = True
+        except BaseException:
+            self.release()
+            raise
 
     def release(self) -> None:
         self._depth.release()
-        if self.colour is not None:
-            self.frame.release()
-            self.colour.release()
-            self.colour = None
+        self._release_colour()
+
+    def _release_colour(self) -> None:
+        self.colour = None
+        while self._made:
+            self._made.pop().release()
 
 
 class LayerTargets:

@@ -17,7 +17,8 @@ from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.layers import LayerTarget
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.readback import Readback
-from physics.cameras.gl.shading import SceneBlocks, SeatMaps
+from physics.cameras.gl.shading import SceneBlocks, SceneMaps
+from physics.cameras.gl.shadows import NO_SUN
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.gl.variants import Variant
@@ -25,7 +26,6 @@ from physics.cameras.sky import sky_of
 from physics.cameras.view import shot
 
 _FIRST: Final = np.zeros(1, dtype=np.intp)
-_NO_SUN: Final = np.eye(4)[None]
 EYE_M = 0.75
 """Height of the eye over flat ground, metres."""
 
@@ -51,7 +51,7 @@ class PeopleAlone:
             )
             self._readback = Readback(gl, self._target)
             self._layers = LayerTarget(gl, self._size)
-            self._seats = SeatMaps(gl)
+            self._scene_maps = SceneMaps(gl)
             self._variant = Variant.LAYERS if draws_layers(gl) else Variant.NONE
         self._context = gl
         return self
@@ -65,7 +65,7 @@ class PeopleAlone:
         with self._context:
             for thing in (
                 *(self._crowd, self._blocks, self._target, self._readback),
-                *(self._layers, self._seats),
+                *(self._layers, self._scene_maps),
             ):
                 thing.release()
 
@@ -85,29 +85,28 @@ class PeopleAlone:
                 [PeopleSeen(street.people, Clock().time_s(street.tick), _flat, shadows=False)],
                 shots,
             )
-            self._blocks.set(shots.cameras(), _NO_SUN, _NO_SUN, shots.views(), self._rows)
+            self._blocks.set(shots.cameras(), NO_SUN[None], NO_SUN[None], shots.views(), self._rows)
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             gl.front_face = "cw"
             gl.depth_func = "<"
-            self._readback.begin()
-            if self._variant:
-                self._draw_layer()
-            else:
-                self._blocks.bind()
-                self._target.clear()
-                self._crowd.draw("colour", Variant.NONE)
-                self._readback.take()
-            self._readback.send()
+            with self._readback.begin():
+                if self._variant:
+                    self._draw_layer()
+                else:
+                    self._blocks.bind()
+                    self._target.clear()
+                    self._crowd.draw("colour", Variant.NONE)
+                    self._readback.take()
 
     def _draw_layer(self) -> None:
         """Draw the picture as a layer, as on a graphics card."""
         self._layers.room(1)
         self._blocks.bind_all()
-        self._seats.set(1, _FIRST, _FIRST)
-        self._seats.bind()
+        self._scene_maps.set(1, _FIRST, _FIRST)
+        self._scene_maps.bind()
         self._layers.clear()
         self._crowd.draw("colour", self._variant)
-        self._readback.take_layers(self._layers, 0, 1, 0)
+        self._readback.take_layers(self._layers, (0,))
 
     def end(self) -> Frame:
         """Return the oldest pending picture."""

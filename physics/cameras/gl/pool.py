@@ -129,10 +129,10 @@ class MeshPool:
         self._indices.give(first, count)
 
 
-class Part(NamedTuple):
+class PictureRange(NamedTuple):
     """Pictures of a batch that are drawn together: from `first`, below `end`.
 
-    number: of the part in its batch
+    number: of this range in its batch
     """
 
     number: int

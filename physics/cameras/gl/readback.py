@@ -8,8 +8,9 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final
 
 import moderngl
@@ -20,12 +21,9 @@ from cosim.core.errors import EngineError
 from physics.cameras.gl.context import is_card
 from physics.cameras.gl.driver import flush, function
 from physics.cameras.gl.layers import LayerTarget
+from physics.cameras.gl.picture_bytes import write_layers
 from physics.cameras.gl.targets import Target
 
-_UNIT: Final = 8
-"""Texture unit of the layers to be read."""
-_BYTES_BINDING: Final = 2
-_GROUP: Final = 64
 _LENT_MAX: Final = 3
 """Maximum number of batches whose memory the caller holds; later ones are copied."""
 _PIXEL_PACK_BUFFER: Final = 0x88EB
@@ -35,13 +33,15 @@ _MAP_COHERENT: Final = 0x0080
 _CLIENT_STORAGE: Final = 0x0200
 _GPU_COMMANDS_COMPLETE: Final = 0x9117
 _FLUSH_COMMANDS: Final = 1
-_FOREVER_NS: Final = (1 << 64) - 1
+_WAIT_NS: Final = 600_000_000_000
+_SIGNALED: Final = (0x911A, 0x911C)
+"""Results of a successful wait: already signaled, condition satisfied."""
 
 Pictures = list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 """Colours (H, W, 3) and labels (H, W) of each picture, the top row first."""
 
 
-class _Landing:
+class HostBuffer:
     """Memory of the processor that the graphics card writes to. size: bytes"""
 
     def __init__(self, context: moderngl.Context, size: int) -> None:
@@ -55,6 +55,7 @@ class _Landing:
         at = function("glMapBufferRange", "ullu", "p")(_PIXEL_PACK_BUFFER, 0, size, flags)
         bind(_PIXEL_PACK_BUFFER, 0)
         if not at:
+            function("glDeleteBuffers", "ip")(1, ctypes.addressof(name))
             raise EngineError(
                 f"the graphics driver has no memory for {size} bytes of pictures: draw fewer or "
                 "smaller pictures at a time"
@@ -84,123 +85,145 @@ class Readback:
     """Asynchronous readback of pictures.
 
     Pictures are queued one after another into memory, and returned later, while the next are drawn.
-    Returned arrays are views of this memory; pictures that are kept for long are copies.
+    Returned arrays are views of this memory. Where the caller holds those of many batches, later
+    pictures are copies.
 
     target: source of the pictures that are not layers
+    staged: pictures are first written to memory of the graphics card, and transferred from there
+        together; default on a card
     """
 
-    UNDER_WAY: Final = 2
+    PENDING_MAX: Final = 2
     """Maximum number of pending batches."""
 
-    def __init__(self, context: moderngl.Context, target: Target) -> None:
+    def __init__(
+        self, context: moderngl.Context, target: Target, staged: bool | None = None
+    ) -> None:
         self._context = context
         self._target = target
         self._each = target.size[0] * target.size[1] * 4
-        self._on_card = is_card(context)
-        self._written: moderngl.Buffer | None = None
-        self._landings: list[_Landing] = []
-        self._begun: deque[_Begun] = deque()
+        self._staged = is_card(context) if staged is None else staged
+        self._stage: moderngl.Buffer | None = None
+        self._host_buffers: list[HostBuffer] = []
+        self._pending: deque[PendingBatch] = deque()
 
-    def begin(self, pictures: int = 1) -> None:
-        """Reserve memory for `pictures` pictures, which are taken next."""
-        if len(self._begun) == self.UNDER_WAY:
+    @contextmanager
+    def begin(self, pictures: int = 1) -> Iterator[None]:
+        """Reserve memory for `pictures` pictures, which are taken within a `with` block.
+
+        Their transfer is queued at its end. An error within it discards the batch.
+        Raises EngineError for too many pending batches, and where the driver fails.
+        """
+        if len(self._pending) == self.PENDING_MAX:
             raise EngineError("too many pictures are under way: `end` some first")
-        landing = self._landing(max(pictures, 1) * self._each)
-        self._begun.append(_Begun(landing, pictures))
+        batch = PendingBatch(self._unused(max(pictures, 1) * self._each), pictures)
+        self._pending.append(batch)
+        try:
+            yield
+            self._send(batch)
+        except BaseException:
+            self._pending.pop()
+            raise
 
     def take(self, place: int = 0) -> None:
         """Queue a copy of the target to a place of the most recent batch."""
         self._target.copy(self._buffer, place * self._each)
 
-    def take_layers(self, drawn: LayerTarget, first: int, count: int, place: int) -> None:
-        """Queue a copy of `count` layers from `first` on to places of the most recent batch."""
+    def take_layers(self, drawn: LayerTarget, places: Sequence[int]) -> None:
+        """Queue a copy of the first layers to places of the most recent batch."""
         assert drawn.colour is not None
-        program = _parting(self._context)
-        drawn.colour.use(_UNIT)
-        self._buffer.bind_to_storage_buffer(_BYTES_BINDING)
-        words = self._each // 4
-        program["places"] = first, place * words, words
-        self._context.memory_barrier()  # llvmpipe else does not see a clear without draws
-        program.run((words + _GROUP - 1) // _GROUP, count)
-        self._context.memory_barrier()
-
-    def send(self) -> None:
-        """Queue the transfer of the most recent batch, after its last picture."""
-        begun = self._begun[-1]
-        if self._written is not None and begun.pictures:
-            size = begun.pictures * self._each
-            self._context.copy_buffer(begun.landing.buffer, self._written, size=size)
-        begun.fence = function("glFenceSync", "uu", "p")(_GPU_COMMANDS_COMPLETE, 0)
-        flush()
-
-    def forget(self) -> None:
-        """Drop the most recent batch after a failed drawing."""
-        self._begun.pop()
+        write_layers(self._context, drawn.colour, self._buffer, places)
 
     def end(self) -> Pictures:
-        """Return the pictures of the oldest batch, as `Target.read` does."""
-        if not self._begun:
+        """Return the pictures of the oldest batch, as `Target.read` does.
+
+        Raises EngineError without one, and where the graphics card does not finish it.
+        """
+        if not self._pending:
             raise EngineError("no picture is under way: `begin` one first")
-        begun = self._begun.popleft()
-        pictures = begun.pictures
-        function("glClientWaitSync", "puq", "u")(begun.fence, _FLUSH_COMMANDS, _FOREVER_NS)
-        function("glDeleteSync", "p")(begun.fence)
-        data = begun.landing.lend()[: pictures * self._each].reshape(pictures, self._each)
-        held = sum(one.lent for one in self._landings) > _LENT_MAX
-        return [self._target.parted(one.copy() if held else one) for one in data]
+        batch = self._pending.popleft()
+        pictures = batch.pictures
+        wait = function("glClientWaitSync", "puq", "u")
+        result = wait(batch.fence, _FLUSH_COMMANDS, _WAIT_NS)
+        batch.delete_fence()
+        if result not in _SIGNALED:
+            raise EngineError(
+                f"the graphics driver did not finish {pictures} pictures (glClientWaitSync returned "
+                f"0x{result:04X}): see the driver's log; start the process again"
+            )
+        data = batch.memory.lend()[: pictures * self._each].reshape(pictures, self._each)
+        copied = sum(one.lent for one in self._host_buffers) > _LENT_MAX
+        return [self._target.parted(one.copy() if copied else one) for one in data]
 
     def release(self) -> None:
-        if self._written is not None:
-            self._written.release()
-            self._written = None
-        self._begun.clear()
-        _LEFT.extend(self._landings)
-        self._landings.clear()
-        _free_left()
+        if self._stage is not None:
+            self._stage.release()
+            self._stage = None
+        while self._pending:
+            self._pending.popleft().delete_fence()
+        _UNRELEASED.extend(self._host_buffers)
+        self._host_buffers.clear()
+        _free_unreleased()
+
+    def _send(self, batch: PendingBatch) -> None:
+        """Queue the transfer of a batch, after its last picture."""
+        if self._staged and batch.pictures:
+            size = batch.pictures * self._each
+            self._context.copy_buffer(batch.memory.buffer, self._buffer, size=size)
+        batch.fence = function("glFenceSync", "uu", "p")(_GPU_COMMANDS_COMPLETE, 0)
+        if batch.fence is None:
+            raise EngineError("the graphics driver made no fence (glFenceSync): see its log")
+        flush()
 
     @property
     def _buffer(self) -> moderngl.Buffer:
-        """Return the buffer that pictures are written to: on a card it has its own memory."""
-        landing = self._begun[-1].landing
-        if not self._on_card:
-            return landing.buffer
-        if self._written is None or self._written.size < landing.size:
-            if self._written is not None:
-                self._written.release()
-            self._written = self._context.buffer(reserve=landing.size)
-        return self._written
+        """Return the buffer that pictures of the most recent batch are written to."""
+        memory = self._pending[-1].memory
+        if not self._staged:
+            return memory.buffer
+        if self._stage is None or self._stage.size < memory.size:
+            if self._stage is not None:
+                self._stage.release()
+            self._stage = self._context.buffer(reserve=memory.size)
+        return self._stage
 
-    def _landing(self, size: int) -> _Landing:
+    def _unused(self, size: int) -> HostBuffer:
         """Return unused memory of at least a size."""
-        under_way = [one.landing for one in self._begun]
-        unused = [one for one in self._landings if one not in under_way and not one.lent]
+        pending = [one.memory for one in self._pending]
+        unused = [one for one in self._host_buffers if one not in pending and not one.lent]
         for one in unused:
             if one.size >= size:
                 return one
-            self._landings.remove(one)
+            self._host_buffers.remove(one)
             one.release()
-        _free_left()
-        self._landings.append(_Landing(self._context, size))
-        return self._landings[-1]
+        _free_unreleased()
+        self._host_buffers.append(HostBuffer(self._context, size))
+        return self._host_buffers[-1]
 
 
 @dataclass(slots=True)
-class _Begun:
-    """Batch that is under way."""
+class PendingBatch:
+    """Batch of pictures that are queued."""
 
-    landing: _Landing
+    memory: HostBuffer
     pictures: int
     fence: int | None = None
 
+    def delete_fence(self) -> None:
+        """Free the fence, if any."""
+        if self.fence is not None:
+            function("glDeleteSync", "p")(self.fence)
+            self.fence = None
 
-_LEFT: Final[list[_Landing]] = []
+
+_UNRELEASED: Final[list[HostBuffer]] = []
 """Memory of released readbacks whose pictures were in use."""
 
 
-def _free_left() -> None:
+def _free_unreleased() -> None:
     """Free memory of released readbacks that is not in use any more."""
-    for one in [one for one in _LEFT if not one.lent]:
-        _LEFT.remove(one)
+    for one in [one for one in _UNRELEASED if not one.lent]:
+        _UNRELEASED.remove(one)
         one.release()
 
 
@@ -216,11 +239,10 @@ class SinglePicture:
         """Read the target."""
         self._found = [self.target.read()]
 
-    def take_layers(self, drawn: LayerTarget, first: int, count: int, place: int) -> None:
-        """Read a layer."""
-        self._readback.begin()
-        self._readback.take_layers(drawn, first, count, place)
-        self._readback.send()
+    def take_layers(self, drawn: LayerTarget, places: Sequence[int]) -> None:
+        """Read the first layer."""
+        with self._readback.begin():
+            self._readback.take_layers(drawn, places)
         self._found = self._readback.end()
 
     def end(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -230,28 +252,3 @@ class SinglePicture:
     def release(self) -> None:
         self.target.release()
         self._readback.release()
-
-
-@lru_cache(maxsize=1)
-def _parting(context: moderngl.Context) -> moderngl.ComputeShader:
-    """Create the program that writes layers to a buffer: all colours of each, then all labels."""
-    return context.compute_shader(
-        f"""#version 430
-        layout(local_size_x = {_GROUP}) in;
-        layout(binding = {_UNIT}) uniform sampler2DArray pictures;
-        layout(std430, binding = {_BYTES_BINDING}) writeonly buffer Bytes {{ uint words[]; }};
-        uniform ivec3 places;  // first layer, first word, words of a picture
-        void main() {{
-            int word = int(gl_GlobalInvocationID.x), nth = int(gl_WorkGroupID.y);
-            if (word >= places.z) return;
-            int wide = textureSize(pictures, 0).x, colours = 3 * places.z;
-            vec4 four;
-            for (int i = 0; i < 4; i++) {{
-                int k = 4 * word + i, at = k < colours ? k / 3 : k - colours;
-                vec4 seen = texelFetch(pictures, ivec3(at % wide, at / wide, places.x + nth), 0);
-                four[i] = seen[k < colours ? k - 3 * at : 3];
-            }}
-            words[places.y + nth * places.z + word] = packUnorm4x8(four);
-        }}
-        """
-    )

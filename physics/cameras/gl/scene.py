@@ -114,7 +114,7 @@ class GlScene:
     splats: the scan's mesh is not in the picture, but drawn apart
     layers: pictures are drawn as layers, together with those of other scenes
 
-    seat: number of the scene in the shared buffers
+    id: number of the scene in the shared buffers
     draws: of each of STEPS, for `StreetDrawing`
     version: unique number of `draws`
     """
@@ -135,7 +135,7 @@ class GlScene:
         self._forms = street.forms
         self._shadows = light.shadows
         self._surfaces = surfaces(context)
-        self.seat = street.seat()
+        self.id = street.take_id()
         self.style = style_of(light, splats, look, layers)
         self.draws = [NO_DRAWS] * len(STEPS)
         self.version = 0
@@ -200,7 +200,7 @@ class GlScene:
         for tile in self._tiles.values():
             self._drop(tile)
         self._tiles.clear()
-        self._street.leave(self.seat)
+        self._street.give_id(self.id)
 
     def _drop(self, tile: _Tile) -> None:
         for kind, piece in tile.meshes.items():
@@ -256,13 +256,13 @@ class GlScene:
         self._seen_for = None
         self._still_for = None
         self._lit_for = []
-        self._street.place(self._places[0], self.seat, self._middles, anchor)
+        self._street.place(self._places[0], self.id, self._middles, anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
         self._stands = _joined([*placed, _at(self._obstacles, self._obstacle_xy, anchor)])
         self._far = np.concatenate(
             [*(self._tiles[key].far for key in self._keys), self._obstacles[0]]
         )
-        self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]), self.seat)
+        self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]), self.id)
         self._show_things("fenced", self._fenced)
 
     def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
@@ -277,7 +277,7 @@ class GlScene:
         rows = chosen.nonzero()[0]
         form, things = self._stands
         form = np.where(away > _NEAR_M, self._far, form)
-        self._seen.set(*_joined([(form[rows], things[rows]), self._lit]), self.seat)
+        self._seen.set(*_joined([(form[rows], things[rows]), self._lit]), self.id)
         self._show_things("seen", self._seen)
         for kind in TILE_KINDS:
             if kind != "decals":
@@ -292,7 +292,7 @@ class GlScene:
         obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
         self._standing.set(
             *_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles]),
-            self.seat,
+            self.id,
         )
         self._show_things("standing", self._standing)
         tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)

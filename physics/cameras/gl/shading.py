@@ -44,11 +44,12 @@ Uniform block `Scene` (binding SCENE_BINDING, one per pass and picture, from `Sc
     vec4 backdrop          with layers: rgb linear, all around the horizon; w layer of the sky
 
 With `Variant.LAYERS` one draw fills layers of array textures, one for each picture. The attribute
-`seat` of an instance is that of its scene; the buffer `Seats` maps it to the block and the layer of
+`scene_id` of an instance is that of its scene; the buffer `SceneMap` maps it to the block and the layer of
 the picture, and `project` selects both. Then eye.w is the layer of the static shadow map.
 
 Textures: the shadow maps are bound to units STILL_UNIT (static) and MOVING_UNIT (moving objects).
 SKY_UNIT holds the sky; SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT those of ground and walls.
+MAPS_UNIT holds maps of people.
 Units 0 and 1 are free for drawables; people use them for the time of a batch.
 
 A drawable implements `draw(stage)` and draws itself with its program of that stage:
@@ -84,11 +85,14 @@ FACADES_UNIT: Final = 4
 SKY_UNIT: Final = 5
 STILL_UNIT: Final = 6
 MOVING_UNIT: Final = 7
+MAPS_UNIT: Final = 8
+"""Texture unit of the maps of people, bound for each draw of them."""
+PICTURE_UNIT: Final = MAPS_UNIT
+"""Texture unit of the pictures to be read back, after all draws."""
 ANCHOR_M: Final = 64.0
 PICTURES_MAX: Final = 128
 """Maximum number of pictures of a batch: their blocks fill the uniform block of a layered draw."""
-SEATS_BINDING: Final = 1
-_USED_ROWS: Final = 21
+SCENE_MAPS_BINDING: Final = 1
 _BLOCK_ROWS: Final = 32
 """Rows (vec4) of a block; graphics cards require aligned starts of blocks."""
 
@@ -120,16 +124,25 @@ layout(std140, binding = 0) uniform Scene {{
 """
 
 _BLOCKS: Final = f"""#version 430
-#extension GL_ARB_shader_viewport_layer_array : require
-struct Scene {{
-{_DECLARED}    vec4 unused[{_BLOCK_ROWS - _USED_ROWS}];
-}};
-layout(std140, binding = 0) uniform Scenes {{ Scene scenes[{PICTURES_MAX}]; }};
+EXTENSION
+layout(std140, binding = 0) uniform Scenes {{ vec4 rows[{_BLOCK_ROWS * PICTURES_MAX}]; }};
 """
-_OF_PICTURE: Final = "".join(
-    f"{kind} {name} = scenes[PICTURE].{name};\n" for kind, name in _MEMBERS
-)
-"""Values of one block under the names that they have without layers."""
+_LAYER_EXTENSION: Final = "#extension GL_ARB_shader_viewport_layer_array : require"
+"""For vertex shaders, which select the layer; other shaders have no such extension."""
+
+
+def _of_picture() -> str:
+    """Return GLSL of the values of one block under the names that they have without layers."""
+    lines, row = [], 0
+    for kind, name in _MEMBERS:
+        size = 4 if kind == "mat4" else 1
+        rows = ", ".join(f"rows[{_BLOCK_ROWS} * PICTURE + {row + i}]" for i in range(size))
+        lines.append(f"{kind} {name} = {kind}({rows});\n")
+        row += size
+    return "".join(lines)
+
+
+_OF_PICTURE: Final = _of_picture()
 
 _VERTEX = """
 invariant gl_Position;  // the same depth in all programs
@@ -138,11 +151,11 @@ vec4 in_picture(vec4 clip) { return clip; }
 vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
 """
 
-_SEATS: Final = f"""
-layout(std430, binding = {SEATS_BINDING}) readonly buffer Seats {{ ivec2 seats[]; }};
-in int seat;
+_SCENE_MAP: Final = f"""
+layout(std430, binding = {SCENE_MAPS_BINDING}) readonly buffer SceneMap {{ ivec2 scene_map[]; }};
+in int scene_id;
 flat out int picture;
-ivec2 block_layer = seats[seat];
+ivec2 block_layer = scene_map[scene_id];
 #define PICTURE block_layer.x
 {_OF_PICTURE}"""
 _LAYERS_VERTEX: Final = """
@@ -175,11 +188,11 @@ layout(binding = 7) uniform sampler2DShadow moving_shadow;
 #define MOVING(p) texture(moving_shadow, p)
 #endif
 vec3 on_map(vec3 at, vec3 normal) { return (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz; }
-float sunlit_on(vec3 on_map) {
+float sunlit_on(vec3 spot) {
 #ifdef SHADOWS
-    vec2 off = abs(on_map.xy - 0.5);
+    vec2 off = abs(spot.xy - 0.5);
     float inside = clamp((0.5 - max(off.x, off.y)) * 20.0, 0.0, 1.0);
-    float lit = min(STILL(on_map), MOVING(on_map));
+    float lit = min(STILL(spot), MOVING(spot));
     return 1.0 - sun.w * inside * (1.0 - lit);
 #else
     return 1.0;
@@ -326,14 +339,12 @@ def programs(
     """
     variant = Variant(shadows)
     layers = Variant.LAYERS in variant
-    head = (_BLOCKS if layers else _BLOCK) + variant.defines
-    before = head + (_SEATS if layers else "") + _DECODED + _SHADOW
-    before += _LAYERS_VERTEX if layers else _VERTEX
+    head = (_BLOCKS.replace("EXTENSION", "") if layers else _BLOCK) + variant.defines
     head += _LAYERS_FRAGMENT if layers else ""
     weather = BLOCK if variant & Variant.WEATHER else ""
     return Programs(
         context.program(
-            vertex_shader=before + vertex,
+            vertex_shader=_before_vertex(variant) + vertex,
             fragment_shader=head
             + weather
             + _DECODED
@@ -342,10 +353,19 @@ def programs(
             + fragment,
         ),
         context.program(
-            vertex_shader=before + vertex,
+            # These programs draw into the shadow maps, so they must not read them.
+            vertex_shader=_before_vertex(variant & ~Variant.SHADOWS) + vertex,
             fragment_shader=f"#version 430\n{cut_out}" if cut_out else _NOTHING,
         ),
     )
+
+
+def _before_vertex(variant: Variant) -> str:
+    """Return the GLSL before a drawable's vertex shader."""
+    if Variant.LAYERS in variant:
+        head = _BLOCKS.replace("EXTENSION", _LAYER_EXTENSION)
+        return head + variant.defines + _SCENE_MAP + _DECODED + _SHADOW + _LAYERS_VERTEX
+    return _BLOCK + variant.defines + _DECODED + _SHADOW + _VERTEX
 
 
 def anchor_of(eye_m: Floats) -> Floats:
@@ -432,8 +452,8 @@ class SceneBlocks:
         self._buffer.release()
 
 
-class SeatMaps:
-    """Buffers `Seats`: blocks and layers of the scenes of a batch, for pictures and static maps."""
+class SceneMaps:
+    """Buffers `SceneMap`: blocks and layers of the scenes of a batch, for pictures and static maps."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
@@ -441,30 +461,30 @@ class SeatMaps:
         self._buffers: list[moderngl.Buffer] = []
         self._held: tuple[int, bytes, bytes] | None = None
 
-    def set(self, count: int, seats: NDArray[np.intp], maps: NDArray[np.intp]) -> None:
+    def set(self, count: int, scene_ids: NDArray[np.intp], maps: NDArray[np.intp]) -> None:
         """Upload the places of N scenes.
 
-        count: number above all seats
-        seats, maps: (N,) seats, and layers of the static shadow maps
+        count: number above all ids
+        scene_ids, maps: (N,) ids, and layers of the static shadow maps
         """
         if count > self._room:
             self.release()
             self._room = 2 * count
             self._buffers = [self._context.buffer(reserve=8 * self._room) for _ in range(2)]
             self._held = None
-        wanted = count, seats.tobytes(), maps.tobytes()
+        wanted = count, scene_ids.tobytes(), maps.tobytes()
         if wanted == self._held:
             return
         self._held = wanted
-        pictures = np.arange(len(seats))
+        pictures = np.arange(len(scene_ids))
         for buffer, layers in zip(self._buffers, (pictures, maps), strict=True):
             rows = np.zeros((count, 2), dtype=np.int32)
-            rows[seats, 0], rows[seats, 1] = pictures, layers
+            rows[scene_ids, 0], rows[scene_ids, 1] = pictures, layers
             buffer.write(rows)
 
     def bind(self, still: bool = False) -> None:
         """Bind the places of pictures, or of static shadow maps, for later draws."""
-        self._buffers[still].bind_to_storage_buffer(SEATS_BINDING)
+        self._buffers[still].bind_to_storage_buffer(SCENE_MAPS_BINDING)
 
     def release(self) -> None:
         for buffer in self._buffers:

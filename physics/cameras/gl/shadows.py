@@ -19,6 +19,7 @@ import moderngl
 import numpy as np
 
 from cosim.core.geometry import Floats
+from physics.cameras.gl.gl_state import polygon_offset
 from physics.cameras.gl.layers import DepthLayers
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Pass
@@ -35,6 +36,8 @@ TO_TEXTURE: Final = np.array(
     [[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
 )
 """Matrix from clip space to texture space."""
+NO_SUN: Final = np.eye(4)
+"""Matrix of a shadow pass that is never drawn."""
 
 
 def shadow_matrix(
@@ -76,9 +79,8 @@ def casting(context: moderngl.Context) -> Iterator[None]:
     """Set the GL state for drawing shadow maps within a `with` block."""
     context.enable_only(moderngl.DEPTH_TEST)
     context.depth_func = "<"
-    context.polygon_offset = 1.5, 4.0
-    yield
-    context.polygon_offset = 0.0, 0.0
+    with polygon_offset(context, 1.5, 4.0):
+        yield
 
 
 class SunView:
@@ -128,6 +130,7 @@ class ShadowMaps(SunView):
         """
         key = (*lattice.anchor, *lattice.middle, *light.to_sun.tolist())
         if key != self._drawn_for:
+            self._drawn_for = None
             self._draw("still", draw)
             self._drawn_for = key
         self._draw("moving", draw)
@@ -149,7 +152,7 @@ class ShadowMaps(SunView):
         self._moving.release()
 
 
-class ShadowSeat(SunView):
+class ShadowSlot(SunView):
     """A scene in `ShadowLayers`. layer: of its static map; to_sun: x, y, z"""
 
     def __init__(self, maps: ShadowLayers, light: Lighting) -> None:
@@ -170,34 +173,36 @@ class ShadowLayers:
         self._still, self._moving = (
             DepthLayers(context, (side, side), shadow=True) for side in sides
         )
-        self._seats: set[int] = set()
+        self._taken: set[int] = set()
         self._drawn: dict[int, object] = {}
 
     def take(self) -> int:
         """Return an unused layer of the static maps."""
-        layer = next(i for i in count() if i not in self._seats)
-        self._seats.add(layer)
+        layer = next(i for i in count() if i not in self._taken)
+        self._taken.add(layer)
         return layer
 
     def give(self, layer: int) -> None:
         """Return a layer from `take`."""
-        self._seats.remove(layer)
+        self._taken.remove(layer)
         self._drawn.pop(layer, None)
 
-    def begin_still(self, wanted: Mapping[int, object]) -> list[int]:
-        """Clear the static maps to be drawn, and return their layers.
+    @contextmanager
+    def begin_still(self, wanted: Mapping[int, object]) -> Iterator[list[int]]:
+        """Clear the static maps to be drawn within a `with` block, and return their layers.
 
         wanted: what the map of each layer depends on
         """
-        if self._still.room(max(self._seats, default=0) + 1):
+        if self._still.room(max(self._taken, default=0) + 1):
             self._drawn.clear()
         changed = [layer for layer, key in wanted.items() if self._drawn.get(layer) != key]
         for layer in changed:
+            self._drawn.pop(layer, None)
             self._still.clear(layer)
-            self._drawn[layer] = wanted[layer]
         if changed:
             self._still.use()
-        return changed
+        yield changed
+        self._drawn.update((layer, wanted[layer]) for layer in changed)
 
     def begin_moving(self, pictures: int, clear: bool) -> None:
         """Draw into the maps of the moving objects of a batch from now on."""
@@ -211,7 +216,6 @@ class ShadowLayers:
         self._moving.bind(MOVING_UNIT)
 
 
-@lru_cache(maxsize=8)
 def shadow_layers(context: moderngl.Context, high_px: int) -> ShadowLayers:
     """Return the context's maps for pictures of a height, with the same lifetime."""
     return _layers_of(context, sides_px(high_px))

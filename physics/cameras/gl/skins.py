@@ -140,7 +140,7 @@ void main() {
 class Skins:
     """Bodies in one vertex and one index buffer.
 
-    instances: rows of person, dress, girth, tall and seat
+    instances: rows of person, dress, girth, tall and scene_id
     drawn: the programs, with and without shadow maps
     """
 
@@ -202,7 +202,7 @@ class Skins:
         corner, index = self._buffers
         content = [
             (corner, *self._layout),
-            (instances, "1i4 1i4 1f4 1f4 1i4/i", *("person", "dress", "girth", "tall", "seat")),
+            (instances, "1i4 1i4 1f4 1f4 1i4/i", *("person", "dress", "girth", "tall", "scene_id")),
         ]
         colour, shadow = (
             self._context.vertex_array(program, content, index, skip_errors=True)

@@ -22,6 +22,7 @@ from cosim.core.errors import EngineError
 from cosim.place.scan import ScanFacts, Splats
 from cosim.spec.scenario import Light
 from physics.cameras.gl import splat_shaders as glsl
+from physics.cameras.gl.full_screen import VERTEX as FULL_SCREEN
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.scans import SHADE
 from physics.cameras.gl.shading import programs
@@ -42,14 +43,6 @@ _CONTACT_M: Final = 0.2
 
 _ABOVE: Final = np.array([0.0, 0.0, 1.0])
 _DARK: Final = np.zeros(3)
-
-_VERTEX: Final = """
-out vec2 spot;
-void main() {
-    spot = vec2(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0);
-    gl_Position = vec4(spot, 0.0, 1.0);
-}
-"""
 
 _FRAGMENT: Final = f"""
 layout(binding = {glsl.OBJECTS_UNIT}) uniform sampler2D objects;
@@ -248,7 +241,7 @@ class SplatPictures:
         key = 2 * light.shadows + contact
         if key not in self._arrays:
             fragment = ("#define CONTACT\n" if contact else "") + _FRAGMENT
-            program = programs(self._context, _VERTEX, fragment, light.shadows).colour
+            program = programs(self._context, FULL_SCREEN, fragment, light.shadows).colour
             first_row = program["first_row"]
             assert isinstance(first_row, moderngl.Uniform)
             self._arrays[key] = self._context.vertex_array(program, []), first_row

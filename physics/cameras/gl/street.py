@@ -15,9 +15,10 @@ import numpy as np
 from cosim.core.geometry import Floats
 from physics.cameras.gl import corners, walls
 from physics.cameras.gl.context import is_card
+from physics.cameras.gl.gl_state import depth_only
 from physics.cameras.gl.instances import MATERIALS, POOLED, Forms, Material, ThingArrays
 from physics.cameras.gl.lighting import Lighting
-from physics.cameras.gl.pool import Draws, MeshPool, Part, Pool
+from physics.cameras.gl.pool import Draws, MeshPool, PictureRange, Pool
 from physics.cameras.gl.scans import scan_shaders
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.surfaces import SurfaceShaders, surfaces
@@ -42,8 +43,8 @@ STEPS: Final[tuple[Step, ...]] = (
     *((things, material) for things in ("seen", "standing", "fenced") for material in MATERIALS),
 )
 _OPAQUE: Final[tuple[Material, ...]] = ("solid", "cut-out")
-_PLACE: Final = np.dtype([("middle", "f4", 2), ("middle_in_world", "f4", 2), ("seat", "i4")])
-_PLACE_LAYOUT: Final = ("2f 2f 1i4/i", "middle", "middle_in_world", "seat")
+_PLACE: Final = np.dtype([("middle", "f4", 2), ("middle_in_world", "f4", 2), ("scene_id", "i4")])
+_PLACE_LAYOUT: Final = ("2f 2f 1i4/i", "middle", "middle_in_world", "scene_id")
 
 
 class Style(NamedTuple):
@@ -87,33 +88,38 @@ class StreetDrawing:
         self._draws = Draws(context)
         self._drawn_for: list[int] = []
         self._scenes: Sequence[GlScene] = ()
-        self._seats: list[int] = []
-        self._seats_end = 0
+        self._free_ids: list[int] = []
+        self._ids_end = 0
 
-    def seat(self) -> int:
+    def take_id(self) -> int:
         """Return an unused number for a scene."""
-        if not self._seats:
-            self._seats_end += 1
-            return self._seats_end - 1
-        return self._seats.pop()
+        if not self._free_ids:
+            self._ids_end += 1
+            return self._ids_end - 1
+        return self._free_ids.pop()
 
-    def leave(self, seat: int) -> None:
-        """Return a number from `seat`."""
-        self._seats.append(seat)
+    def give_id(self, scene_id: int) -> None:
+        """Return a number from `take_id`."""
+        self._free_ids.append(scene_id)
+        self._scenes = ()
 
     @property
-    def seats(self) -> int:
-        """Return a number above all seats."""
-        return self._seats_end
+    def scene_ids_end(self) -> int:
+        """Return a number above all ids."""
+        return self._ids_end
 
-    def place(self, first: int, seat: int, middles: Floats, anchor: Floats) -> None:
+    def place(self, first: int, scene_id: int, middles: Floats, anchor: Floats) -> None:
         """Set the positions of a scene's tiles.
 
         first: row of `places`
         middles: (T, 2) world metres
         """
         rows = np.empty(len(middles), dtype=_PLACE)
-        rows["middle"], rows["middle_in_world"], rows["seat"] = middles - anchor, middles, seat
+        rows["middle"], rows["middle_in_world"], rows["scene_id"] = (
+            middles - anchor,
+            middles,
+            scene_id,
+        )
         self.places.write(first, rows)
 
     def set(self, scenes: Sequence[GlScene]) -> None:
@@ -124,7 +130,7 @@ class StreetDrawing:
             self._draws.set(list(zip(*(scene.draws for scene in scenes), strict=True)))
             self._drawn_for = versions
 
-    def draw(self, part: Part, stage: Pass, style: Style) -> None:
+    def draw(self, part: PictureRange, stage: Pass, style: Style) -> None:
         """Draw the streets of a part: small objects first, then walls and ground from near to
         far."""
         if stage == "moving":
@@ -143,20 +149,20 @@ class StreetDrawing:
         if not style.splats:
             self._draw_tiles("scan", stage, style, part)
 
-    def draw_mesh(self, part: Part, style: Style) -> None:
+    def draw_mesh(self, part: PictureRange, style: Style) -> None:
         """Draw normals and labels of the scan's mesh."""
         self._draw_tiles("scan", "colour", style, part)
 
-    def draw_paint(self, part: Part, style: Style) -> None:
+    def draw_paint(self, part: PictureRange, style: Style) -> None:
         """Draw road paint after the ground, without labels and depth."""
         self._draw_tiles("paint", "colour", style, part)
 
-    def draw_decals(self, part: Part, style: Style) -> None:
+    def draw_decals(self, part: PictureRange, style: Style) -> None:
         """Draw pictures on the ground, unless snow covers it; the blending multiplies colours."""
         if Variant.SNOW not in style.variant:
             self._draw_tiles("decals", "colour", style, part)
 
-    def draw_panes(self, part: Part, labels: bool, style: Style) -> None:
+    def draw_panes(self, part: PictureRange, labels: bool, style: Style) -> None:
         """Draw clear glass over the finished picture: its colours, or its labels and depth."""
         step = STEPS.index(("seen", "pane"))
         if self._draws.count(step, part.first, part.end):
@@ -164,14 +170,16 @@ class StreetDrawing:
             self._draws.draw(array, step, part.first, part.end)
 
     def _draw_things(
-        self, things: ThingStep, material: Material, stage: Pass, style: Style, part: Part
+        self, things: ThingStep, material: Material, stage: Pass, style: Style, part: PictureRange
     ) -> None:
         step = _STEP[things, material]
         if self._draws.count(step, part.first, part.end):
             array = self._thing_arrays.of(material, stage != "colour", style.variant)
             self._draws.draw(array, step, part.first, part.end)
 
-    def _draw_fences(self, material: Material, stage: Pass, style: Style, part: Part) -> None:
+    def _draw_fences(
+        self, material: Material, stage: Pass, style: Style, part: PictureRange
+    ) -> None:
         """Draw fences, whose forms are those of their scene."""
         step = _STEP["fenced", material]
         if not self._draws.count(step, part.first, part.end):
@@ -182,27 +190,25 @@ class StreetDrawing:
                 array = arrays.of(material, stage != "colour", style.variant)
                 self._draws.draw(array, step, i, i + 1)
 
-    def _draw_walls(self, style: Style, part: Part) -> None:
-        """Draw the picture of walls, which hide one another, and shade only what is seen.
+    def _draw_walls(self, style: Style, part: PictureRange) -> None:
+        """Draw the walls of pictures.
 
-        The depth comes first on a software renderer, which spends its time on shading.
+        A software renderer first draws their depths alone, so that hidden walls are not shaded.
         """
         gl = self._context
         step = _STEP["colour", "walls"]
         if is_card(gl) or not self._draws.count(step, part.first, part.end):
             self._draw_tiles("walls", "colour", style, part)
             return
-        frame = gl.fbo
-        frame.color_mask = False, False, False, False
-        frame.use()
-        self._draws.draw(self._tile_array("walls", style)[1], step, part.first, part.end)
-        frame.color_mask = True, True, True, True
-        frame.use()
+        with depth_only(gl.fbo):
+            self._draws.draw(self._tile_array("walls", style)[1], step, part.first, part.end)
         gl.depth_func = "<="
-        self._draw_tiles("walls", "colour", style, part)
-        gl.depth_func = "<"
+        try:
+            self._draw_tiles("walls", "colour", style, part)
+        finally:
+            gl.depth_func = "<"
 
-    def _draw_tiles(self, kind: TileKind, stage: Pass, style: Style, part: Part) -> None:
+    def _draw_tiles(self, kind: TileKind, stage: Pass, style: Style, part: PictureRange) -> None:
         step = _STEP["colour" if stage == "colour" else "still", kind]
         if self._draws.count(step, part.first, part.end):
             array = self._tile_array(kind, style)[stage != "colour"]

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
-from typing import Final, Literal
+from typing import Literal
 
 import cv2
 import moderngl
@@ -17,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physics.cameras.gl.context import draws_layers, is_card
+from physics.cameras.gl.picture_bytes import write_picture
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
-
-_UNIT: Final = 8
-"""Texture unit of the picture to be reordered."""
 
 
 class Frame:
@@ -66,14 +63,15 @@ class Target(Frame):
     def __init__(
         self, context: moderngl.Context, size: tuple[int, int], parts_on_card: bool | None = None
     ) -> None:
+        self._context = context
         self.size = size
         self._colour = context.texture(size, 4)
         self._depth = context.depth_renderbuffer(size)
         self.frame = context.framebuffer([self._colour], self._depth)
         self.drawn_in = self.frame
         on_card = is_card(context) or draws_layers(context)
-        on_card = on_card if parts_on_card is None else parts_on_card
-        self._parting = _Parting(context, size) if on_card else None
+        self._parts = on_card if parts_on_card is None else parts_on_card
+        self._bytes: moderngl.Buffer | None = None
 
     def clear(self) -> None:
         """Clear the target to an empty picture."""
@@ -83,17 +81,26 @@ class Target(Frame):
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Read colours (H, W, 3) and labels (H, W), the top row first."""
         data = np.empty(4 * self.size[0] * self.size[1], dtype=np.uint8)
-        self._read().read_into(data, components=4, dtype="f1")
+        if self._parts:
+            if self._bytes is None:
+                self._bytes = self._context.buffer(reserve=data.nbytes)
+            write_picture(self._context, self._colour, self._bytes, 0)
+            self._bytes.read_into(data)
+        else:
+            self.frame.read_into(data, components=4, dtype="f1")
         return self.parted(data)
 
     def copy(self, buffer: moderngl.Buffer, offset: int) -> None:
         """Queue a copy of the picture into a buffer at `offset`, for `parted`."""
-        self._read().read_into(buffer, components=4, dtype="f1", write_offset=offset)
+        if self._parts:
+            write_picture(self._context, self._colour, buffer, offset)
+        else:
+            self.frame.read_into(buffer, components=4, dtype="f1", write_offset=offset)
 
     def parted(self, data: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Split the read data of a picture into colours (H, W, 3) and labels (H, W)."""
         width, height = self.size
-        if self._parting is not None:
+        if self._parts:
             colours = data[: 3 * width * height]
             labels = data[3 * width * height :]
             return colours.reshape(height, width, 3), labels.reshape(height, width)
@@ -101,13 +108,6 @@ class Target(Frame):
         rgb = cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB)
         label = cv2.extractChannel(whole, 3)
         return np.asarray(rgb, dtype=np.uint8), np.asarray(label, dtype=np.uint8)
-
-    def _read(self) -> moderngl.Framebuffer:
-        """Return the framebuffer to read."""
-        if self._parting is None:
-            return self.frame
-        self._parting.draw(self._colour)
-        return self._parting.frame
 
     def read_depth(self) -> NDArray[np.float32]:
         """Read depth along the view, (H, W) metres."""
@@ -119,51 +119,6 @@ class Target(Frame):
         ).astype(np.float32)
 
     def release(self) -> None:
-        for thing in (self.frame, self._colour, self._depth, self._parting):
+        for thing in (self.frame, self._colour, self._depth, self._bytes):
             if thing is not None:
                 thing.release()
-
-
-class _Parting:
-    """Reordering of a picture's bytes by a shader: all colours, then all labels."""
-
-    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
-        self._context = context
-        self._bytes = context.renderbuffer(size, 4, dtype="f1")
-        self.frame = context.framebuffer([self._bytes])
-        self._everywhere = context.vertex_array(_parting_program(context), [])
-
-    def draw(self, picture: moderngl.Texture) -> None:
-        self.frame.use()
-        self._context.enable_only(moderngl.NOTHING)
-        picture.use(_UNIT)
-        self._everywhere.render(moderngl.TRIANGLES, vertices=3)
-        self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-
-    def release(self) -> None:
-        for thing in (self._everywhere, self.frame, self._bytes):
-            thing.release()
-
-
-@lru_cache(maxsize=1)
-def _parting_program(context: moderngl.Context) -> moderngl.Program:
-    return context.program(
-        vertex_shader="""#version 430
-        void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
-        """,
-        fragment_shader="""#version 430
-        layout(binding = 8) uniform sampler2D picture;
-        out vec4 four;
-        float byte_at(int k, ivec2 size) {
-            int colours = 3 * size.x * size.y;
-            int at = k < colours ? k / 3 : k - colours;
-            vec4 seen = texelFetch(picture, ivec2(at % size.x, at / size.x), 0);
-            return seen[k < colours ? k - 3 * at : 3];
-        }
-        void main() {
-            ivec2 size = textureSize(picture, 0), here = ivec2(gl_FragCoord.xy);
-            int k = 4 * (here.y * size.x + here.x);
-            four = vec4(byte_at(k, size), byte_at(k + 1, size), byte_at(k + 2, size), byte_at(k + 3, size));
-        }
-        """,
-    )

@@ -88,12 +88,12 @@ class TrafficDrawing:
         driven: Sequence[Driven],
         shots: Shots,
         parts: NDArray[np.intp],
-        seats: NDArray[np.intp],
+        scene_ids: NDArray[np.intp],
     ) -> None:
         """Upload the vehicles and robots of all pictures.
 
         parts: part of the batch of each picture, in order
-        seats: of the scenes of the pictures
+        scene_ids: of the scenes of the pictures
         """
         both = self._vehicles(driven, shots), self._robots(driven, shots)
         placed = [one for one in both if one is not None]
@@ -103,7 +103,7 @@ class TrafficDrawing:
                 of[0] if len(of) == 1 else np.concatenate(of) for of in zip(*placed, strict=True)
             )
             rows = turned_instances(at, turn[:, 0], turn[:, 1], turn[:, 2], paint, label)
-            self._things.set(form, rows, seats[picture], 2 * parts[picture] + shadow, count)
+            self._things.set(form, rows, scene_ids[picture], 2 * parts[picture] + shadow, count)
         else:
             self._things.clear(count)
         self._draws.set([self._things.draws[material] for material in _MATERIALS])

@@ -139,14 +139,6 @@ float towards_sun(vec3 ray) {
 vec3 fog_towards(vec3 ray) { return fog.rgb + sun_light.rgb * (night.z * towards_sun(ray)); }
 """
 
-AIR_VERTEX: Final = """
-out vec2 spot;
-void main() {
-    spot = vec2(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0);
-    gl_Position = vec4(spot, 0.0, 1.0);
-}
-"""
-
 _REFLECTIONS: Final = """
 vec3 sky_at(vec3 ray) {
     vec2 where = vec2(0.5 - atan(ray.y, ray.x) * 0.15915494, 0.5 - asin(clamp(ray.z, 0.0, 1.0)) * 0.31830989);

@@ -1,0 +1,41 @@
+"""Changes of the OpenGL state within a `with` block, which end also after an error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import moderngl
+
+
+@contextmanager
+def polygon_offset(context: moderngl.Context, factor: float, units: float) -> Iterator[None]:
+    """Shift the depths of later draws."""
+    context.polygon_offset = factor, units
+    try:
+        yield
+    finally:
+        context.polygon_offset = 0.0, 0.0
+
+
+@contextmanager
+def blending(context: moderngl.Context) -> Iterator[None]:
+    """Blend later draws by their fourth channel."""
+    context.enable(moderngl.BLEND)
+    try:
+        yield
+    finally:
+        context.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
+        context.disable(moderngl.BLEND)
+
+
+@contextmanager
+def depth_only(frame: moderngl.Framebuffer) -> Iterator[None]:
+    """Limit later draws into a framebuffer to depths."""
+    frame.color_mask = False, False, False, False
+    frame.use()
+    try:
+        yield
+    finally:
+        frame.color_mask = True, True, True, True
+        frame.use()
