@@ -16,10 +16,18 @@ from cosim.core.framing import MessageSocket
 
 _PR_SET_PDEATHSIG = 1
 """Number of Linux's prctl operation that sends a signal when the parent dies."""
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables with the number of threads of numerical libraries."""
 _EXIT_TIMEOUT_S = 5.0
 """Time that a child has to exit after closing its socket, in seconds; then it is killed."""
 _POLL_INTERVAL_S = 0.001
 """Interval at which an exiting child is polled, in seconds."""
+
+
+def limit_threads() -> None:
+    """Let child processes compute with one thread each, unless the environment sets a number."""
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
 
 
 def exit_with_parent(parent: int, how: signal.Signals = signal.SIGKILL) -> None:

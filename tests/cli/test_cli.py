@@ -273,13 +273,13 @@ def test_an_interrupted_run_is_finished_by_resume(
 def test_sigterm_stops_a_run_as_ctrl_c_does(desk: Path, cosim: Cosim) -> None:
     """The same exit code and words, and no environment process is left."""
     out = desk / "terminated"
-    with held_before(desk, "t-1") as waits, ThreadPoolExecutor(1) as beside:
+    with held_before(desk, "t-1") as waits, ThreadPoolExecutor(1) as threads:
 
         def terminate() -> None:
             wait_until(waits)
             os.kill(os.getpid(), signal.SIGTERM)
 
-        sent = beside.submit(terminate)
+        sent = threads.submit(terminate)
         said = cosim("run", *HELD, out.name, cwd=desk)
         sent.result()
         assert said.returncode == 130 and says_stopped(said.stderr, out.name), said

@@ -171,7 +171,7 @@ def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
 
 
 def test_parts_turn_by_the_quaternions_of_scipy() -> None:
-    """Random rotations, half turns and no turn give the same bits; nobody gives no rows."""
+    """Random rotations, half turns and no turn give the same bits; no people give no rows."""
     exact = [np.eye(3), *(np.diag(signs) for signs in np.eye(3) * 2.0 - 1.0)]
     drawn = Rotation.random(2000, random_state=np.random.default_rng(0)).as_matrix()
     turns = np.concatenate([exact, drawn])

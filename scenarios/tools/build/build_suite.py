@@ -7,7 +7,6 @@ hangs costs one candidate.
 from __future__ import annotations
 
 import itertools
-import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ import physics
 import scenarios
 import sumo_nets
 from cosim.core.cache import sources_hash
+from cosim.core.child_process import limit_threads
 from cosim.core.errors import CosimError, RunError, SpecError, UsageError
 from cosim.core.files import write_atomic
 from cosim.core.progress import Progress, ignore
@@ -45,7 +45,6 @@ _BEGUN: Final = 2
 own fault.
 """
 _POLL_S: Final = 0.1
-_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Kept(msgspec.Struct, frozen=True):
@@ -224,8 +223,7 @@ def _look_after(worker: _Worker, folder: Path) -> None:
 
 
 def _started(piece: _Piece, folder: Path, tries: int) -> BaseProcess:
-    for name in _THREADS:
-        os.environ.setdefault(name, "1")
+    limit_threads()
     process = get_context("spawn").Process(target=_work, args=(piece, folder, tries))
     process.start()
     return process

@@ -5,7 +5,7 @@ OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode
                       too few are solved. Of other formats than raw, they may be deleted once the
                       data set is complete
 OUT/writing           unfinished data set
-OUT/about.json        with the format raw: what `cosim dataset pack` needs beside the runs, in
+OUT/about.json        with the format raw: what `cosim dataset pack` needs besides the runs, in
                       place of the following
 OUT/bags              with the format rosbag2 a ROS 2 bag of each episode, in place of the following
 OUT/meta, data, videos   the data set; meta is written last and marks it as complete
@@ -475,7 +475,7 @@ def _written(
 
 
 def _write_about(out: Path, about: dict[str, Any]) -> None:
-    """Write what packing needs beside the runs. Raises MachineError."""
+    """Write what packing needs besides the runs. Raises MachineError."""
     try:
         write_atomic(out / ABOUT, json.dumps(about, indent=1).encode() + b"\n")
     except OSError as error:
