@@ -112,15 +112,18 @@ class RemoteDirector:
         self._waiting = waiting
 
     def react(self, query: EventQuery) -> EventReply:
-        """Return the director's reply. Raises DirectorLost on timeout or an invalid reply."""
+        """Return the director's reply.
+
+        Raises DirectorLost on timeout or an invalid reply. A director in this process cannot be
+        lost: its errors are the simulator's, EngineError.
+        """
         try:
             reply = verify(self._ask(sign_query(query, self._by), query.tick), EventReply, self._by)
             _check(reply, query)
         except (TimeoutError, EngineError) as error:
             why = str(error)[:LONGEST_REASON]
-            raise DirectorLost(
-                f"director, tick {query.tick} of '{query.episode}': {why}"
-            ) from error
+            failed = EngineError if self._session.in_process else DirectorLost
+            raise failed(f"director, tick {query.tick} of '{query.episode}': {why}") from error
         return reply
 
     def _ask(self, payload: bytes, tick: int) -> bytes:

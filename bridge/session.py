@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import zenoh
 import zenoh.ext
@@ -98,6 +98,9 @@ class Session:
     inside: For a listening session, the connection of its own processes on this machine, by a
         private socket. They have all rights; other processes have those of their role.
     """
+
+    in_process: ClassVar[bool] = False
+    """Whether queries are answered in the calling thread."""
 
     def __init__(
         self, session: zenoh.Session, inside: Connection | None = None, folder: Path | None = None
@@ -407,6 +410,8 @@ class LocalSession(Session):
     Query and reply are publications, because Zenoh's queries use a timer thread that adds latency
     on a busy machine. An interrupt of the calling thread interrupts the handler.
     """
+
+    in_process = True
 
     def __init__(self) -> None:
         super().__init__(

@@ -204,6 +204,15 @@ def _patches_the_referee(self: Hostile, seen: Any) -> None:
     self.undo = lambda: setattr(Referee, "judge", judge)
 
 
+def _patches_the_director(self: Hostile, seen: Any) -> None:
+    """Let the director of this process fail, as an alarm at an unlucky moment does."""
+    from bridge import director
+
+    before = director.verify_query
+    director.verify_query = lambda *_: _raise(OSError("alarm"))
+    self.undo = lambda: setattr(director, "verify_query", before)
+
+
 def _patches_numpy(self: Hostile, seen: Any) -> None:
     names = ("hypot", "column_stack", "asarray")
     before = {name: getattr(np, name) for name in names}
@@ -546,6 +555,7 @@ DEEDS = {
     "scribbles": Deed(_scribbles, DONE, DONE, sees=True),
     "changes-its-manifest": Deed(_changes_its_manifest, DONE, DONE, sees=True),
     "patches-the-referee": Deed(_patches_the_referee, FORGED, DONE),
+    "patches-the-director": Deed(_patches_the_director, BLAMED, DONE, attempts=2),
     "patches-numpy": Deed(_patches_numpy, BLAMED, DONE, attempts=2),
     "patches-time": Deed(_patches_time, BLAMED, DONE, attempts=2),
     "empties-sys-modules": Deed(_empties_sys_modules, DONE, DONE),
