@@ -45,8 +45,8 @@ TICK_S: Final = 120.0
 _LOOKS_S: Final = 1.0
 """Seconds between two checks whether a supervisor was stopped by a signal."""
 _CODE: Final = (
-    "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import keep_worker; "
-    "keep_worker({serves!r}, {given}, {run}, {sandbox})"
+    "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import supervise_worker; "
+    "supervise_worker({entry_point!r}, {descriptors}, {run}, {sandbox})"
 )
 
 
@@ -54,10 +54,10 @@ class ChildProcess:
     """A supervisor process and its worker (`scenarios.ipc.supervisor`).
 
     log: file of its output, None for this process's standard error.
-    serves: function that the worker runs, as module:name.
-    called: kind of the process, for messages.
-    also: further descriptors to pass on.
-    most_bytes: size limit of a message from it.
+    entry_point: function that the worker runs, as module:name.
+    kind: kind of the process, for messages.
+    descriptors: further descriptors to pass on.
+    max_message_bytes: size limit of a message from it.
     sandbox: sandbox in which it runs, without the memory of the pending call.
     open: whether it is not known to have ended.
     """
@@ -65,27 +65,33 @@ class ChildProcess:
     def __init__(
         self,
         log: Path | None,
-        serves: str,
-        called: str,
-        also: tuple[int, ...] = (),
-        most_bytes: int = MAX_MESSAGE_BYTES,
+        entry_point: str,
+        kind: str,
+        descriptors: tuple[int, ...] = (),
+        max_message_bytes: int = MAX_MESSAGE_BYTES,
         sandbox: Sandbox | None = None,
     ) -> None:
         self.log = str(log)
         self.open = True
-        self.called = called
-        self._asked = PendingCallMemory.new(LOG_BYTES)
-        self._last_asked: PendingCall | None = None
+        self.kind = kind
+        self._memory = PendingCallMemory.new(LOG_BYTES)
+        self._last_pending_call: PendingCall | None = None
         self._last_driven: Driven | None = None
         self.in_engine = False
         self.in_policy = False
         ours, theirs = socket.socketpair()
-        self.wire = MessageSocket(ours, most_bytes)
-        call = () if sandbox is not None else (self._asked.descriptor,)
-        given = (theirs.fileno(), *call, *also)
+        self.wire = MessageSocket(ours, max_message_bytes)
+        call = () if sandbox is not None else (self._memory.descriptor,)
+        inherited = (theirs.fileno(), *call, *descriptors)
         path = [str(Path(entry).absolute()) for entry in sys.path]
-        boxed = None if sandbox is None else tuple(sandbox)
-        code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid(), sandbox=boxed)
+        values = None if sandbox is None else tuple(sandbox)
+        code = _CODE.format(
+            path=path,
+            entry_point=entry_point,
+            descriptors=inherited,
+            run=os.getpid(),
+            sandbox=values,
+        )
         try:
             if log is not None:
                 log.parent.mkdir(parents=True, exist_ok=True)  # a policy may have deleted it
@@ -95,7 +101,7 @@ class ChildProcess:
                     stdin=subprocess.DEVNULL,
                     stdout=printed,
                     stderr=printed,
-                    pass_fds=given,
+                    pass_fds=inherited,
                     start_new_session=True,
                 )
         except OSError as error:
@@ -104,19 +110,19 @@ class ChildProcess:
             theirs.close()
 
     @property
-    def question(self) -> PendingCall | None:
+    def pending_call(self) -> PendingCall | None:
         """Return the pending call of the policy; after the end, the one that was pending then."""
-        return self._asked.question if self.open else self._last_asked
+        return self._memory.pending_call if self.open else self._last_pending_call
 
     @property
     def driven(self) -> Driven | None:
         """Return what was driven of the last episode of an environment process; None if unknown."""
-        return driven_of(self._asked) if self.open else self._last_driven
+        return driven_of(self._memory) if self.open else self._last_driven
 
     @property
     def progress(self) -> tuple[int, bool]:
         """Return the ticks of the episode so far, and whether it is over."""
-        return progress_of(self._asked)
+        return progress_of(self._memory)
 
     def wake(self) -> None:
         """Continue the supervisor, which continues the worker, if a signal has stopped it."""
@@ -138,13 +144,13 @@ class ChildProcess:
         with suppress(OSError):
             self.wire.post(message)
 
-    def listen(self, hear: MessageHandler) -> bool:
+    def listen(self, handle: MessageHandler) -> bool:
         """Pass on the messages that have arrived. Returns False if no more will."""
         with suppress(OSError):
             self.wire.flush()
         try:
             for message in self.wire.received():
-                hear(decode_message(message))
+                handle(decode_message(message))
         except (EOFError, msgspec.DecodeError):  # a policy can write garbage to the socket
             return False
         return True
@@ -170,15 +176,19 @@ class ChildProcess:
                 self._child.kill()
                 self._child.wait()
         if self.open:
-            self._last_asked = self._asked.question
-            self._last_driven = driven_of(self._asked)
+            self._last_pending_call = self._memory.pending_call
+            self._last_driven = driven_of(self._memory)
             self.open = False
-            self._asked.close()
-        during = f" in the policy's {self._last_asked.when}" if self._last_asked is not None else ""
-        self.in_engine = self._last_asked is None and code in _FAULTS
+            self._memory.close()
+        during = (
+            f" in the policy's {self._last_pending_call.when}"
+            if self._last_pending_call is not None
+            else ""
+        )
+        self.in_engine = self._last_pending_call is None and code in _FAULTS
         by_itself = code is not None and (code >= 0 or code in _FAULTS)
-        self.in_policy = self._last_asked is not None and by_itself
-        return f"the {self.called} process {_in_words(code)}{during}"
+        self.in_policy = self._last_pending_call is not None and by_itself
+        return f"the {self.kind} process {_in_words(code)}{during}"
 
     def _terminate(self) -> None:
         """Request the supervisor to end everything, also if a signal has stopped it."""
@@ -206,7 +216,7 @@ def _in_words(code: int | None) -> str:
 class ProcessEnd(NamedTuple):
     """The end of a process, in words.
 
-    question: the policy call that was pending.
+    pending_call: the policy call that was pending.
     in_engine: whether compiled code has ended it or hangs, while no policy call was pending.
     in_policy: whether it has ended by itself during a policy call.
     hung: whether it was killed because it sent nothing.
@@ -216,7 +226,7 @@ class ProcessEnd(NamedTuple):
     """
 
     words: str
-    question: PendingCall | None = None
+    pending_call: PendingCall | None = None
     in_engine: bool = False
     hung: bool = False
     allowed_s: float | None = None
@@ -230,7 +240,7 @@ class Watchdog:
     silence_s: timeout in seconds of its heartbeats, unless a policy call is pending.
     tick_s: the same between two ticks of an episode.
     ready: whether it has loaded the engines and the policy.
-    heard_s: monotonic clock of its last message.
+    last_message_s: monotonic clock of its last message.
     """
 
     def __init__(
@@ -242,42 +252,42 @@ class Watchdog:
     ) -> None:
         self.process = process
         self.ready = False
-        self.heard_s = time.monotonic()
+        self.last_message_s = time.monotonic()
         self._patience = patience
         self._silence_s = silence_s
         self._tick_s = tick_s or silence_s
         self._progress = (0, False)
         self._looks_at_s = 0.0
 
-    def poll(self, hear: MessageHandler, *, idle: bool = False) -> ProcessEnd | None:
+    def poll(self, handle: MessageHandler, *, idle: bool = False) -> ProcessEnd | None:
         """Pass on its messages. Returns its end, if it has ended or was killed because it hangs.
 
         idle: whether it may be silent.
         Raises UsageError if it cannot load the policy, MachineError if the machine lacks something.
         """
-        if not self.process.listen(partial(self._take, hear)):
+        if not self.process.listen(partial(self._take, handle)):
             words = self.process.end()
-            return self._ended(words, self.process.question, self.process.in_engine)
-        question = self.process.question
+            return self._ended(words, self.process.pending_call, self.process.in_engine)
+        pending_call = self.process.pending_call
         now_s = time.monotonic()
         if idle:
             return None
         if now_s >= self._looks_at_s:
             self._looks_at_s = now_s + _LOOKS_S
             self.process.wake()
-        if question is None:
+        if pending_call is None:
             allowed_s = self._allowed_s()
-            if now_s - self.heard_s <= allowed_s:
+            if now_s - self.last_message_s <= allowed_s:
                 return None
             self.process.kill()
-            words = f"the {self.process.called} process showed no sign of life"
+            words = f"the {self.process.kind} process showed no sign of life"
             return self._ended(words, in_engine=True, hung=True)
-        self.heard_s = now_s
-        if not question.overdue(self._patience):
+        self.last_message_s = now_s
+        if not pending_call.overdue(self._patience):
             return None
         self.process.kill()
-        words = f"the {self.process.called} process was ended"
-        return self._ended(words, question, allowed_s=self._patience.of(question.doing))
+        words = f"the {self.process.kind} process was ended"
+        return self._ended(words, pending_call, allowed_s=self._patience.of(pending_call.kind))
 
     def _allowed_s(self) -> float:
         """Return the timeout of its next heartbeat, after a look at the ticks, each of which is a
@@ -285,29 +295,29 @@ class Watchdog:
         progress = self.process.progress
         if progress != self._progress:
             self._progress = progress
-            self.heard_s = time.monotonic()
+            self.last_message_s = time.monotonic()
         ticks, over = progress
         return self._tick_s if ticks and not over else self._silence_s
 
     def _ended(
         self,
         words: str,
-        question: PendingCall | None = None,
+        pending_call: PendingCall | None = None,
         in_engine: bool = False,
         hung: bool = False,
         allowed_s: float | None = None,
     ) -> ProcessEnd:
         driven, in_policy = self.process.driven, self.process.in_policy
-        return ProcessEnd(words, question, in_engine, hung, allowed_s, driven, in_policy)
+        return ProcessEnd(words, pending_call, in_engine, hung, allowed_s, driven, in_policy)
 
-    def _take(self, hear: MessageHandler, message: Message) -> None:
-        self.heard_s = time.monotonic()
+    def _take(self, handle: MessageHandler, message: Message) -> None:
+        self.last_message_s = time.monotonic()
         if isinstance(message, Unable):
             raise_unable(message)
         if isinstance(message, Ready):
             self.ready = True
         else:
-            hear(message)
+            handle(message)
 
 
 def raise_unable(message: Unable) -> None:

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple, get_args
 from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCall, when
 from scenarios.ipc.shared_memory import SharedMemory
 
-_DOINGS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
+_CALL_KINDS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
 _LAYOUT: Final = struct.Struct("dqq")
 """Layout of a pending call: its start time in s, 0.0 without a call; its kind; its tick."""
 
@@ -28,9 +28,9 @@ class Patience(NamedTuple):
     answer_s: float = 60.0
     start_s: float = LOAD_TIMEOUT_S
 
-    def of(self, doing: PolicyCall) -> float:
+    def of(self, kind: PolicyCall) -> float:
         """Return the timeout of a kind of call."""
-        return self.start_s if doing in ("loading", "reset", "first act") else self.answer_s
+        return self.start_s if kind in ("loading", "reset", "first act") else self.answer_s
 
 
 class ServerTimes(NamedTuple):
@@ -59,35 +59,37 @@ class PendingCall(NamedTuple):
     """
 
     since_s: float
-    doing: PolicyCall
+    kind: PolicyCall
     tick: int
 
     def overdue(self, patience: Patience) -> bool:
         """Return whether the call has exceeded its timeout."""
-        return time.monotonic() - self.since_s > patience.of(self.doing)
+        return time.monotonic() - self.since_s > patience.of(self.kind)
 
     @property
     def when(self) -> str:
         """Return the call in words: "reset", or "act at 3.2 s"."""
-        return when(self.doing, self.tick)
+        return when(self.kind, self.tick)
 
 
 class PendingCallMemory(SharedMemory):
     """Shared memory with the pending call: created by the run, written as `Timer` by the policy's
     process."""
 
-    def starts(self, doing: PolicyCall, tick: int) -> None:
-        _LAYOUT.pack_into(self.map, 0, time.monotonic(), _DOINGS.index(doing), tick)
+    def starts(self, kind: PolicyCall, tick: int) -> None:
+        _LAYOUT.pack_into(self.map, 0, time.monotonic(), _CALL_KINDS.index(kind), tick)
 
     def stops(self) -> None:
         _LAYOUT.pack_into(self.map, 0, 0.0, 0, 0)
 
     @property
-    def question(self) -> PendingCall | None:
+    def pending_call(self) -> PendingCall | None:
         """Return the pending call; None without one. An entry that a policy has damaged is an
         overdue call."""
-        since_s, doing, tick = _LAYOUT.unpack_from(self.map, 0)
+        since_s, kind, tick = _LAYOUT.unpack_from(self.map, 0)
         if not since_s:
             return None
-        known = 0.0 < since_s <= time.monotonic() and 0 <= doing < len(_DOINGS)
-        return PendingCall(since_s, _DOINGS[doing], tick) if known else PendingCall(0.0, "act", 0)
+        known = 0.0 < since_s <= time.monotonic() and 0 <= kind < len(_CALL_KINDS)
+        return (
+            PendingCall(since_s, _CALL_KINDS[kind], tick) if known else PendingCall(0.0, "act", 0)
+        )

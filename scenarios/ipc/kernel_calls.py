@@ -25,29 +25,32 @@ class SandboxError(Exception):
     """A step of the set-up that failed, with its reason."""
 
 
-def call(step: str, name: str, *given: Any) -> int:
+def call(step: str, name: str, *arguments: Any) -> int:
     """Make a system call. Raises SandboxError that names the step."""
     numbers = seccomp.NUMBERS[name]
     number = numbers[seccomp.MACHINES[platform.machine()][0]]
-    sent = [ctypes.c_long(one) if isinstance(one, int) else one for one in given]
+    sent = [ctypes.c_long(one) if isinstance(one, int) else one for one in arguments]
     made: int = _LIBC.syscall(ctypes.c_long(number or -1), *sent)
     if made < 0:
         raise SandboxError(f"{step}: {os.strerror(ctypes.get_errno())}")
     return made
 
 
-def prctl(step: str, *given: int) -> None:
+def prctl(step: str, *arguments: int) -> None:
     """Set a property of this process. Raises SandboxError that names the step."""
-    if _LIBC.prctl(*map(ctypes.c_ulong, (*given, *[0] * (5 - len(given))))) != 0:
+    if _LIBC.prctl(*map(ctypes.c_ulong, (*arguments, *[0] * (5 - len(arguments))))) != 0:
         raise SandboxError(f"{step}: {os.strerror(ctypes.get_errno())}")
 
 
 def drop_privileges(user: int | None) -> None:
-    """Give up all rights of this process, for good. Root becomes a user without an account, who may
-    read files of any user where the sandbox shows them, if root may."""
-    kept = 0 if user is None else (1 << _READ_ANY) & _permitted()
+    """Give up all rights of this process permanently.
+
+    Root becomes a user without an account. This user may read files of any user that the sandbox
+    shows, if root may.
+    """
+    retained = 0 if user is None else (1 << _READ_ANY) & _permitted()
     for capability in range(64):
-        if not kept >> capability & 1:
+        if not retained >> capability & 1:
             with suppress(SandboxError):  # of an older kernel, or not root's
                 prctl("drop capabilities", _DROP_BOUND, capability)
     if user is not None:
@@ -56,10 +59,10 @@ def drop_privileges(user: int | None) -> None:
         os.setresgid(user, user, user)
         os.setresuid(user, user, user)
     head = ctypes.create_string_buffer(struct.pack("Ii", 0x20080522, 0))
-    sets = ctypes.create_string_buffer(struct.pack("6I", kept, kept, kept, 0, 0, 0))
+    sets = ctypes.create_string_buffer(struct.pack("6I", retained, retained, retained, 0, 0, 0))
     if _LIBC.capset(head, sets) != 0:
         raise SandboxError(f"drop capabilities: {os.strerror(ctypes.get_errno())}")
-    if kept:
+    if retained:
         prctl("keep a capability", _AMBIENT, 2, _READ_ANY)
     prctl("forbid new privileges", _NO_PRIVILEGES, 1)
 

@@ -65,7 +65,7 @@ class RendererLink:
             raise self.lost() from error
         self._memory = SharedMemory(descriptor)
 
-    def tell(self, request: Request) -> None:
+    def send(self, request: Request) -> None:
         """Send a request without waiting for a reply."""
         try:
             self._wire.send(encode_exchange(request))
@@ -74,7 +74,7 @@ class RendererLink:
 
     def exchange(self, request: Request, call: str = "") -> bytes:
         """Return the reply to a request. call: the policy call in words, for errors."""
-        self.tell(request)
+        self.send(request)
         return self.received(call)
 
     def received(self, call: str = "") -> bytes:
@@ -87,29 +87,29 @@ class RendererLink:
 
     def enter(self, scenario: Scenario) -> None:
         """Report the scenario that this environment runs. Raises EngineError."""
-        self._rendered(self.exchange(Enter(scenario)))
+        self._decode_rendered(self.exchange(Enter(scenario)))
 
     def draw(self, robot: RobotState, street: Street) -> Frame:
         """Return the picture of the robot's camera. Raises EngineError."""
-        return self.drawn(self.exchange(Draw(robot, street)))
+        return self.decode_frame(self.exchange(Draw(robot, street)))
 
-    def drawn(self, payload: bytes) -> Frame:
+    def decode_frame(self, payload: bytes) -> Frame:
         """Return a copy of the picture that a reply describes. Raises EngineError."""
-        laid = self._rendered(payload).arrays
+        locations = self._decode_rendered(payload).arrays
         if self._memory is None:
             raise self.lost()
-        arrays = self._memory.take(laid)
-        self._drawn = arrays, laid
+        arrays = self._memory.read_arrays(locations)
+        self._drawn = arrays, locations
         return Frame(arrays["rgb"], arrays["labels"])
 
-    def laid(self, name: str, array: object) -> PackedArray | None:
+    def location_of(self, name: str, array: object) -> PackedArray | None:
         """Return the location of an array of the last picture; None for any other array."""
-        arrays, laid = self._drawn
-        return laid[name] if arrays.get(name) is array else None
+        arrays, locations = self._drawn
+        return locations[name] if arrays.get(name) is array else None
 
     def leave(self) -> None:
         """Report that this environment runs no scenario."""
-        self.tell(Enter(None))
+        self.send(Enter(None))
 
     def close(self) -> None:
         """Close the connection; the next use of `link_to` makes another one."""
@@ -126,7 +126,7 @@ class RendererLink:
         self.close()
         return RendererLost(self.number, call if busy else "")
 
-    def _rendered(self, payload: bytes) -> Rendered:
+    def _decode_rendered(self, payload: bytes) -> Rendered:
         try:
             reply: Rendered | Refusal = decode_rendered(payload)
         except msgspec.DecodeError as error:

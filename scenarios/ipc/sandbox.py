@@ -97,11 +97,10 @@ _FROM_DESCRIPTOR: Final = 4
 
 def _mount(kind: str, at: Path, flags: int, options: str = "") -> None:
     step = f"mount {kind} at {at}"
-    given = kind.encode(), os.fsencode(at), kind.encode(), flags, options.encode()
-    call(step, "mount", *given)
+    call(step, "mount", kind.encode(), os.fsencode(at), kind.encode(), flags, options.encode())
 
 
-# --- outside
+# --- outside of the sandbox
 
 
 def work_folder(sandbox: Sandbox) -> str:
@@ -117,7 +116,7 @@ def remove_work_folder(folder: str) -> None:
 
 def start(
     sandbox: Sandbox,
-    serves: str,
+    entry_point: str,
     descriptors: tuple[int, ...],
     folder: str,
     refuse: Callable[[socket.socket, str], None],
@@ -126,21 +125,21 @@ def start(
 
     Returns the wait status of the policy's process.
 
-    serves: function that it runs, as module:name.
+    entry_point: function that it runs, as module:name.
     descriptors: its arguments, first the socket, all that it inherits but its output.
     folder: of `work_folder`.
     refuse: reports on a socket that the sandbox cannot be set up, and why.
     """
-    heard, status = os.pipe()
-    waits, goes = os.pipe()
+    status_reader, status_writer = os.pipe()
+    go_reader, go_writer = os.pipe()
     child = os.fork()
     if child == 0:
-        for descriptor in (heard, goes):
+        for descriptor in (status_reader, go_writer):
             os.close(descriptor)
-        _set_up(sandbox, _Inside(serves, descriptors, folder, status), waits)
-    for descriptor in (status, waits, *descriptors[1:]):
+        _set_up(sandbox, _Inside(entry_point, descriptors, folder, status_writer), go_reader)
+    for descriptor in (status_writer, go_reader, *descriptors[1:]):
         os.close(descriptor)
-    ended = _watched(child, heard, goes, descriptors[0], refuse)
+    ended = _watched(child, status_reader, go_writer, descriptors[0], refuse)
     code = _status_of(child)
     return code if ended is None else ended
 
@@ -157,19 +156,25 @@ def _status_of(child: int) -> int:
 
 
 def _watched(
-    child: int, heard: int, goes: int, connection: int, refuse: Callable[[socket.socket, str], None]
+    child: int,
+    status_reader: int,
+    go_writer: int,
+    connection: int,
+    refuse: Callable[[socket.socket, str], None],
 ) -> int | None:
-    """Follow the set-up and then the policy, until its pipe is closed. Returns the wait status that
-    was reported."""
+    """Follow the set-up and then the policy, until its pipe is closed.
+
+    Returns the reported wait status; None if none was reported.
+    """
     ended = None
-    with open(heard, "rb") as said, socket.socket(fileno=connection) as ours:
-        for line in said:
+    with open(status_reader, "rb") as lines, socket.socket(fileno=connection) as ours:
+        for line in lines:
             word, _, rest = line.decode(errors="replace").strip().partition(" ")
             if word == "maps":
                 with suppress(OSError):  # without maps, the set-up fails
                     _write_maps(child)
-                    os.write(goes, b"!")
-                os.close(goes)
+                    os.write(go_writer, b"!")
+                os.close(go_writer)
             elif word == "failed":
                 refuse(ours, rest)
             elif word == "started":  # only the policy's process may hold the connection
@@ -191,7 +196,7 @@ def _write_maps(child: int) -> None:
         Path(f"/proc/{child}/{kind}_map").write_text("\n".join(lines))
 
 
-# --- inside
+# --- inside of the sandbox
 
 
 class _Inside(NamedTuple):
@@ -201,7 +206,7 @@ class _Inside(NamedTuple):
     begun: pipe that closes when Python starts, -1 for none.
     """
 
-    serves: str
+    entry_point: str
     descriptors: tuple[int, ...]
     folder: str
     status: int
@@ -211,14 +216,14 @@ class _Inside(NamedTuple):
         os.write(self.status, f"{words}\n".encode())
 
 
-def _set_up(sandbox: Sandbox, inside: _Inside, waits: int) -> NoReturn:
+def _set_up(sandbox: Sandbox, inside: _Inside, go_reader: int) -> NoReturn:
     """Set the sandbox up, and end or become the policy."""
     try:
         os.setsid()
         if platform.machine() not in seccomp.MACHINES:
             raise SandboxError(f"no table of system calls for {platform.machine()}")
         if sandbox.kind == "namespaces":
-            _enter_namespaces(sandbox, inside, waits)
+            _enter_namespaces(sandbox, inside, go_reader)
         else:
             _enter_landlock(sandbox, inside)
     except BaseException as error:  # noqa: BLE001  the process must end here
@@ -238,14 +243,14 @@ def _end_with_parent(inside: _Inside) -> None:
         os._exit(1)
 
 
-def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
+def _enter_namespaces(sandbox: Sandbox, inside: _Inside, go_reader: int) -> None:
     """Create the namespaces, and fork their first process."""
     user = _user()
     flags = _NEW_USER | _NEW_MOUNTS | _NEW_IPC | _NEW_PIDS | _NEW_NET
     call("create user, mount, PID, IPC and network namespaces", "unshare", flags)
     _end_with_parent(inside)
     inside.say("maps")
-    if not os.read(waits, 1):
+    if not os.read(go_reader, 1):
         raise SandboxError("map the user into the namespace: not permitted")
     first = os.fork()
     if first:
@@ -260,14 +265,14 @@ def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
     filter_calls(rules)
     # The policy may not see or trace the first process, which has this program's memory.
     prctl("forbid to be traced", DUMPABLE, 0)
-    waits, begun = os.pipe()
+    exec_reader, begun = os.pipe()
     policy = os.fork()
     if policy == 0:
         os.setsid()
         _limit(sandbox, PROCESSES)
         _exec(sandbox, sandbox.imports, inside._replace(begun=begun), _WORK)
     os.close(begun)
-    os.read(waits, 1)
+    os.read(exec_reader, 1)
     inside.say("started")
     _close_all_but({inside.status})
     inside.say(f"ended {_status_of(policy)}")
@@ -277,7 +282,7 @@ def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
 def _build_root(sandbox: Sandbox, user: int | None) -> None:
     """Replace the root folder by one in memory that has only what may be read."""
     call("make mounts private", "mount", b"none", b"/", None, _RECURSIVE | _PRIVATE, None)
-    held = [(path, _opened_tree(path)) for path in devices(gpu=True)]
+    device_trees = [(path, _opened_tree(path)) for path in devices(gpu=True)]
     root = Path("/dev")  # where all sources but the devices can be reached meanwhile
     _mount("tmpfs", root, _NO_SETUID | _NO_DEVICES, "mode=755,size=16m")
     for folder in ("tmp", "dev/shm", "proc"):
@@ -291,12 +296,12 @@ def _build_root(sandbox: Sandbox, user: int | None) -> None:
     leaves, links = visible(sandbox.reads)
     for path in leaves:
         _attach(_opened_tree(path), path, root)
-    for path, tree in held:
+    for path, tree in device_trees:
         _attach(tree, path, root, device=True)
     for path, target in links.items():
-        _there(path, root).parent.mkdir(parents=True, exist_ok=True)
-        _there(path, root).symlink_to(target)
-    work = _there(_WORK, root)
+        _below(path, root).parent.mkdir(parents=True, exist_ok=True)
+        _below(path, root).symlink_to(target)
+    work = _below(_WORK, root)
     work.mkdir(0o700)
     if user is not None:
         os.chown(work, user, user)
@@ -307,7 +312,7 @@ def _build_root(sandbox: Sandbox, user: int | None) -> None:
     _restrict_mount(_HERE, "/", _READ_ONLY, 0)
 
 
-def _there(path: Path, root: Path) -> Path:
+def _below(path: Path, root: Path) -> Path:
     """Return a path below another root."""
     return root / path.relative_to("/")
 
@@ -320,7 +325,7 @@ def _opened_tree(path: Path) -> int:
 
 def _attach(tree: int, path: Path, root: Path, *, device: bool = False) -> None:
     """Show what is at a path at the same path below another root, read-only."""
-    at = _there(path, root)
+    at = _below(path, root)
     at.parent.mkdir(parents=True, exist_ok=True)
     if stat.S_ISDIR(os.fstat(tree).st_mode):
         at.mkdir(exist_ok=True)
@@ -333,9 +338,9 @@ def _attach(tree: int, path: Path, root: Path, *, device: bool = False) -> None:
 
 
 def _restrict_mount(folder: int, path: str, attributes: int, flags: int) -> None:
-    given = ctypes.create_string_buffer(struct.pack("QQQQ", attributes, 0, 0, 0))
+    values = ctypes.create_string_buffer(struct.pack("QQQQ", attributes, 0, 0, 0))
     step = f"restrict the mount {path}"
-    call(step, "mount_setattr", folder, path.encode(), flags, given, 32)
+    call(step, "mount_setattr", folder, path.encode(), flags, values, 32)
 
 
 def _enter_landlock(sandbox: Sandbox, inside: _Inside) -> None:
@@ -382,8 +387,8 @@ def _landlock_rules(reads: list[Path], writes: list[Path], version: int) -> int:
     abstract sockets."""
     every = (1 << (16 if version >= 5 else 15)) - 1
     handled = [every, 3 if version >= 4 else 0, 3 if version >= 6 else 0]
-    given = struct.pack("QQQ", *handled)[: 24 if version >= 6 else 16 if version >= 4 else 8]
-    rules = call("make Landlock's rules", "landlock_create_ruleset", given, len(given), 0)
+    attributes = struct.pack("QQQ", *handled)[: 24 if version >= 6 else 16 if version >= 4 else 8]
+    rules = call("make Landlock's rules", "landlock_create_ruleset", attributes, len(attributes), 0)
     of_file = (_EXECUTE | _WRITE | _READ | _TRUNCATE | _DEVICE_CALLS) & every
     for path, rights in (
         *((path, _EXECUTE | _READ | _LIST) for path in reads),
@@ -411,7 +416,7 @@ def _threads_of_user() -> int:
     return count
 
 
-# --- both kinds
+# --- for both kinds of sandboxes
 
 
 def _user() -> int | None:
@@ -433,9 +438,9 @@ def _limit(sandbox: Sandbox, processes: int) -> None:
         resource.setrlimit(what, (least, least))
 
 
-def _close_all_but(kept: set[int]) -> None:
+def _close_all_but(exceptions: set[int]) -> None:
     last = -1
-    for descriptor in sorted(kept):
+    for descriptor in sorted(exceptions):
         if descriptor > last + 1:  # closerange takes an empty range for an endless one
             os.closerange(last + 1, descriptor)
         last = descriptor
@@ -451,15 +456,15 @@ def _environment(sandbox: Sandbox, work: Path) -> dict[str, str]:
 
 def _exec(sandbox: Sandbox, imports: tuple[str, ...], inside: _Inside, work: Path) -> NoReturn:
     """Become Python with the policy, with no descriptors but its output and its connection."""
-    module, _, function = inside.serves.partition(":")
-    given = inside.descriptors
+    module, _, function = inside.entry_point.partition(":")
+    arguments = inside.descriptors
     code = (
         f"import sys; sys.path[:] = {[str(work), *imports]!r}; from {module} import {function}; "
-        f"{function}{given!r}"
+        f"{function}{arguments!r}"
     )
-    kept = {0, 1, 2, *given}
-    _close_all_but({*kept, inside.status, inside.begun} - {-1})
-    for descriptor in kept:
+    inherited = {0, 1, 2, *arguments}
+    _close_all_but({*inherited, inside.status, inside.begun} - {-1})
+    for descriptor in inherited:
         os.set_inheritable(descriptor, True)
     os.chdir(work)
     python = sys.executable

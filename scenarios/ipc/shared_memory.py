@@ -42,31 +42,31 @@ class SharedMemory:
 
     @classmethod
     def new(cls, size: int = 0) -> Self:
-        """Create memory with a header and room for size bytes of arrays."""
+        """Create memory with a header and space for size bytes of arrays."""
         descriptor = os.memfd_create("cosim", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(descriptor, HEAD_BYTES + size)
         fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, _SEALS)
         return cls(descriptor)
 
-    def lay(self, arrays: dict[str, np.ndarray[Any, Any]]) -> dict[str, PackedArray]:
+    def write_arrays(self, arrays: dict[str, np.ndarray[Any, Any]]) -> dict[str, PackedArray]:
         """Write arrays over the last ones, and return their locations. Raises ValueError without
-        enough room."""
-        laid = {}
+        enough space."""
+        locations = {}
         at = HEAD_BYTES
         for name, array in arrays.items():
             flat = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
             if at + len(flat) > len(self.map):
                 raise ValueError(
-                    f"no room for {name} of shape {array.shape} in {len(self.map)} bytes"
+                    f"no space for {name} of shape {array.shape} in {len(self.map)} bytes"
                 )
             self.map[at : at + len(flat)] = flat.data
-            laid[name] = PackedArray(array.dtype.str, array.shape, at=at)
+            locations[name] = PackedArray(array.dtype.str, array.shape, at=at)
             at += -(-len(flat) // _ALIGNED_BYTES) * _ALIGNED_BYTES
-        return laid
+        return locations
 
-    def take(self, laid: dict[str, PackedArray]) -> dict[str, Any]:
+    def read_arrays(self, locations: dict[str, PackedArray]) -> dict[str, Any]:
         """Return copies of arrays. Raises ValueError for an invalid location."""
-        return {name: unpack_array(array, self.map) for name, array in laid.items()}
+        return {name: unpack_array(array, self.map) for name, array in locations.items()}
 
     @property
     def busy(self) -> bool:
@@ -85,10 +85,10 @@ class SharedMemory:
         self.map.close()
 
 
-def room_for(manifest: Manifest | None) -> int:
+def observation_bytes(manifest: Manifest | None) -> int:
     """Return the bytes of the largest observation by a manifest; 0 without one.
 
-    >>> room_for(None)
+    >>> observation_bytes(None)
     0
     """
     if manifest is None:

@@ -40,7 +40,7 @@ CHUNK_BYTES = 1 << 16
 """Bytes of output that are read at a time."""
 KILLING_S = 10.0
 """Timeout in seconds for the end of killed processes, which the kernel may delay."""
-PARTING_S = 3.0
+NESTED_END_S = 3.0
 """Seconds that a nested supervisor has to end its processes before it is killed."""
 STOPPED_S = 2.0
 """Seconds after which a worker that a signal has stopped is continued."""
@@ -50,14 +50,17 @@ _NAME = "cosim-keeper"
 """Name of supervisors."""
 
 
-def keep_worker(
-    serves: str, descriptors: tuple[int, ...], parent: int, sandbox: tuple[Any, ...] | None = None
+def supervise_worker(
+    entry_point: str,
+    descriptors: tuple[int, ...],
+    parent: int,
+    sandbox: tuple[Any, ...] | None = None,
 ) -> None:
     """Run one worker, and end with its exit code or signal.
 
     Its output goes to this process's standard output.
 
-    serves: function that the worker runs, as module:name.
+    entry_point: function that the worker runs, as module:name.
     descriptors: its arguments, first the socket to the run.
     parent: process id of the run.
     sandbox: values of the `Sandbox` in which it runs, if any.
@@ -66,21 +69,21 @@ def keep_worker(
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1)
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_NAME, _NAME.encode())
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    printed, prints = os.pipe()
+    output_reader, output_writer = os.pipe()
     supervisor = os.getpid()
-    boxed = None if sandbox is None else _Boxed(sandbox)
+    worker_sandbox = None if sandbox is None else _WorkerSandbox(sandbox)
     pid = os.fork()
     if pid == 0:
-        os.close(printed)
-        _begin_worker(prints, supervisor)
-        if boxed is not None:
-            _end_as(boxed.run(serves, descriptors))
-        module, _, function = serves.partition(":")
+        os.close(output_reader)
+        _begin_worker(output_writer, supervisor)
+        if worker_sandbox is not None:
+            _end_as(worker_sandbox.run(entry_point, descriptors))
+        module, _, function = entry_point.partition(":")
         getattr(importlib.import_module(module), function)(*descriptors)
         return
-    for descriptor in (*descriptors, prints):
+    for descriptor in (*descriptors, output_writer):
         os.close(descriptor)
-    log = threading.Thread(target=_copy, args=(printed, BoundedLog(1)), daemon=True)
+    log = threading.Thread(target=_copy, args=(output_reader, BoundedLog(1)), daemon=True)
     log.start()
     status = int(signal.SIGTERM)
     with suppress(_Ended):
@@ -89,8 +92,8 @@ def keep_worker(
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
     kill_children()
     log.join(KILLING_S)
-    if boxed is not None:
-        boxed.close()
+    if worker_sandbox is not None:
+        worker_sandbox.close()
     _end_as(status)
 
 
@@ -102,20 +105,20 @@ class BoundedLog:
 
     def __init__(self, descriptor: int, first: int = FIRST_BYTES, last: int = LAST_BYTES) -> None:
         self._descriptor = descriptor
-        self._room = first
+        self._first_left = first
         self._last = last
         self._tail: deque[bytes] = deque()
-        self._held = self._dropped = 0
+        self._tail_bytes = self._dropped = 0
 
     def write(self, text: bytes) -> None:
-        if self._room > 0:
-            self._put(text[: self._room])
-            text, self._room = text[self._room :], self._room - len(text)
+        if self._first_left > 0:
+            self._put(text[: self._first_left])
+            text, self._first_left = text[self._first_left :], self._first_left - len(text)
         if text:
             self._tail.append(text)
-            self._held += len(text)
-            while self._held - len(self._tail[0]) >= self._last:
-                self._held -= len(self._tail[0])
+            self._tail_bytes += len(text)
+            while self._tail_bytes - len(self._tail[0]) >= self._last:
+                self._tail_bytes -= len(self._tail[0])
                 self._dropped += len(self._tail.popleft())
 
     def close(self) -> None:
@@ -132,14 +135,14 @@ class BoundedLog:
 def kill_children() -> None:
     """Kill all descendants of this process, which become its children as their parents die.
 
-    Nested supervisors are requested to end first, and killed after PARTING_S. A process that takes
-    their name gains no more than that.
+    Nested supervisors are requested to end first, and killed after NESTED_END_S. A process that
+    takes their name gains no more than that.
     """
     began = time.monotonic()
     requested: set[int] = set()
     while (passed := time.monotonic() - began) < KILLING_S:
         for child, name in _children():
-            if name != _NAME or passed > PARTING_S:
+            if name != _NAME or passed > NESTED_END_S:
                 _send(child, signal.SIGKILL)
             elif child not in requested:
                 requested.add(child)
@@ -181,7 +184,7 @@ def _ended(number: int, frame: FrameType | None) -> None:
     raise _Ended
 
 
-class _Boxed:
+class _WorkerSandbox:
     """Sandbox of a worker, and its folder outside."""
 
     def __init__(self, values: tuple[Any, ...]) -> None:
@@ -191,11 +194,11 @@ class _Boxed:
         self._sandbox = Sandbox(*values)
         self._folder = work_folder(self._sandbox)
 
-    def run(self, serves: str, descriptors: tuple[int, ...]) -> int:
+    def run(self, entry_point: str, descriptors: tuple[int, ...]) -> int:
         """Run the worker inside; return its wait status."""
         from scenarios.ipc.sandbox import start
 
-        return start(self._sandbox, serves, descriptors, self._folder, _refuse)
+        return start(self._sandbox, entry_point, descriptors, self._folder, _refuse)
 
     def close(self) -> None:
         """Remove the folder."""
@@ -213,14 +216,14 @@ def _refuse(connection: socket, why: str) -> None:
         MessageSocket(connection).send(encode_message(Refusal("sandbox", why)))
 
 
-def _begin_worker(prints: int, supervisor: int) -> None:
+def _begin_worker(output_writer: int, supervisor: int) -> None:
     """Begin the worker in the forked child: its session, its end and its output."""
     os.setsid()
     exit_with_parent(supervisor)
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_NAME, b"cosim-worker")
-    os.dup2(prints, 1)
-    os.dup2(prints, 2)
-    os.close(prints)
+    os.dup2(output_writer, 1)
+    os.dup2(output_writer, 2)
+    os.close(output_writer)
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
 
 
@@ -239,9 +242,9 @@ def _status_of(pid: int) -> int:
             return status
 
 
-def _copy(printed: int, log: BoundedLog) -> None:
+def _copy(output_reader: int, log: BoundedLog) -> None:
     """Copy a pipe to a log until it is closed."""
-    while text := os.read(printed, CHUNK_BYTES):
+    while text := os.read(output_reader, CHUNK_BYTES):
         log.write(text)
     log.close()
 

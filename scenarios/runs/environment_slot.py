@@ -132,15 +132,15 @@ class EnvironmentSlot:
             self.start()
         else:
             self._watchdog.process.give(job)
-            self._given_s = self._watchdog.heard_s = time.monotonic()
+            self._given_s = self._watchdog.last_message_s = time.monotonic()
 
-    def poll(self, hear: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> Failure | None:
         """Pass on messages about the job, enforce deadlines, and return the failure of the job if
         it has failed."""
         watchdog = self._watchdog
         if watchdog is None:
             return None
-        end = watchdog.poll(partial(self._take, hear), idle=watchdog.ready and self.job is None)
+        end = watchdog.poll(partial(self._take, handle), idle=watchdog.ready and self.job is None)
         if watchdog.ready:
             self._failed_starts = 0
         reported, self._reported = self._reported, None
@@ -174,7 +174,7 @@ class EnvironmentSlot:
         if watchdog is not None:
             watchdog.process.end()
 
-    def _take(self, hear: MessageHandler, message: Message) -> None:
+    def _take(self, handle: MessageHandler, message: Message) -> None:
         if self.job is None:
             return
         if isinstance(message, Repeated) or (isinstance(message, Done) and self._must_ask(message)):
@@ -183,7 +183,7 @@ class EnvironmentSlot:
         if isinstance(message, Done | LostRenderer):
             self.job = None
             self._ran = True
-        hear(message)
+        handle(message)
 
     def _must_ask(self, done: Done) -> bool:
         """Return whether a result is the last attempt's engine error, so that its cause must be
@@ -251,8 +251,8 @@ class EnvironmentSlot:
             return self._judged(end.words, end.driven, killed=not end.in_engine)
         idle = (
             self._ran
-            and watchdog.heard_s <= self._given_s
-            and end.question is None
+            and watchdog.last_message_s <= self._given_s
+            and end.pending_call is None
             and not end.hung
         )
         if end.allowed_s is not None or (watchdog.ready and not idle and self.job is not None):
@@ -265,24 +265,24 @@ class EnvironmentSlot:
         return None
 
     def _failure(self, job: Job | None, end: ProcessEnd) -> Failure:
-        if end.allowed_s is None or end.question is None:
+        if end.allowed_s is None or end.pending_call is None:
             if end.in_policy:
                 return Failure("policy_ended", end.words)
             return Failure("engine_failed" if end.in_engine else "process_ended", end.words)
         words = no_answer(self._hello, end.allowed_s)
-        if end.question.doing == "loading" or job is None:
+        if end.pending_call.kind == "loading" or job is None:
             raise UsageError(
                 f"{words} while it was loaded in an environment process: give a longer "
                 f"--start-timeout"
             )
-        return Failure("policy_timeout", f"{words} in {end.question.when} of {job.scenario.id}")
+        return Failure("policy_timeout", f"{words} in {end.pending_call.when} of {job.scenario.id}")
 
     def _count_failed_start(self, end: ProcessEnd) -> None:
         self._failed_starts += 1
         if self._failed_starts < STARTS:
             return
         words = f"{end.words} before it was ready, {STARTS} times: see {self.log}"
-        if end.question is not None:
+        if end.pending_call is not None:
             raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {words}")
         raise MachineError(f"{words}, and `cosim doctor`")
 

@@ -42,21 +42,24 @@ class PolicyServerBusy(PolicyServerLost):
 
 
 class RequestCarrier(Protocol):
-    """Carrier of requests to a policy. loses: whether the policy's side can lose an episode."""
+    """Carrier of requests to a policy.
+
+    can_lose_episodes: whether the policy's side can lose an episode.
+    """
 
     @property
-    def loses(self) -> bool: ...
+    def can_lose_episodes(self) -> bool: ...
 
-    def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
+    def pack(self, arrays: Arrays) -> dict[str, PackedArray]:
         """Pack the arrays of the next request."""
 
-    def ask(self, question: ResetRequest | ActRequest) -> bytes:
+    def exchange(self, request: ResetRequest | ActRequest) -> bytes:
         """Return the reply to a request.
 
         Raises PolicyFault if none will come, an EngineError if that is not the policy's fault.
         """
 
-    def report_ended(self, question: EndRequest) -> None:
+    def report_ended(self, request: EndRequest) -> None:
         """Report the end of an episode. Raises the same errors."""
 
     def close(self) -> None:
@@ -91,9 +94,9 @@ class HostedPolicy:
         self._step += 1
         fields, arrays = encoded_fields(seen)
         about = encoded_about(seen) if self._step == 0 else None
-        laid = self._carrier.lay(arrays)
+        locations = self._carrier.pack(arrays)
         answer = self._reply(
-            ActRequest(*self._sign, self._step, **fields, arrays=laid, about=about)
+            ActRequest(*self._sign, self._step, **fields, arrays=locations, about=about)
         )
         assert isinstance(answer, ActReply)
         self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
@@ -116,21 +119,21 @@ class HostedPolicy:
     def close(self) -> None:
         self._carrier.close()
 
-    def _reply(self, question: ResetRequest | ActRequest) -> EpisodeReply | ActReply:
+    def _reply(self, request: ResetRequest | ActRequest) -> EpisodeReply | ActReply:
         """Return the reply to a request. Raises PolicyFault for errors of the policy,
         PolicyServerLost for a lost episode."""
-        payload = self._carrier.ask(question)
+        payload = self._carrier.exchange(request)
         try:
             reply: PolicyReply = decode_reply(payload)
         except UNREADABLE as error:
             raise PolicyFault(f"sent what is no answer: {error}"[:LONGEST_MESSAGE]) from None
         if isinstance(reply, Refusal):
             fault = PolicyFault(reply.words, reply.during, reply.together)
-            if not self._carrier.loses or reply.why not in ("unknown", "busy"):
+            if not self._carrier.can_lose_episodes or reply.why not in ("unknown", "busy"):
                 raise fault
             lost = PolicyServerBusy if reply.why == "busy" else PolicyServerLost
             raise lost(f"the server of policy '{self.manifest.name}': {fault.words}")
-        wanted = EpisodeReply if isinstance(question, ResetRequest) else ActReply
+        wanted = EpisodeReply if isinstance(request, ResetRequest) else ActReply
         step = reply.step if isinstance(reply, ActReply) else -1
         if not isinstance(reply, wanted) or reply.signature != self._sign or step != self._step:
             said = f"answered step {step} of '{reply.episode}' when it was asked step {self._step}"

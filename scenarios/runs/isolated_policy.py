@@ -43,13 +43,13 @@ from cosim.spec.run_config import Isolation
 from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.sandbox import KINDS, Sandbox
-from scenarios.ipc.shared_memory import SharedMemory, room_for
+from scenarios.ipc.shared_memory import SharedMemory, observation_bytes
 from scenarios.ipc.surroundings import Surroundings, end_at_once
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 from scenarios.runs.policy_view import name_inside, sandbox_for
 
-_SERVES: Final = "scenarios.runs.isolated_policy:serve_alone"
-_SERVES_INSIDE: Final = "scenarios.runs.isolated_policy:serve_inside"
+_ENTRY_POINT: Final = "scenarios.runs.isolated_policy:serve_alone"
+_ENTRY_POINT_IN_SANDBOX: Final = "scenarios.runs.isolated_policy:serve_inside"
 """The functions of the policy's process, without and with a sandbox."""
 _RUNS: Final[dict[Isolation, PolicyProcess]] = {
     "namespaces": "isolated: namespaces",
@@ -68,17 +68,17 @@ _MOST_BYTES: Final = 4 << 20
 class _PolicyProcess:
     """Carrier of requests to a child process.
 
-    room: bytes for the arrays of an observation.
+    memory_bytes: bytes for the arrays of an observation.
     sandbox: None for the weak kind.
     """
 
-    loses = False
+    can_lose_episodes = False
 
-    def __init__(self, name: str, room: int, sandbox: Sandbox | None) -> None:
-        self._memory = SharedMemory.new(room)
-        serves = _SERVES if sandbox is None else _SERVES_INSIDE
-        also = (self._memory.descriptor,)
-        self._process = ChildProcess(None, serves, "policy", also, _MOST_BYTES, sandbox)
+    def __init__(self, name: str, memory_bytes: int, sandbox: Sandbox | None) -> None:
+        self._memory = SharedMemory.new(memory_bytes)
+        entry_point = _ENTRY_POINT if sandbox is None else _ENTRY_POINT_IN_SANDBOX
+        descriptors = (self._memory.descriptor,)
+        self._process = ChildProcess(None, entry_point, "policy", descriptors, _MOST_BYTES, sandbox)
         self._process.send(name.encode())
         self._open = True
 
@@ -95,20 +95,20 @@ class _PolicyProcess:
         except (EOFError, OSError):
             raise self._dead() from None
 
-    def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
-        return self._memory.lay(arrays)
+    def pack(self, arrays: Arrays) -> dict[str, PackedArray]:
+        return self._memory.write_arrays(arrays)
 
-    def ask(self, question: ResetRequest | ActRequest | EndRequest) -> bytes:
-        if isinstance(question, ResetRequest):
+    def exchange(self, request: ResetRequest | ActRequest | EndRequest) -> bytes:
+        if isinstance(request, ResetRequest):
             self._process.wake()  # the policy may have stopped its supervisor
         try:
-            self._process.wire.send(encode_message(question))
+            self._process.wire.send(encode_message(request))
             return self._process.wire.receive()
         except (EOFError, OSError):
             raise self._dead() from None
 
-    def report_ended(self, question: EndRequest) -> None:
-        self.ask(question)
+    def report_ended(self, request: EndRequest) -> None:
+        self.exchange(request)
 
     def close(self) -> None:
         if self._open:
@@ -182,7 +182,7 @@ def _driver(
     """Load a policy with one kind of sandbox. Raises _NoSandbox, UsageError."""
     sandbox = None if kind == "weak" else sandbox_for(name, kind, host)
     with ExitStack() as stack, policy_call("loading", timer=timer, passes=(BaseException,)):
-        process = _PolicyProcess(name_inside(name), room_for(expected), sandbox)
+        process = _PolicyProcess(name_inside(name), observation_bytes(expected), sandbox)
         stack.callback(process.close)
         try:
             info = process.info(start_s if timer is None else None)

@@ -62,14 +62,14 @@ class Lease:
         """Note that the worker is lost, with all that runs on its machine."""
         self._lost = self._lost or why
 
-    def poll(self, hear: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> Failure | None:
         """Pass on reported messages. Returns the failure of the job if it has failed or its worker
         is lost."""
         while self._reports and not self.ended:
             report = self._reports.popleft()
             for message in report.messages:
                 if isinstance(message, Done) or getattr(message, "scenario", "") == self.scenario:
-                    hear(message)
+                    handle(message)
             self.ended = report.ends
             report.answer(Reply("kept" if self.ended else "renewed"))
             if report.failure is not None:

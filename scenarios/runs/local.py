@@ -82,12 +82,12 @@ class _ThisProcess:
     def give(self, job: Job) -> None:
         self._job = job
 
-    def poll(self, hear: MessageHandler) -> None:
+    def poll(self, handle: MessageHandler) -> None:
         job = self._job
         self._job = None
         if job is not None:
-            done, _ = run_job(job, self._driver, hear)
-            hear(done)
+            done, _ = run_job(job, self._driver, handle)
+            handle(done)
 
     def cancel(self) -> None:
         """Do nothing: nothing else runs while it works."""

@@ -101,24 +101,27 @@ def inspected_driver(
 class _RendererCarrier:
     """Carrier of requests to the shared renderer, which has the picture already."""
 
-    loses = False
+    can_lose_episodes = False
 
     def __init__(self, address: str) -> None:
         self._address = address
         self._link: RendererLink | None = None
 
-    def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
+    def pack(self, arrays: Arrays) -> dict[str, PackedArray]:
         link = self._linked()
-        return {name: link.laid(name, array) or pack_array(array) for name, array in arrays.items()}
+        return {
+            name: link.location_of(name, array) or pack_array(array)
+            for name, array in arrays.items()
+        }
 
-    def ask(self, question: ResetRequest | ActRequest) -> bytes:
-        if isinstance(question, ActRequest):
-            return self._linked().exchange(question, when("act", question.tick))
+    def exchange(self, request: ResetRequest | ActRequest) -> bytes:
+        if isinstance(request, ActRequest):
+            return self._linked().exchange(request, when("act", request.tick))
         self._link = link_to(self._address)
-        return self._link.exchange(question, "reset")
+        return self._link.exchange(request, "reset")
 
-    def report_ended(self, question: EndRequest) -> None:
-        self._linked().tell(question)
+    def report_ended(self, request: EndRequest) -> None:
+        self._linked().send(request)
 
     def close(self) -> None:
         """Nothing to release: the connection lasts as long as the process."""

@@ -50,7 +50,7 @@ def run_all(
     hello: Hello,
     transport: Transport,
     *,
-    tell: MessageHandler,
+    handle: MessageHandler,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     renderer: SharedRenderer | None = None,
     over: Callable[[], bool] = lambda: False,
@@ -59,7 +59,7 @@ def run_all(
     folder.
 
     hello: introduces the policy as it was loaded here.
-    tell: called with the messages about the episodes.
+    handle: called with the messages about the episodes.
     renderer: draws for all episodes; the caller ends it.
     over: whether no further episode is to begin; those that run are finished.
 
@@ -68,7 +68,7 @@ def run_all(
     if renderer is not None:
         hello = msgspec.structs.replace(hello, renderer=renderer.at)
     queue = _AttemptQueue(folder, scenarios)
-    pool = _Pool(folder, queue, hello, transport, options, tell, renderer)
+    pool = _Pool(folder, queue, hello, transport, options, handle, renderer)
     log_event("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
         while pool.busy or (queue and not over()):
@@ -91,7 +91,7 @@ class _Pool:
         hello: Hello,
         transport: Transport,
         options: EpisodeOptions,
-        tell: MessageHandler,
+        handle: MessageHandler,
         renderer: SharedRenderer | None,
     ) -> None:
         self._folder = folder
@@ -99,7 +99,7 @@ class _Pool:
         self._hello = hello
         self._transport = transport
         self._options = options
-        self._tell = tell
+        self._handle = handle
         self._renderer = renderer
         self._setup = msgspec.structs.replace(folder.spec.setup, renderer=NO_RENDERER)
         self._workers: dict[Worker, Scenario | None] = {}
@@ -172,7 +172,7 @@ class _Pool:
         if isinstance(message, FrameDrawn):
             self._folder.write_frame(message.scenario, message.tick, message.png)
         elif not isinstance(message, Done | LostRenderer):
-            self._tell(message)
+            self._handle(message)
         else:
             self._workers[worker] = None
             if isinstance(message, Done):
@@ -278,7 +278,7 @@ class _Pool:
         log_event("done", scenario=scenario.id, status=status)
         if self._renderer is not None:
             self._renderer.episode_ended()
-        self._tell(Done(scenario.id, status))
+        self._handle(Done(scenario.id, status))
 
 
 class _GivenUp(NamedTuple):

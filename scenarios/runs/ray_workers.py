@@ -91,10 +91,10 @@ def ray_carrier(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[T
     jobs: number of workers, by default one for each CPU."""
 
     @contextmanager
-    def reached(run: HeldRun, tell: MessageHandler) -> Iterator[tuple[Transport, MessageHandler]]:
+    def reached(run: HeldRun, handle: MessageHandler) -> Iterator[tuple[Transport, MessageHandler]]:
         workers = RayWorkers(run.held.spec, run.held.path / "logs", jobs, len(run.todo), say)
         say(f"{workers.wanted} workers on Ray")
-        yield workers, tell
+        yield workers, handle
 
     with ray_cluster(on, policy, say):
         yield reached
@@ -266,7 +266,7 @@ class _RayWorker:
         self._lease = Lease(Path(self.log).stem, self._leases, LEASE_S, job.scenario.id)
         self._actor.give.remote(*self._packed(job))
 
-    def poll(self, hear: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> Failure | None:
         while not self.ended and self._ray.wait([self.pending], timeout=0)[0]:
             try:
                 report: SlotReport = self._ray.get(self.pending)
@@ -279,7 +279,7 @@ class _RayWorker:
             self._take(report)
         if self._lease is None:
             return None
-        failure = self._lease.poll(hear)
+        failure = self._lease.poll(handle)
         if self._lease.ended:
             self._lease = None
         if failure is not None and failure.fault == "machine_lost":

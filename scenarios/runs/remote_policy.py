@@ -40,7 +40,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import PolicyHost, PolicyProcess
 from scenarios.ipc.deadlines import ServerTimes
 from scenarios.ipc.observation_codec import Arrays
-from scenarios.ipc.shared_memory import room_for
+from scenarios.ipc.shared_memory import observation_bytes
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy, PolicyServerBusy
 
 DOMAIN: Final = "default"
@@ -67,7 +67,7 @@ class _Server(NamedTuple):
 class PolicyServers:
     """Carrier of requests to the servers of a policy; each episode uses one of them."""
 
-    loses = True
+    can_lose_episodes = True
 
     def __init__(self, name: str, host: PolicyHost, times: ServerTimes = ServerTimes()) -> None:  # noqa: B008
         self.name = name
@@ -106,7 +106,7 @@ class PolicyServers:
         random.shuffle(same)
         self._server = min(same, key=lambda one: one.info.under_way)
 
-    def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
+    def pack(self, arrays: Arrays) -> dict[str, PackedArray]:
         return {
             name: _as_jpeg(array)
             if self._jpeg and name.rpartition("/")[2] == "rgb"
@@ -114,10 +114,10 @@ class PolicyServers:
             for name, array in arrays.items()
         }
 
-    def ask(self, question: ResetRequest | ActRequest) -> bytes:
+    def exchange(self, request: ResetRequest | ActRequest) -> bytes:
         unreached_since_s = None
         while True:
-            how, payload = self._send(question, self.times.try_s)
+            how, payload = self._send(request, self.times.try_s)
             if how in ("answered", "refused"):
                 return payload
             now_s = time.monotonic()
@@ -130,18 +130,18 @@ class PolicyServers:
                 raise self._lost()
             time.sleep(self.times.pause_s)
 
-    def report_ended(self, question: EndRequest) -> None:
-        if self._send(question, self.times.end_s)[0] not in ("answered", "refused"):
+    def report_ended(self, request: EndRequest) -> None:
+        if self._send(request, self.times.end_s)[0] not in ("answered", "refused"):
             raise self._lost()
 
     def _send(
-        self, question: ResetRequest | ActRequest | EndRequest, timeout_s: float
+        self, request: ResetRequest | ActRequest | EndRequest, timeout_s: float
     ) -> tuple[str, bytes]:
         """Send a request once. Returns the outcome and the reply."""
         assert self._server is not None
-        kind = str(question.__struct_config__.tag)
+        kind = str(request.__struct_config__.tag)
         key = f"{policy_key(DOMAIN, self.name, self._server.info.server)}/{kind}"
-        reply = self._server.session.ask_once(key, encode_message(question), timeout_s=timeout_s)
+        reply = self._server.session.ask_once(key, encode_message(request), timeout_s=timeout_s)
         return reply.how, reply.payload
 
     def _lost(self) -> PolicyServerLost:
@@ -259,7 +259,7 @@ def _check(name: str, manifest: Manifest) -> None:
             f"policy '{name}' is told what the simulator knows (privileged), and a remote "
             f"one sees only observations"
         )
-    if (size := room_for(manifest)) > LARGEST_MESSAGE_BYTES:
+    if (size := observation_bytes(manifest)) > LARGEST_MESSAGE_BYTES:
         raise UsageError(
             f"policy '{name}' asks for {size / 2**20:.0f} MiB of pictures a step, and a message "
             f"holds {LARGEST_MESSAGE_BYTES / 2**20:.0f} MiB: ask for smaller or fewer ones"

@@ -51,7 +51,7 @@ from scenarios.ipc.render_protocol import (
     decode_request,
     encode_exchange,
 )
-from scenarios.ipc.shared_memory import SharedMemory, room_for
+from scenarios.ipc.shared_memory import SharedMemory, observation_bytes
 from scenarios.places.nets import make_surface, place
 from scenarios.runs.worker import load_run_policy, send_to_run
 
@@ -75,13 +75,13 @@ def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire = MessageSocket(socket.socket(fileno=pipe))
-    say = partial(send_to_run, wire, os.getpid())
+    send = partial(send_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     assert hello.renderer is not None
     desk = None
     if hello.renderer.asks:
         timer = PendingCallMemory(pending_call)
-        policy = load_run_policy(hello, timer, say).policy
+        policy = load_run_policy(hello, timer, send).policy
         desk = PolicyDesk(policy, decoder=ObservationDecoder, timer=timer, forget_after_s=inf)
     with ExitStack() as stack:
         atlas = None
@@ -93,7 +93,9 @@ def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
             atlas = stack.enter_context(Atlas(spec, appearance))
             drawn_by = renderer_of("gl", appearance)
         rendered = Rendered(hello.renderer.number, drawn_by)
-        renderer = _Renderer(rendered, room_for(hello.manifest), atlas, desk, partial(say, Ready()))
+        renderer = _Renderer(
+            rendered, observation_bytes(hello.manifest), atlas, desk, partial(send, Ready())
+        )
         renderer.serve(socket.socket(fileno=listening), pipe)
 
 
@@ -106,9 +108,9 @@ class _Environment:
     asks_next: whether its next request is to the policy, with the picture that it has.
     """
 
-    def __init__(self, end: socket.socket, room: int) -> None:
+    def __init__(self, end: socket.socket, memory_bytes: int) -> None:
         self.wire = MessageSocket(end)
-        self.memory = SharedMemory.new(room)
+        self.memory = SharedMemory.new(memory_bytes)
         self.began: ResetRequest | None = None
         self.seat: SeatKey | None = None
         self.wants: Draw | ResetRequest | ActRequest | None = None
@@ -139,20 +141,20 @@ class _Renderer:
     """Server of the environments of a run.
 
     rendered: reply to Enter.
-    room: bytes of an observation.
+    memory_bytes: bytes of an observation.
     beat: sends a heartbeat to the run.
     """
 
     def __init__(
         self,
         rendered: Rendered,
-        room: int,
+        memory_bytes: int,
         atlas: Atlas | None,
         desk: PolicyDesk | None,
         beat: Callable[[], None],
     ) -> None:
         self._rendered = rendered
-        self._room = room
+        self._memory_bytes = memory_bytes
         self._atlas = atlas
         self._desk = desk
         self._beat = beat
@@ -195,7 +197,7 @@ class _Renderer:
         if _PEER.unpack(peer)[1] != os.getuid():
             end.close()
             return
-        one = _Environment(end, self._room)
+        one = _Environment(end, self._memory_bytes)
         self._environments.append(one)
         self._selector.register(end, selectors.EVENT_READ, partial(self._hear, one))
 
@@ -303,9 +305,9 @@ class _Renderer:
             return
         for one, frame in zip(which, frames, strict=True):
             assert frame.labels is not None
-            laid = one.memory.lay({"rgb": frame.rgb, "labels": frame.labels})
+            locations = one.memory.write_arrays({"rgb": frame.rgb, "labels": frame.labels})
             one.asks_next = self._desk is not None
-            one.reply(msgspec.structs.replace(self._rendered, arrays=laid))
+            one.reply(msgspec.structs.replace(self._rendered, arrays=locations))
 
     def _ask(self, which: list[_Environment]) -> None:
         """Query the policy for environments together."""

@@ -229,8 +229,8 @@ def execute_run(
         create_transport = stack.enter_context(carrier or _workers(plan, given, reporter))
         plan = stack.enter_context(_connected(plan, folder, ends, reporter))
         held = stack.enter_context(held_run(plan, folder))
-        with reporter.running(plan, held) as hear:
-            _run_todo(plan, held, create_transport, hear)
+        with reporter.running(plan, held) as handle:
+            _run_todo(plan, held, create_transport, handle)
         return held.held.finish()
 
 
@@ -407,15 +407,15 @@ def _workers(plan: PlannedRun, given: RunObjects | None, reporter: Reporter) -> 
 
 
 def _by_processes(
-    jobs: int, run: HeldRun, tell: MessageHandler
+    jobs: int, run: HeldRun, handle: MessageHandler
 ) -> AbstractContextManager[tuple[LocalProcesses, MessageHandler]]:
-    return nullcontext((LocalProcesses(run.held.path / "logs", jobs), tell))
+    return nullcontext((LocalProcesses(run.held.path / "logs", jobs), handle))
 
 
 def _in_this_process(
-    driver: PolicyCaller, run: HeldRun, tell: MessageHandler
+    driver: PolicyCaller, run: HeldRun, handle: MessageHandler
 ) -> AbstractContextManager[tuple[InProcess, MessageHandler]]:
-    return nullcontext((InProcess(driver), tell))
+    return nullcontext((InProcess(driver), handle))
 
 
 @contextmanager
@@ -466,7 +466,7 @@ def _live(connection: Connection | None, named: str) -> Iterator[LiveAddress | N
 
 
 def _run_todo(
-    plan: PlannedRun, run: HeldRun, create_transport: TransportFactory, tell: MessageHandler
+    plan: PlannedRun, run: HeldRun, create_transport: TransportFactory, handle: MessageHandler
 ) -> None:
     """Run the episodes without a result. Raises MachineError, UsageError."""
     if not run.todo:
@@ -482,13 +482,13 @@ def _run_todo(
                 appearance=plan.options.appearance,
             )
             stack.enter_context(renderer)
-        transport, tell = stack.enter_context(create_transport(run, tell))
+        transport, handle = stack.enter_context(create_transport(run, handle))
         run_all(
             run.held,
             run.todo,
             run.hello,
             transport,
-            tell=tell,
+            handle=handle,
             options=plan.options,
             renderer=renderer,
         )

@@ -29,7 +29,7 @@ _SILENCE_S: Final = 120.0
 """Timeout in seconds of a renderer's heartbeats while no policy call is pending."""
 _ENDING_S: Final = 5.0
 """Longest time in seconds between an environment's notice of a renderer's end and the run's."""
-_SERVES: Final = "scenarios.runs.renderer:serve_pictures"
+_ENTRY_POINT: Final = "scenarios.runs.renderer:serve_pictures"
 """The function of the renderer's process."""
 
 
@@ -94,8 +94,8 @@ class SharedRenderer:
             return
         if (
             end.allowed_s is not None
-            and end.question is not None
-            and end.question.doing == "loading"
+            and end.pending_call is not None
+            and end.pending_call.kind == "loading"
         ):
             raise UsageError(
                 f"policy '{self._hello.manifest.name}' gave no answer for {end.allowed_s:g} s "
@@ -104,7 +104,7 @@ class SharedRenderer:
         self._replace(
             self._watchdog,
             RendererEnd(end.words, end.allowed_s),
-            blames_policy=end.question is not None,
+            blames_policy=end.pending_call is not None,
         )
 
     def end_of(self, number: int) -> RendererEnd | None:
@@ -131,7 +131,7 @@ class SharedRenderer:
 
     def _start(self) -> None:
         log = self._logs / f"renderer-{len(self._ends)}.log"
-        process = ChildProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
+        process = ChildProcess(log, _ENTRY_POINT, "renderer", (self._listening.fileno(),))
         at = msgspec.structs.replace(self.at, number=len(self._ends) + 1)
         process.send(encode_message(msgspec.structs.replace(self._hello, renderer=at)))
         self._watchdog = Watchdog(process, self._hello.patience, _SILENCE_S)

@@ -116,14 +116,14 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
 class WorkerRegistry:
     """Registry of the workers of one run, whose folder is locked by this process.
 
-    tell: progress callback of the run.
+    handle: progress callback of the run.
     """
 
     def __init__(
-        self, held: RunFolder, scenarios: Sequence[Scenario], finished: int, tell: MessageHandler
+        self, held: RunFolder, scenarios: Sequence[Scenario], finished: int, handle: MessageHandler
     ) -> None:
         self._held = held
-        self._tell = tell
+        self._handle = handle
         self._lengths_m = {one.id: max(one.route_line.length_m, 1.0) for one in scenarios}
         self._before = finished
         self._finished = finished
@@ -139,10 +139,10 @@ class WorkerRegistry:
         """Whether a worker is connected."""
         return any(one.connected for one in self._workers.values())
 
-    def tell(self, message: Message) -> None:
+    def handle(self, message: Message) -> None:
         """Pass on a message about an episode."""
         self._finished += isinstance(message, Done)
-        self._tell(message)
+        self._handle(message)
 
     def claimed(self, worker: str, host: str, slot: int) -> None:
         """Note that a slot of a worker has no job."""

@@ -30,7 +30,7 @@ class Worker(Protocol):
     def give(self, job: Job) -> None:
         """Send it a job."""
 
-    def poll(self, hear: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> Failure | None:
         """Pass on the messages that have arrived, without waiting; return the failure of its job if
         it has failed."""
 

@@ -69,18 +69,18 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
     run then replaces."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire = MessageSocket(socket(fileno=socket_descriptor))
-    say = partial(send_to_run, wire, os.getpid())
+    send = partial(send_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
-    _import_engines(say)
+    _import_engines(send)
     timer = PendingCallMemory(call_descriptor)
     commands = CommandLog(timer)
     if hello.repeat is not None:
-        with _load_errors_sent(say):
-            say(repeat_job(hello, commands, say))
+        with _load_errors_sent(send):
+            send(repeat_job(hello, commands, send))
     home = _working_folder()
-    drivers: WorkerDrivers | None = load_drivers(hello, timer, say)
+    drivers: WorkerDrivers | None = load_drivers(hello, timer, send)
     surroundings = Surroundings.now()
-    say(Ready())
+    send(Ready())
     while True:
         try:
             job = decode_job(wire.receive())
@@ -94,11 +94,11 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
             drivers = drivers or load_drivers(hello, timer, ignore_message, again=True)
         except (UsageError, MachineError):
             break  # a new process says whether the policy can be loaded there, and runs the job
-        done, failed = _run(job, drivers, say, hello, commands)
+        done, failed = _run(job, drivers, send, hello, commands)
         if failed or drivers.spent:
             drivers.close()
             drivers = None  # loaded again for the next job
-        say(done)
+        send(done)
         engine_failed = failed and isinstance(done, Done) and done.status == "invalid"
         if engine_failed or Surroundings.now() != surroundings:
             break  # a policy has changed the process; the run starts another one
@@ -106,12 +106,12 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
 
 
 def _run(
-    job: Job, drivers: WorkerDrivers, say: MessageHandler, hello: Hello, commands: CommandLog
+    job: Job, drivers: WorkerDrivers, send: MessageHandler, hello: Hello, commands: CommandLog
 ) -> tuple[Done | LostRenderer, bool]:
     """Run one episode as `run_job`. What the machine lacks, the policy may have taken away: this is
     an engine error, and a replay without the policy finds out."""
     try:
-        return run_job(job, drivers.policy, say, drivers.learner, hello.renderer, commands)
+        return run_job(job, drivers.policy, send, drivers.learner, hello.renderer, commands)
     except MachineError as lack:
         print(f"--- {job.scenario.id}\n{lack}", file=sys.stderr, flush=True)
         setup = job.setup or RunSetup.of(job.options)
@@ -132,12 +132,12 @@ def _working_folder() -> Path:
         return Path("/")
 
 
-def _import_engines(say: MessageHandler) -> None:
+def _import_engines(send: MessageHandler) -> None:
     """Import the engines. An error is sent to the run, and ends the process."""
     try:
         import scenarios.episodes.run_episode  # noqa: F401  engines print a greeting on import
     except (ImportError, OSError) as error:
-        say(
+        send(
             Unable(
                 f"{CANNOT_START} {error_text(error)}. `cosim doctor` says more", blames_policy=False
             )
@@ -145,7 +145,7 @@ def _import_engines(say: MessageHandler) -> None:
         raise
 
 
-def repeat_job(hello: Hello, commands: CommandLog, say: MessageHandler) -> Repeated:
+def repeat_job(hello: Hello, commands: CommandLog, send: MessageHandler) -> Repeated:
     """Simulate the commands of a failed episode again, without the policy.
 
     Raises MachineError if the machine lacks something.
@@ -156,7 +156,7 @@ def repeat_job(hello: Hello, commands: CommandLog, say: MessageHandler) -> Repea
     assert hello.repeat is not None
     job = hello.repeat.job
     name = job.scenario.id
-    say(Waits(name, "its commands run again without the policy"))
+    send(Waits(name, "its commands run again without the policy"))
     if job.net_hash:
         check_place(job.scenario.place, job.net_hash)
     commands.begins()
@@ -169,7 +169,7 @@ def repeat_job(hello: Hello, commands: CommandLog, say: MessageHandler) -> Repea
         renderer=hello.renderer,
         log=commands,
         watches=[_noted(commands)],
-        waiting=lambda reason, _=None: say(Waits(name, reason)),
+        waiting=lambda reason, _=None: send(Waits(name, reason)),
     )
     commands.ends()
     return Repeated(name, replayed.record.encoded(), replayed.error)
@@ -198,7 +198,7 @@ class WorkerDrivers:
 
 
 def load_drivers(
-    hello: Hello, timer: PendingCallMemory, say: MessageHandler, *, again: bool = False
+    hello: Hello, timer: PendingCallMemory, send: MessageHandler, *, again: bool = False
 ) -> WorkerDrivers:
     """Load the drivers of a worker, with the checks of `load_run_policy`."""
     if hello.renderer is not None and hello.renderer.asks:
@@ -206,15 +206,15 @@ def load_drivers(
             hello.manifest, hello.source_hash, hello.renderer, hello.host.run
         )
     else:
-        driver = load_run_policy(hello, timer, say, again=again)
+        driver = load_run_policy(hello, timer, send, again=again)
     if (learner := hello.learner) is None:
         return WorkerDrivers(driver, None)
-    with _load_errors_sent(say):
+    with _load_errors_sent(send):
         return WorkerDrivers(driver, _checked(load_policy(learner.policy, timer), learner, again))
 
 
 def load_run_policy(
-    hello: Hello, timer: PendingCallMemory, say: MessageHandler, *, again: bool = False
+    hello: Hello, timer: PendingCallMemory, send: MessageHandler, *, again: bool = False
 ) -> PolicyCaller:
     """Load the policy of the run. An error, or a policy that differs from the run's, is sent to the
     run, and ends the process.
@@ -222,18 +222,18 @@ def load_run_policy(
     again: whether it was loaded in this process before, so that it may have changed the manifest of
         its class.
     """
-    with _load_errors_sent(say):
+    with _load_errors_sent(send):
         driver = policy_driver(hello.policy, hello.host, timer, hello.manifest)
         return _checked(driver, hello, again)
 
 
 @contextmanager
-def _load_errors_sent(say: MessageHandler) -> Iterator[None]:
+def _load_errors_sent(send: MessageHandler) -> Iterator[None]:
     """Send UsageError and MachineError of the block to the run, and raise them again."""
     try:
         yield
     except (UsageError, MachineError) as error:
-        say(Unable(str(error), blames_policy=isinstance(error, UsageError)))
+        send(Unable(str(error), blames_policy=isinstance(error, UsageError)))
         raise
 
 
@@ -258,7 +258,7 @@ def _checked(driver: PolicyCaller, expected: Hello, again: bool) -> PolicyCaller
 def run_job(
     job: Job,
     driver: PolicyCaller,
-    say: MessageHandler,
+    send: MessageHandler,
     learner: PolicyCaller | None = None,
     renderer: RendererAddress | None = None,
     commands: CommandLog | None = None,
@@ -283,15 +283,15 @@ def run_job(
         from scenarios.episodes.demonstrator import Demonstrator
 
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
-    driver.on_reason(lambda reason: say(Waits(name, reason)))
-    watcher = _Watcher(job, say)
+    driver.on_reason(lambda reason: send(Waits(name, reason)))
+    watcher = _Watcher(job, send)
     watches: list[Watch] = [watcher.watch]
     if commands is not None:
         commands.begins()
         watches.append(_noted(commands))
     try:
         if renderer is not None:
-            link_to(renderer.address, lambda: say(Waits(name, "waits for the shared renderer")))
+            link_to(renderer.address, lambda: send(Waits(name, "waits for the shared renderer")))
         outcome = run_episode(
             job.scenario,
             expert or driver,
@@ -299,7 +299,7 @@ def run_job(
             setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
             renderer=renderer,
             watches=watches,
-            waiting=lambda reason, _=None: say(Waits(name, reason)),
+            waiting=lambda reason, _=None: send(Waits(name, reason)),
             comparing=watcher.compared,
             commands=commands,
         )
@@ -318,9 +318,9 @@ def run_job(
 class _Watcher:
     """Sender of the progress of an episode, and of the camera frames that its job requests."""
 
-    def __init__(self, job: Job, say: MessageHandler) -> None:
+    def __init__(self, job: Job, send: MessageHandler) -> None:
         self._every_s = job.options.frames_every_s
-        self._say = say
+        self._send = send
         self._next_frame_s = 0.0
         self._progress = Progress(job.scenario.id, 0.0, 0.0, 0)
 
@@ -334,12 +334,12 @@ class _Watcher:
 
             self._next_frame_s += self._every_s
             _, png = cv2.imencode(".png", step.frame.rgb[..., ::-1])
-            self._say(FrameDrawn(name, step.tick, png.tobytes()))
+            self._send(FrameDrawn(name, step.tick, png.tobytes()))
         if step.tick % REPORT_EVERY_TICKS == 0:
-            self._say(self._progress)
+            self._send(self._progress)
 
     def compared(self, _stage: str, share: float | None = None) -> None:
-        self._say(msgspec.structs.replace(self._progress, compared=share or 0.0))
+        self._send(msgspec.structs.replace(self._progress, compared=share or 0.0))
 
 
 def send_to_run(wire: MessageSocket, worker: int, message: Message) -> None:

@@ -94,8 +94,8 @@ class _LeasedWorker(Lease):
         failure = _failure_in(report)
         self.take((*report.said, *done), failure, lambda reply: _answer(query, reply))
 
-    def poll(self, hear: MessageHandler) -> Failure | None:
-        failure = super().poll(hear)
+    def poll(self, handle: MessageHandler) -> Failure | None:
+        failure = super().poll(handle)
         if self.expired:
             words = f"has not renewed its lease of {self.scenario} for {LEASE_S:g} s"
             self._server.registry.note(f"{self.seat[0]}/{self.seat[1]} {words}")
@@ -371,15 +371,15 @@ def _answer(query: Query, reply: CoordinatorReply) -> None:
 
 @contextmanager
 def workers_of_run(
-    session: Session, run: HeldRun, tell: MessageHandler, *, resumed: bool
+    session: Session, run: HeldRun, handle: MessageHandler, *, resumed: bool
 ) -> Iterator[tuple[ZenohWorkers, MessageHandler]]:
     """Create the transport of a run and wrap its progress callback.
 
     At the end of the block, unless it failed, workers are informed that the run is over."""
-    registry = WorkerRegistry(run.held, run.picked, len(run.picked) - len(run.todo), tell)
+    registry = WorkerRegistry(run.held, run.picked, len(run.picked) - len(run.todo), handle)
     workers = ZenohWorkers(session, run.held.spec, run.hello, registry, resumed=resumed)
     workers.open()
     registry.note(f"run {workers.run}: {len(run.todo)} of {len(run.picked)} episodes to be run")
-    yield workers, registry.tell
+    yield workers, registry.handle
     registry.note("the run is over")
     workers.close()

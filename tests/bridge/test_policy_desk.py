@@ -237,22 +237,22 @@ def test_a_request_that_cannot_be_decoded_is_refused() -> None:
 class ToDesk:
     """Carries requests to a desk of this process."""
 
-    loses = True
+    can_lose_episodes = True
 
     def __init__(self, policy: Any) -> None:
         self.desk = PolicyDesk(policy, decoder=ObservationDecoder)
 
-    def lay(self, arrays: dict[str, Any]) -> dict[str, PackedArray]:
+    def pack(self, arrays: dict[str, Any]) -> dict[str, PackedArray]:
         return {name: pack_array(array) for name, array in arrays.items()}
 
-    def ask(self, question: ResetRequest | ActRequest) -> bytes:
-        (reply,) = self.desk.replies([read_request(encode_message(question))])
+    def exchange(self, request: ResetRequest | ActRequest) -> bytes:
+        (reply,) = self.desk.replies([read_request(encode_message(request))])
         payload = encode_message(reply)
         assert decode_reply(payload) == reply
         return payload
 
-    def report_ended(self, question: EndRequest) -> None:
-        self.desk.replies([question])
+    def report_ended(self, request: EndRequest) -> None:
+        self.desk.replies([request])
 
     def close(self) -> None:
         """Nothing to release."""

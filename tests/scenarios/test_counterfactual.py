@@ -145,7 +145,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
         options = EpisodeOptions(camera="bullet", counterfactual=True)
         hello = Hello("orca", manifest, driver.source_hash)
         transport = LocalProcesses(folder.path / "logs")
-        run_all(folder, short.scenarios, hello, transport, tell=told.append, options=options)
+        run_all(folder, short.scenarios, hello, transport, handle=told.append, options=options)
     assert [type(message) for message in told] == [Progress] * 10 + [Done]
     assert [getattr(message, "compared", None) for message in told[5:-1]] == [
         0.0,

@@ -139,7 +139,7 @@ class Run:
                 ):
                     self.kill = _killer(transport)
                     self.opened.set()
-                    run_all(held, todo, hello, transport, tell=tell)
+                    run_all(held, todo, hello, transport, handle=tell)
             except MachineError as error:
                 self.error = error
 

@@ -193,14 +193,14 @@ def test_a_first_answer_may_take_longer(
 ) -> None:
     """The first answer has its own timeout, and none runs before a query."""
     asked = PendingCallMemory.new()
-    assert asked.question is None
+    assert asked.pending_call is None
     asked.starts(doing, 64)
     time.sleep(0.001)
-    question = asked.question
-    assert question is not None and question.overdue(Patience(answer_s, start_s)) is overdue
-    assert question.when == ("act at 3.20 s" if "act" in doing else doing)
+    pending_call = asked.pending_call
+    assert pending_call is not None and pending_call.overdue(Patience(answer_s, start_s)) is overdue
+    assert pending_call.when == ("act at 3.20 s" if "act" in doing else doing)
     asked.stops()
-    assert asked.question is None
+    assert asked.pending_call is None
     asked.close()
 
 
@@ -224,7 +224,7 @@ class Fake:
         self.driven = driven
         self.progress = (0, False)
         self.repeats: Repeat | None = None
-        self.question = None if asks is None else PendingCall(time.monotonic(), asks, 64)
+        self.pending_call = None if asks is None else PendingCall(time.monotonic(), asks, 64)
         self.killed = False
         self._messages = messages
         self._ends = ends
@@ -232,11 +232,11 @@ class Fake:
     def give(self, job: Job) -> None:
         """It does not listen."""
 
-    def listen(self, hear: MessageHandler) -> bool:
+    def listen(self, handle: MessageHandler) -> bool:
         messages = self._messages
         self._messages = ()
         for message in messages:
-            hear(message)
+            handle(message)
         return not self._ends
 
     def hang_up(self) -> None:
@@ -310,7 +310,7 @@ def all_pooled(
     hello = Hello("stop", driver.manifest, driver.source_hash, patience=Patience(**named))
     with RunFolder.create(folder / "run", spec, suite) as held:
         pool.run_all(
-            held, suite.scenarios, hello, transport, tell=lambda _: None, renderer=renderer
+            held, suite.scenarios, hello, transport, handle=lambda _: None, renderer=renderer
         )
         assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
     return sorted(read_records(folder / "run"), key=lambda record: record.scenario.id)
@@ -490,9 +490,9 @@ def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
 class DiesIdle(Fake):
     """It ends once it has said everything."""
 
-    def listen(self, hear: MessageHandler) -> bool:
+    def listen(self, handle: MessageHandler) -> bool:
         left = bool(self._messages)
-        super().listen(hear)
+        super().listen(handle)
         return left
 
 
@@ -609,9 +609,9 @@ def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
 class Again(Fake):
     """It says one thing after another, one for each time that it is listened to."""
 
-    def listen(self, hear: MessageHandler) -> bool:
+    def listen(self, handle: MessageHandler) -> bool:
         if self._messages:
-            hear(self._messages[0])
+            handle(self._messages[0])
             self._messages = self._messages[1:]
         return True
 
@@ -673,7 +673,7 @@ def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_pat
         spec = spec_of(suite, "stop", seed=seed)
         hello = Hello("stop", load_policy("stop").manifest, "")
         with RunFolder.create(folder, spec, suite) as held:
-            pool.run_all(held, suite.scenarios, hello, Prepared(notes), tell=lambda _: None)
+            pool.run_all(held, suite.scenarios, hello, Prepared(notes), handle=lambda _: None)
         assert {job.setup.seed for job in notes.given} == {seed}
         order = [job.scenario.id for job in notes.given]
         assert orders.setdefault(seed, order) == order

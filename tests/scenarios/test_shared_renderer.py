@@ -116,7 +116,7 @@ def asked_together(links: Sequence[RendererLink], *requests: Request) -> list[by
     while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
         time.sleep(0.001)
     for link, request in zip(links, requests, strict=True):
-        link.tell(request)
+        link.send(request)
     os.kill(pid, signal.SIGCONT)
     return [link.received() for link in links]
 
@@ -162,14 +162,14 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
         for k, street in enumerate(busy.streets):
             replies = asked_together(links, *[Draw(busy.robot, street)] * len(links))
             for link, reply, frames in zip(links, replies, expected, strict=False):
-                picture = link.drawn(reply)
+                picture = link.decode_frame(reply)
                 assert picture.rgb.tobytes() == frames[k].rgb.tobytes()
                 assert frames[k].labels is not None and picture.labels is not None
                 assert picture.labels.tobytes() == frames[k].labels.tobytes()
             if k == 1:
                 links.pop().close()
             if k == 2:
-                links.pop().tell(ResetRequest("", "no policy is here", "", 0))
+                links.pop().send(ResetRequest("", "no policy is here", "", 0))
         assert expected[0][3].rgb.tobytes() != expected[1][3].rgb.tobytes() and len(links) == 1
         with pytest.raises(
             EngineError, match="the shared renderer: UsageError: unknown map 'nowhere'"
@@ -266,7 +266,7 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
         }
         for number, (name, end) in enumerate(ends.items(), start=1):
             honest_one, other = begun("honest", name)
-            other.tell(knows(name, 2))
+            other.send(knows(name, 2))
             while name == "hangs" and renderer.end_of(1) is None:
                 renderer.tend()
             with pytest.raises(RendererLost) as lost:
@@ -405,10 +405,10 @@ def test_no_environment_can_shrink_its_memory_under_the_renderers_hands() -> Non
     memory = SharedMemory.new(64)
     with pytest.raises(PermissionError):
         os.ftruncate(memory.descriptor, 0)
-    with pytest.raises(ValueError, match="no room for rgb"):
-        memory.lay({"rgb": np.zeros((9, 9), np.uint8)})
+    with pytest.raises(ValueError, match="no space for rgb"):
+        memory.write_arrays({"rgb": np.zeros((9, 9), np.uint8)})
     picture = {"rgb": np.arange(24, dtype=np.uint8).reshape(2, 4, 3)}
-    taken = memory.take(memory.lay(picture))
-    memory.lay({"rgb": picture["rgb"] + 1})
+    taken = memory.read_arrays(memory.write_arrays(picture))
+    memory.write_arrays({"rgb": picture["rgb"] + 1})
     assert (taken["rgb"] == picture["rgb"]).all() and not memory.busy
     memory.close()

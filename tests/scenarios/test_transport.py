@@ -43,12 +43,12 @@ class Fails(Ahead):
         raise LookupError("no answer")
 
 
-def done_here(policy: Policy, hear: MessageHandler) -> None:
+def done_here(policy: Policy, handle: MessageHandler) -> None:
     """One short scenario in this process."""
     driver = PolicyCaller.of(policy)
     worker = InProcess(driver).start(Hello("mine", driver.manifest, driver.source_hash))
     worker.give(Job(msgspec.structs.replace(small_scenario(), time_limit_s=1.0)))
-    assert worker.poll(hear) is None
+    assert worker.poll(handle) is None
 
 
 @pytest.mark.engine
@@ -57,12 +57,12 @@ def test_a_full_disk_is_no_crash_of_an_episode_in_this_process(tmp_path: Path) -
     processes."""
     told: list[Message] = []
 
-    def hear(message: Message) -> None:
+    def handle(message: Message) -> None:
         told.append(message)
         raise MachineError("cannot be written: no space left on device")
 
     with pytest.raises(MachineError, match="no space left"):
-        done_here(Ahead(), hear)
+        done_here(Ahead(), handle)
     assert len(told) == 1 and not isinstance(told[0], Done)
 
 

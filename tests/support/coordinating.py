@@ -107,11 +107,11 @@ def serve_made_up(workers: int, jobs: int) -> Served:
             ) as of,
         ):
             load = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-            transport, tell = of
+            transport, handle = of
             while not transport.room(0):
                 transport.wait(1.0)
             began_s, cpu_s = time.monotonic(), time.process_time()
-            run_all(held, scenarios, hello, transport, tell=tell, options=options)
+            run_all(held, scenarios, hello, transport, handle=handle, options=options)
             took_s, cpu_s = time.monotonic() - began_s, time.process_time() - cpu_s
         said, _ = load.communicate()
     if load.returncode:

@@ -472,7 +472,7 @@ def _episodes_per_s(jobs: int) -> float:
 
     ends_s: list[float] = []
 
-    def hear(message: object) -> None:
+    def handle(message: object) -> None:
         if isinstance(message, Done):
             ends_s.append(time.monotonic())
 
@@ -482,7 +482,7 @@ def _episodes_per_s(jobs: int) -> float:
         episodes=_COMPARED,
         jobs=jobs,
         options=EpisodeOptions(seed=1),
-        tell=hear,
+        tell=handle,
     )
     return (_COMPARED - _WARM) / (ends_s[-1] - ends_s[_WARM - 1])
 
@@ -534,7 +534,13 @@ def driving_together() -> list[Figure]:
         with suppress(_Enough):
             processes = LocalProcesses(logs, _TOGETHER)
             run_all(
-                held, picked, hello, processes, tell=watch.hear, options=options, renderer=renderer
+                held,
+                picked,
+                hello,
+                processes,
+                handle=watch.handle,
+                options=options,
+                renderer=renderer,
             )
     what = f"{_TOGETHER} environments, shared renderer and batched policy, simulated s per s in all"
     return [Figure(what, watch.rate(), reach=60.0, better=MORE)]
@@ -552,7 +558,7 @@ class _Watch:
         self._began: tuple[float, float] | None = None
         self._ended: tuple[float, float] | None = None
 
-    def hear(self, message: object) -> None:
+    def handle(self, message: object) -> None:
         """Raises _Enough at the end of the time to measure."""
         from scenarios.ipc.messages import Progress
 

@@ -345,7 +345,7 @@ class _Rounds:
             with showing(scenarios, done) as hear:
                 transport = LocalProcesses(held.path / "logs", self.jobs)
                 run_all(
-                    held, todo, hello, transport, tell=hear, options=self.options, over=self.over
+                    held, todo, hello, transport, handle=hear, options=self.options, over=self.over
                 )
         held.finish()
 
