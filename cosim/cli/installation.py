@@ -164,7 +164,7 @@ def verify(
     """
     try:
         from scenarios.tools.verify.cases import verified_cases
-        from scenarios.tools.verify.shipped import SHIPPED, Given, given_here, writable
+        from scenarios.tools.verify.shipped import SHIPPED, Results, results_here, writable
         from scenarios.tools.verify.verdict import blamed, findings
     except (ImportError, OSError) as error:
         raise EngineError(_LACKING.format(error)) from error
@@ -174,9 +174,9 @@ def verify(
         if name not in cases:
             raise unknown("case", name, cases)
     picked = [cases[name] for name in dict.fromkeys(case or cases)]
-    shipped = None if write else Given.load(SHIPPED)
+    shipped = None if write else Results.load(SHIPPED)
     with doing(f"running {len(picked)} cases") as progress:
-        here = given_here(picked, jobs, progress)
+        here = results_here(picked, jobs, progress)
     if shipped is None:
         writable(here, list(cases)).save(SHIPPED)
         out.print(f"{SHIPPED}: {len(here.traces)} cases", soft_wrap=True, highlight=False)

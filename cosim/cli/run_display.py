@@ -28,31 +28,31 @@ if TYPE_CHECKING:
 
     from scenarios.ipc.messages import MessageHandler
     from scenarios.runs.planning import PlannedRun
-    from scenarios.runs.run import Carrier
-    from scenarios.runs.transport import HeldRun
+    from scenarios.runs.run import WorkerConnection
+    from scenarios.runs.transport import LockedRun
 
 _MOST_CRASHED = 5
 """Largest number of crashed episodes that are named when a run is resumed."""
 _EXAMPLE_PEDESTRIAN = '{"id": "eve", "path": [{"ahead": 15, "left": 1}]}'
 
 
-def run_in_terminal(config: RunConfig, carrier: Carrier | None = None) -> None:
+def run_in_terminal(config: RunConfig, workers: WorkerConnection | None = None) -> None:
     """Run a config in this terminal, and exit with the code of its results.
 
-    carrier: connection to workers on other machines; None for this machine.
+    workers: connection to workers on other machines; None for this machine.
     """
-    terminal = Terminal(config, of_here=carrier is None and not config.on)
+    terminal = Terminal(config, runs_here=workers is None and not config.on)
     with _noticed_if_not_begun(config.out):
         from scenarios.runs.run import execute_run
 
-        table = execute_run(config, reporter=terminal, carrier=carrier)
+        table = execute_run(config, reporter=terminal, workers=workers)
     _print_end(terminal, table)
 
 
 class Terminal(EpisodeBars):
     """Reporter that shows a run in this terminal.
 
-    of_here: whether its episodes run in processes of this machine.
+    runs_here: whether its episodes run in processes of this machine.
     plan, folder: set when the run opens.
     figures: throughput, set when it ends.
     """
@@ -61,9 +61,9 @@ class Terminal(EpisodeBars):
     folder: Path
     figures: Throughput | None = None
 
-    def __init__(self, config: RunConfig, *, of_here: bool) -> None:
+    def __init__(self, config: RunConfig, *, runs_here: bool) -> None:
         self._config = config
-        self._of_here = of_here
+        self._runs_here = runs_here
         self._counts: dict[str, int] = {}
 
     def planned(self, plan: PlannedRun) -> None:
@@ -71,7 +71,7 @@ class Terminal(EpisodeBars):
         sees = plan.driver.manifest.camera is not None
         if sees and self._config.camera == "auto" and plan.options.camera == "bullet":
             err.print(NO_OPENGL)
-        check_rerun(self._config.rerun, len(plan.picked))
+        check_rerun(self._config.rerun, len(plan.scenarios))
 
     @contextmanager
     def opening(self, plan: PlannedRun, folder: Path) -> Iterator[None]:
@@ -83,30 +83,32 @@ class Terminal(EpisodeBars):
             yield
 
     @contextmanager
-    def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
+    def running(self, plan: PlannedRun, run: LockedRun) -> Iterator[MessageHandler]:
         """Show the progress of episodes and, after Ctrl-C, the command that continues."""
         from scenarios.runs.eta import recording_durations
 
         config = self._config
         self._print_beginning(plan, run)
-        done = {one.id for one in plan.picked} - {one.id for one in run.todo}
-        board = ProgressDisplay(plan.picked, done, compared=config.counterfactual, pace=config.pace)
-        going = ThroughputTimer(run.held.path, [one.id for one in run.todo], self._counts)
+        done = {one.id for one in plan.scenarios} - {one.id for one in run.todo}
+        board = ProgressDisplay(
+            plan.scenarios, done, compared=config.counterfactual, pace=config.pace
+        )
+        going = ThroughputTimer(run.folder.path, [one.id for one in run.todo], self._counts)
         try:
             with ExitStack() as stack:
                 stack.callback(going.end)
-                if self._of_here:
+                if self._runs_here:
                     stack.enter_context(
-                        recording_durations(run.held, run.todo, config.jobs or 1, config.pace)
+                        recording_durations(run.folder, run.todo, config.jobs or 1, config.pace)
                     )
                 stack.enter_context(board.bars)
                 yield board.tell
         except KeyboardInterrupt:
-            self._print_how_to_continue(plan, len(run.held.finished()))
+            self._print_how_to_continue(plan, len(run.folder.finished()))
             raise typer.Exit(INTERRUPTED) from None
         self.figures = going.figures
 
-    def _print_beginning(self, plan: PlannedRun, run: HeldRun) -> None:
+    def _print_beginning(self, plan: PlannedRun, run: LockedRun) -> None:
         from scenarios.runs.eta import announcement
 
         config = self._config
@@ -115,12 +117,12 @@ class Terminal(EpisodeBars):
             f"Seed {seed}: the episode ids and seeds that the policy gets are drawn from it.",
             highlight=False,
         )
-        for note in run.held.notes:
+        for note in run.folder.notes:
             notice(note)
-        if done := len(run.picked) - len(run.todo):
-            err.print(f"{done} of {len(run.picked)} episodes are finished already.")
+        if done := len(run.scenarios) - len(run.todo):
+            err.print(f"{done} of {len(run.scenarios)} episodes are finished already.")
             _print_crashed(run)
-        if run.todo and self._of_here:
+        if run.todo and self._runs_here:
             jobs = config.jobs or 1
             words = announcement(
                 run.todo,
@@ -140,15 +142,15 @@ class Terminal(EpisodeBars):
         again = shlex.join(word for word in sys.argv[1:] if word != "--resume")
         again += "" if self._config.out else f" --out {shlex.quote(str(self.folder))}"
         err.print(
-            f"Stopped. {finished} of {len(plan.picked)} episodes are finished and stored in "
+            f"Stopped. {finished} of {len(plan.scenarios)} episodes are finished and stored in "
             f"{self.folder}."
         )
         err.print(f"Continue with: cosim {again} --resume", soft_wrap=True)
 
 
-def _print_crashed(run: HeldRun) -> None:
+def _print_crashed(run: LockedRun) -> None:
     """Print how to run the crashed episodes of a resumed run again, if there are any."""
-    records = read_records(run.held.path)
+    records = read_records(run.folder.path)
     crashed = sorted(one.scenario.id for one in records if one.status == "crashed")
     if crashed:
         chosen = " ".join(f"--scenario {name}" for name in crashed[:_MOST_CRASHED])
@@ -159,7 +161,7 @@ def _print_crashed(run: HeldRun) -> None:
         )
 
 
-def _print_live_commands(hub: Connection, run: HeldRun, *, several: bool, paced: bool) -> None:
+def _print_live_commands(hub: Connection, run: LockedRun, *, several: bool, paced: bool) -> None:
     """Print the commands that listen to a live run and inject pedestrians.
 
     several: whether episodes run in parallel; then the commands name the first one.
@@ -167,8 +169,8 @@ def _print_live_commands(hub: Connection, run: HeldRun, *, several: bool, paced:
     """
     from bridge import keys
 
-    first = min(run.todo, key=partial(episode_id_of, run.held.spec.setup.seed))
-    env = f" --env {keys.chunk(run.held.path.name)}/{keys.chunk(first.id)}" if several else ""
+    first = min(run.todo, key=partial(episode_id_of, run.folder.spec.setup.seed))
+    env = f" --env {keys.chunk(run.folder.path.name)}/{keys.chunk(first.id)}" if several else ""
     notice(f"On the air at {hub.listen}. From another terminal:")
     notice(f"  cosim listen events{connect_options(hub, 'viewer')}{env} --wait 60")
     notice(
@@ -185,7 +187,7 @@ def _print_end(terminal: Terminal, table: DataFrame) -> None:
     """Print the results of a run. Raises Exit if an episode is not scored."""
     plan = terminal.plan
     folder = terminal.folder
-    print_table(out, table, len(plan.of_run), folder)
+    print_table(out, table, len(plan.selected), folder)
     print_by_kind(out, table, kinds_of(folder))
     if terminal.figures is not None:
         err.print(terminal.figures.in_words, soft_wrap=True, highlight=False)
@@ -196,11 +198,11 @@ def _print_end(terminal: Terminal, table: DataFrame) -> None:
             f"Shard {plan.shard.in_words} of the run: `cosim merge` makes one of all.",
             highlight=False,
         )
-    if lacking := [one.id for one in plan.picked if one.id not in set(table["scenario"])]:
+    if lacking := [one.id for one in plan.scenarios if one.id not in set(table["scenario"])]:
         notice(f"No record of {', '.join(lacking)}: run it again with --resume.")
     if lacking or table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
-    write_rerun(folder, [one.id for one in plan.picked], plan.config.rerun)
+    write_rerun(folder, [one.id for one in plan.scenarios], plan.config.rerun)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from cosim.spec.scenario import Scenario
     from scenarios.ipc.messages import MessageHandler
     from scenarios.runs.planning import PlannedRun
-    from scenarios.runs.transport import HeldRun
+    from scenarios.runs.transport import LockedRun
 
 
 SETUP_M = 30.0
@@ -184,10 +184,10 @@ class EpisodeBars:
         return nullcontext()
 
     @contextmanager
-    def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
+    def running(self, plan: PlannedRun, run: LockedRun) -> Iterator[MessageHandler]:
         """Show the progress of the episodes."""
         board = ProgressDisplay(
-            plan.picked, {one.id for one in plan.picked} - {one.id for one in run.todo}
+            plan.scenarios, {one.id for one in plan.scenarios} - {one.id for one in run.todo}
         )
         with board.bars:
             yield board.tell

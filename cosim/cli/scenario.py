@@ -277,8 +277,8 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
             config, suite=own.name, scenario=ids, goal=goal or "", out=part, resume=part in begun
         )
         try:
-            given = RunObjects(suite=suite, host=host_of(of_part))
-            tables.append(execute_run(of_part, given=given, reporter=EpisodeBars()))
+            objects = RunObjects(suite=suite, host=host_of(of_part))
+            tables.append(execute_run(of_part, objects=objects, reporter=EpisodeBars()))
         except KeyboardInterrupt:
             notice(
                 f"Stopped. Finished episodes are stored in {part}: continue with --out {path} "

@@ -89,7 +89,7 @@ def coordinator_command(
     connection_warnings(connection)
 
     @contextmanager
-    def carrier() -> Iterator[Any]:
+    def workers() -> Iterator[Any]:
         with open_session(connection, notice) as session:
             _log_and_print(
                 f"Workers find it by: cosim worker --connect "
@@ -98,7 +98,7 @@ def coordinator_command(
             yield partial(workers_of_run, session, resumed=config.resume)
 
     run_in_terminal(
-        replace(config, tls=files, insecure=insecure and bool(config.policy_at)), carrier()
+        replace(config, tls=files, insecure=insecure and bool(config.policy_at)), workers()
     )
 
 

@@ -97,7 +97,7 @@ class Demonstrator(PolicyCaller):
         if self.learner is not None:
             self.learner.ended()
 
-    def kept(self, scenario: Scenario, record: Record, log: Log | None) -> bytes:
+    def encoded_demonstration(self, scenario: Scenario, record: Record, log: Log | None) -> bytes:
         """Return the encoded demonstration; b"" if the episode crashed or was not solved."""
         if log is None or not (self._collecting.unsolved or solved(record, log)):
             return b""

@@ -162,7 +162,7 @@ class Episode:
                 live = stack.enter_context(
                     LiveEpisode(self.options.live, self.scenario, stage.injected)
                 )
-                self._watches.append(live.tell)
+                self._watches.append(live.publish)
             if self.options.pace:
                 pacer = Pacer(self.options.pace)
                 self._watches.append(lambda step, verdict: pacer.wait(self.clock.tick_s))

@@ -54,7 +54,7 @@ class LiveEpisode:
     ) -> None:
         self._session.close()
 
-    def tell(self, step: Step, verdict: Verdict) -> None:
+    def publish(self, step: Step, verdict: Verdict) -> None:
         """Publish the telemetry of a tick."""
         self._step = step
         pose = step.motion.robot.pose

@@ -64,33 +64,33 @@ def load_recorded(folder: Path, scenario_id: str) -> RecordedEpisode:
 
 
 def replay_episode(
-    original: RecordedEpisode,
+    recorded: RecordedEpisode,
     camera: CameraChoice = "auto",
     *watches: Watch,
-    judged_alone: bool = False,
+    without_measures: bool = False,
     appearance: Appearance | None = None,
 ) -> tuple[Episode, Replay]:
     """Return a new Episode for a replay, and the policy that repeats the recorded commands.
 
-    judged_alone: compute no measures, for a replay whose result is not needed.
+    without_measures: compute no measures, for a replay whose result is not needed.
     appearance: of scanned places in pictures, by default that of the recorded episode.
     """
     options = EpisodeOptions(
-        seed=original.record.setup.seed,
+        seed=recorded.record.setup.seed,
         camera=camera,
-        appearance=appearance or appearance_of(original.record.setup.renderer),
-        gait=original.record.setup.gait,
-        injections=original.record.injections,
+        appearance=appearance or appearance_of(recorded.record.setup.renderer),
+        gait=recorded.record.setup.gait,
+        injections=recorded.record.injections,
     )
-    setup = RunSetup.of(options, gait_hash=original.record.setup.gait_hash)
-    policy = Replay(original.log.command)
+    setup = RunSetup.of(options, gait_hash=recorded.record.setup.gait_hash)
+    policy = Replay(recorded.log.command)
 
     def skip_measures(stage: StagedScenario) -> None:
         stage.scorer.skip_measures()
 
-    through = skip_measures if judged_alone else None
+    through = skip_measures if without_measures else None
     episode = Episode(
-        original.scenario,
+        recorded.scenario,
         policy.manifest,
         options,
         watches=watches,
@@ -126,7 +126,7 @@ class RecordedAnswers:
 
 
 def observed_replay(
-    original: RecordedEpisode, manifest: Manifest, camera: CameraChoice = "auto"
+    recorded: RecordedEpisode, manifest: Manifest, camera: CameraChoice = "auto"
 ) -> tuple[Episode, RecordedAnswers]:
     """Return a new Episode that observes with a manifest at the recorded rate, and the answers.
 
@@ -134,19 +134,19 @@ def observed_replay(
 
     manifest: sensors of the observations; its rate is that of the record.
     """
-    setup = original.record.setup
+    setup = recorded.record.setup
     options = EpisodeOptions(
         seed=setup.seed,
         camera=camera,
         appearance=appearance_of(setup.renderer),
         gait=setup.gait,
-        injections=original.record.injections,
+        injections=recorded.record.injections,
         own_camera=True,
         real_time=setup.real_time,
     )
     of_replay = RunSetup.of(options, gait_hash=setup.gait_hash)
-    episode = Episode(original.scenario, manifest, options, through=_only_hash, setup=of_replay)
-    return episode, RecordedAnswers(original.log)
+    episode = Episode(recorded.scenario, manifest, options, through=_only_hash, setup=of_replay)
+    return episode, RecordedAnswers(recorded.log)
 
 
 def _only_hash(stage: StagedScenario) -> None:
@@ -154,30 +154,30 @@ def _only_hash(stage: StagedScenario) -> None:
 
 
 def replay_state_hash(
-    original: RecordedEpisode, *watches: Watch, progress: Progress = ignore
+    recorded: RecordedEpisode, *watches: Watch, progress: Progress = ignore
 ) -> str:
     """Replay an episode, and return its state hash."""
-    return _again(original, progress, *watches)[0]
+    return _again(recorded, progress, *watches)[0]
 
 
 def replay_and_compare(
-    original: RecordedEpisode, progress: Progress = ignore
+    recorded: RecordedEpisode, progress: Progress = ignore
 ) -> tuple[str, DelayComparison]:
     """Replay an episode, then its street without the robot; return the state hash and the
     delays."""
     tracker = CounterfactualTracker()
-    state_hash, entrances = _again(original, progress, tracker.watch)
+    state_hash, entrances = _again(recorded, progress, tracker.watch)
     return state_hash, tracker.compared(
-        original.scenario, entrances, partial(progress, "the street without the robot")
+        recorded.scenario, entrances, partial(progress, "the street without the robot")
     )
 
 
-def _again(original: RecordedEpisode, progress: Progress, *watches: Watch) -> tuple[str, Entrances]:
+def _again(recorded: RecordedEpisode, progress: Progress, *watches: Watch) -> tuple[str, Entrances]:
     def watch(step: Step, _: Verdict) -> None:
-        progress(f"replaying {original.scenario.id}", step.tick / len(original.log))
+        progress(f"replaying {recorded.scenario.id}", step.tick / len(recorded.log))
 
     progress("starting SUMO and PyBullet")
-    episode, policy = replay_episode(original, "auto", watch, *watches)
+    episode, policy = replay_episode(recorded, "auto", watch, *watches)
     with episode:
         drive(episode, policy)
         return episode.result()[0].state_hash, episode.entrances
@@ -190,46 +190,46 @@ class ReplayChecker:
     distance to the nearest person.
     """
 
-    def __init__(self, folder: Path, original: RecordedEpisode) -> None:
+    def __init__(self, folder: Path, recorded: RecordedEpisode) -> None:
         self._folder = folder
-        self._original = original
-        self._footprint_m = robot_called(original.scenario.robot).footprint_m
+        self._recorded = recorded
+        self._footprint_m = robot_called(recorded.scenario.robot).footprint_m
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         """Check the next tick. Raises RunError if it differs from the recorded one."""
-        if not self._original.log.same(Tick(step, verdict, self._footprint_m, RoadState())):
+        if not self._recorded.log.same(Tick(step, verdict, self._footprint_m, RoadState())):
             raise replay_mismatch(
-                self._folder, self._original, f"from {Clock().time_s(step.tick):g} s on"
+                self._folder, self._recorded, f"from {Clock().time_s(step.tick):g} s on"
             )
 
 
-def check_state_hash(folder: Path, original: RecordedEpisode, state_hash: str) -> None:
+def check_state_hash(folder: Path, recorded: RecordedEpisode, state_hash: str) -> None:
     """Check the state hash of a replay. Raises RunError if it differs from the recorded one."""
-    if state_hash != original.record.state_hash:
+    if state_hash != recorded.record.state_hash:
         raise replay_mismatch(
-            folder, original, f"{state_hash[:16]}, recorded {original.record.state_hash[:16]}"
+            folder, recorded, f"{state_hash[:16]}, recorded {recorded.record.state_hash[:16]}"
         )
 
 
-def replay_mismatch(folder: Path, original: RecordedEpisode, what: str) -> RunError:
+def replay_mismatch(folder: Path, recorded: RecordedEpisode, what: str) -> RunError:
     """Return the error for a replay that differs from the record. what: the difference."""
-    name = original.record.scenario.id
+    name = recorded.record.scenario.id
     return RunError(
         f"{folder}: '{name}' was not the same when it was replayed ({what}). The record is "
-        f"{_origin_in_words(original)}, or it was changed. Replay it with the code and the files "
+        f"{_origin_in_words(recorded)}, or it was changed. Replay it with the code and the files "
         "that made it, or run it again."
     )
 
 
-def _origin_in_words(original: RecordedEpisode) -> str:
+def _origin_in_words(recorded: RecordedEpisode) -> str:
     """Return what differs between the origin of a record and this machine, in words."""
-    robot = robot_called(original.scenario.robot)
-    if original.robot_hash not in ("", digest := robot_hash(robot)):
+    robot = robot_called(recorded.scenario.robot)
+    if recorded.robot_hash not in ("", digest := robot_hash(robot)):
         return (
-            f"of robot '{robot.name}' with hash {original.robot_hash}, and its row and files here "
+            f"of robot '{robot.name}' with hash {recorded.robot_hash}, and its row and files here "
             f"have hash {digest}"
         )
-    here, there = versions(), original.record.setup.versions
+    here, there = versions(), recorded.record.setup.versions
     changed = [
         f"{name} {there.get(name)}, here {here[name]}"
         for name in here

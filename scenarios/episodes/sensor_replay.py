@@ -25,18 +25,18 @@ class SensorReplay:
     They are read at the ticks at which the policy observed, with the errors that it got.
     """
 
-    def __init__(self, told: RecordedEpisode, rays: RangeSensor | None) -> None:
+    def __init__(self, recorded: RecordedEpisode, rays: RangeSensor | None) -> None:
         manifest = replace(
-            told.record.manifest,
+            recorded.record.manifest,
             camera=None,
             cameras={},
             goal="none",
             odometry="none",
             privileged=False,
         )
-        self._asked = {*told.log.answers[:, 0].astype(int).tolist()}
+        self._observed_ticks = {*recorded.log.answers[:, 0].astype(int).tolist()}
         self._observer = Observer(
-            told.scenario, manifest, told.record.setup.seed, _unknown, {}, rays=rays
+            recorded.scenario, manifest, recorded.record.setup.seed, _unknown, {}, rays=rays
         )
 
     def read(self, step: Step, verdict: Verdict) -> Observation | None:
@@ -45,7 +45,7 @@ class SensorReplay:
         None where the policy did not observe.
         """
         seen: Observation | None = None
-        if step.tick in self._asked:
+        if step.tick in self._observed_ticks:
             now = Moment(step.tick, step.robot, step.street, step.route_s_m)
             seen, _ = self._observer.observed(now, Clock().time_s(step.tick), None, False)
         self._observer.moved(step, verdict.reset is not None)
@@ -53,17 +53,17 @@ class SensorReplay:
 
 
 @contextmanager
-def sensor_replay(told: RecordedEpisode) -> Iterator[SensorReplay | None]:
+def sensor_replay(recorded: RecordedEpisode) -> Iterator[SensorReplay | None]:
     """Provide the sensors of a recorded policy; None if it has none of them."""
-    manifest, scenario = told.record.manifest, told.scenario
+    manifest, scenario = recorded.record.manifest, recorded.scenario
     range_m = sensing_range_m(manifest)
     if not range_m:
-        yield None if manifest.imu == "none" else SensorReplay(told, None)
+        yield None if manifest.imu == "none" else SensorReplay(recorded, None)
         return
     robot = robot_called(scenario.robot)
     surface = surface_of_place(scenario.place)
     with RayCaster(surface, scenario.barriers, scenario.obstacles, robot, range_m) as rays:
-        yield SensorReplay(told, rays)
+        yield SensorReplay(recorded, rays)
 
 
 def _unknown(now: Moment) -> NoReturn:

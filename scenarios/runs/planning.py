@@ -32,14 +32,14 @@ from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello
 from scenarios.runs.policy_host import inspected_driver, settled_host
 from scenarios.runs.shared_renderer import check_shared
-from scenarios.runs.transport import HeldRun
+from scenarios.runs.transport import LockedRun
 
 
 class PlannedRun(NamedTuple):
     """A run whose policy is loaded and whose seed is drawn.
 
-    whole: its suite, before a robot is applied: so runs by several robots are of one suite.
-    of_run: the scenarios selected from the suite, with the robot of the run.
+    suite: its suite, before a robot is applied, so that runs of several robots have the same suite.
+    selected: the scenarios selected from the suite, with the robot of the run.
     shard: the part of them that is run here, None for all.
     policy: name of the policy.
     driver: the policy as loaded in this process.
@@ -49,8 +49,8 @@ class PlannedRun(NamedTuple):
     """
 
     config: RunConfig
-    whole: Suite
-    of_run: Sequence[Scenario]
+    suite: Suite
+    selected: Sequence[Scenario]
     shard: Shard | None
     policy: str
     driver: PolicyCaller
@@ -59,25 +59,25 @@ class PlannedRun(NamedTuple):
     patience: Patience
 
     @property
-    def picked(self) -> Sequence[Scenario]:
-        """The scenarios that are run here."""
+    def scenarios(self) -> Sequence[Scenario]:
+        """Return the scenarios that are run here."""
         if self.shard is None:
-            return self.of_run
-        return [one for pair in self.shard.share(pairs_of(self.of_run)) for one in pair]
+            return self.selected
+        return [one for pair in self.shard.share(pairs_of(self.selected)) for one in pair]
 
     @property
     def spec(self) -> RunSpec:
         """Return the identity of the run. Raises UsageError."""
         shared = self.config.shared_renderer
         return run_spec(
-            self.whole, self.of_run, self.policy, self.driver, self.options, shared, self.shard
+            self.suite, self.selected, self.policy, self.driver, self.options, shared, self.shard
         )
 
 
 def planned_run(
     config: RunConfig,
-    whole: Suite,
-    of_run: Sequence[Scenario],
+    suite: Suite,
+    selected: Sequence[Scenario],
     *,
     policy: Policy | None = None,
     options: EpisodeOptions | None = None,
@@ -96,7 +96,7 @@ def planned_run(
         if policy is None
         else f"{type(policy).__module__}:{type(policy).__qualname__}"
     )
-    part = Shard.called(config.shard, len(pairs_of(of_run))) if config.shard else None
+    part = Shard.called(config.shard, len(pairs_of(selected))) if config.shard else None
     if part is not None and options.seed is None and resumed is None:
         raise UsageError(
             "--shard needs --seed: shards are of one run, which has one seed: give the same to each"
@@ -115,7 +115,7 @@ def planned_run(
     check_real_time(options, jobs, config.shared_renderer)
     if config.shared_renderer:
         check_shared(driver, camera)
-    return PlannedRun(config, whole, of_run, part, name, driver, options, host, patience)
+    return PlannedRun(config, suite, selected, part, name, driver, options, host, patience)
 
 
 def check_folder(plan: PlannedRun, folder: Path) -> None:
@@ -124,10 +124,12 @@ def check_folder(plan: PlannedRun, folder: Path) -> None:
 
 
 @contextmanager
-def held_run(plan: PlannedRun, folder: Path) -> Iterator[HeldRun]:
-    """Create or resume the run folder, and hold its lock. Raises RunError for a folder of another
-    run."""
-    held = _folder(plan, folder)
+def locked_run(plan: PlannedRun, folder: Path) -> Iterator[LockedRun]:
+    """Create or resume the run folder, and lock it until the end of the block.
+
+    Raises RunError for a folder of another run.
+    """
+    run_folder = _folder(plan, folder)
     hello = Hello(
         plan.policy,
         plan.driver.manifest,
@@ -135,21 +137,22 @@ def held_run(plan: PlannedRun, folder: Path) -> Iterator[HeldRun]:
         host=msgspec.structs.replace(plan.host, hidden=(str(folder.absolute()),)),
         patience=plan.patience,
     )
-    with held:
-        done = held.finished()
-        yield HeldRun(held, hello, plan.picked, [one for one in plan.picked if one.id not in done])
+    with run_folder:
+        done = run_folder.finished()
+        todo = [one for one in plan.scenarios if one.id not in done]
+        yield LockedRun(run_folder, hello, plan.scenarios, todo)
 
 
 def _folder(plan: PlannedRun, folder: Path) -> RunFolder:
     if plan.config.resume:
-        return RunFolder.resume(folder, plan.spec, plan.whole)
-    driven = msgspec.structs.replace(plan.whole, scenarios=tuple(plan.of_run))
-    return RunFolder.create(folder, plan.spec, driven)
+        return RunFolder.resume(folder, plan.spec, plan.suite)
+    suite = msgspec.structs.replace(plan.suite, scenarios=tuple(plan.selected))
+    return RunFolder.create(folder, plan.spec, suite)
 
 
 def run_spec(
-    whole: Suite,
-    picked: Sequence[Scenario],
+    suite: Suite,
+    scenarios: Sequence[Scenario],
     policy: str,
     driver: PolicyCaller,
     options: EpisodeOptions,
@@ -158,8 +161,8 @@ def run_spec(
 ) -> RunSpec:
     """Build the identity of a run.
 
-    whole: the suite before robot and weather are applied.
-    picked: the scenarios of the run, with its robot and weather.
+    suite: the suite before robot and weather are applied.
+    scenarios: the scenarios of the run, with its robot and weather.
     policy: name of the policy.
     shared: whether one renderer draws for all episodes.
     shard: the part of the run in the folder, None for all.
@@ -168,7 +171,7 @@ def run_spec(
     if a robot's row or URDF is invalid.
     """
     manifest = with_goal(driver.manifest, options.goal)
-    robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
+    robots = [robot_called(name) for name in sorted({one.robot for one in scenarios})]
     if manifest.camera is not None:
         for robot in robots:
             check_camera(manifest, robot, options.own_camera)
@@ -177,7 +180,7 @@ def run_spec(
     gaits = [gait_hash(options.gait, robot) for robot in robots]
     setup = RunSetup.of(
         options,
-        suite_hash=whole.content_hash,
+        suite_hash=suite.content_hash,
         policy_source=driver.source_hash,
         policy_runs=driver.runs,
         gait_hash=gaits[0] if gaits else "",
@@ -186,13 +189,13 @@ def run_spec(
         drawn_by = renderer_of(chosen_camera(options.camera), options.appearance)
         setup = msgspec.structs.replace(setup, renderer=drawn_by)
     return RunSpec(
-        suite=whole.name,
+        suite=suite.name,
         robots={robot.name: robot_hash(robot) for robot in robots},
-        suite_version=whole.version,
+        suite_version=suite.version,
         policy=policy,
         manifest=manifest,
         setup=setup,
-        scenarios=tuple(s.id for s in picked),
+        scenarios=tuple(s.id for s in scenarios),
         weather=options.weather,
         counterfactual=options.counterfactual,
         shared_renderer=shared,
@@ -204,9 +207,9 @@ def check_real_time(options: EpisodeOptions, jobs: int, shared: bool) -> None:
     """Check that the answers of a run in real time do not wait for those of other episodes. Raises
     UsageError."""
     if options.real_time and (jobs != 1 or shared):
-        much = "a shared renderer" if shared else f"{jobs} jobs"
+        cause = "a shared renderer" if shared else f"{jobs} jobs"
         raise UsageError(
-            f"in real time every answer is timed, and {much} would be timed too: take one "
+            f"in real time every answer is timed, and {cause} would be timed too: take one "
             f"job, without it"
         )
 

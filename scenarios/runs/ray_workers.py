@@ -39,7 +39,7 @@ from scenarios.runs.lease import Lease
 from scenarios.runs.net_transfer import Nets, travels
 from scenarios.runs.protocol import difference, installed_for, other_renderer
 from scenarios.runs.ray_actor import EnvironmentActor, NodeFound, SlotReport
-from scenarios.runs.transport import HeldRun, Transport, TransportFactory
+from scenarios.runs.transport import LockedRun, Transport, TransportFactory
 
 _POLL_S: Final = 1.0
 """Longest time in seconds between two reports of an actor."""
@@ -48,7 +48,7 @@ LEASE_S: Final = 60.0
 its node."""
 _ENDING_S: Final = 60.0
 """Seconds that an idle actor may take to end."""
-_TELLS_S: Final = 30.0
+_NOTE_PERIOD_S: Final = 30.0
 """Seconds between two notes that Ray places no worker."""
 _STARTS: Final = 3
 """Number of actors in a row that may fail to start."""
@@ -70,14 +70,14 @@ def check_ray(on: str) -> Any:
     return ray
 
 
-def check_on_ray(on: str, of_here: Mapping[str, object]) -> None:
+def check_on_ray(on: str, local_options: Mapping[str, object]) -> None:
     """Check the options of a run on Ray.
 
-    of_here: whether options are set that need processes of this machine, by name.
+    local_options: whether options are set that need processes of this machine, by name.
     Raises UsageError if one is set, if Ray is missing, or if `on` is no cluster.
     """
     check_ray(on)
-    for name in (name for name, is_set in of_here.items() if is_set):
+    for name in (name for name, is_set in local_options.items() if is_set):
         raise UsageError(
             f"{name} needs processes of this machine, and this run uses those of a cluster: "
             f"leave one of both out"
@@ -85,19 +85,21 @@ def check_on_ray(on: str, of_here: Mapping[str, object]) -> None:
 
 
 @contextmanager
-def ray_carrier(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[TransportFactory]:
+def ray_workers(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[TransportFactory]:
     """Connect to a cluster, and create the factory of its transport.
 
     jobs: number of workers, by default one for each CPU."""
 
     @contextmanager
-    def reached(run: HeldRun, handle: MessageHandler) -> Iterator[tuple[Transport, MessageHandler]]:
-        workers = RayWorkers(run.held.spec, run.held.path / "logs", jobs, len(run.todo), say)
+    def create_transport(
+        run: LockedRun, handle: MessageHandler
+    ) -> Iterator[tuple[Transport, MessageHandler]]:
+        workers = RayWorkers(run.folder.spec, run.folder.path / "logs", jobs, len(run.todo), say)
         say(f"{workers.wanted} workers on Ray")
         yield workers, handle
 
     with ray_cluster(on, policy, say):
-        yield reached
+        yield create_transport
 
 
 @contextmanager
@@ -214,7 +216,7 @@ class RayWorkers:
             if self._ray.wait([ref], timeout=0)[0]:
                 self._take(ref, self._coming.pop(ref))
         now_s = time.monotonic()
-        if self._placed or self._workers or now_s - self._noted_s < _TELLS_S:
+        if self._placed or self._workers or now_s - self._noted_s < _NOTE_PERIOD_S:
             return
         self._noted_s = now_s
         free = self._ray.available_resources().get("CPU", 0)

@@ -32,16 +32,16 @@ from cosim.spec.selection import select_scenarios
 from physics.robots.check import check_robot
 from scenarios.ipc.messages import MessageHandler
 from scenarios.runs.local import InProcess, LocalProcesses
-from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
+from scenarios.runs.planning import PlannedRun, check_folder, locked_run, planned_run
 from scenarios.runs.policy_host import host_of
 from scenarios.runs.pool import run_all
 from scenarios.runs.shared_renderer import SharedRenderer
-from scenarios.runs.transport import HeldRun, TransportFactory
+from scenarios.runs.transport import LockedRun, TransportFactory
 from scenarios.suites.catalog import load_suite, with_crowd
 from scenarios.suites.fits import LOOKING, check_places
 from scenarios.suites.sample import suite_on_map
 
-Carrier = AbstractContextManager[TransportFactory]
+WorkerConnection = AbstractContextManager[TransportFactory]
 """Connection to the workers of a run."""
 _VEHICLES_SHARE = 2 / 3
 """Number of vehicles for each person of a crowd that is set by an option."""
@@ -67,12 +67,12 @@ class Reporter(Protocol):
         """Show a stage until the block ends, and return its progress callback."""
 
     def planned(self, plan: PlannedRun) -> None:
-        """Show a plan: called when the policy is loaded, before places are built."""
+        """Show a plan; called when the policy is loaded, before places are built."""
 
     def opening(self, plan: PlannedRun, folder: Path) -> AbstractContextManager[None]:
         """Show a run: entered before workers are connected and files written, until the end."""
 
-    def running(self, plan: PlannedRun, run: HeldRun) -> AbstractContextManager[MessageHandler]:
+    def running(self, plan: PlannedRun, run: LockedRun) -> AbstractContextManager[MessageHandler]:
         """Show progress: entered while episodes run, returns the handler of workers' messages."""
 
 
@@ -91,7 +91,7 @@ class Silent(NamedTuple):
     def opening(self, plan: PlannedRun, folder: Path) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def running(self, plan: PlannedRun, run: HeldRun) -> AbstractContextManager[MessageHandler]:
+    def running(self, plan: PlannedRun, run: LockedRun) -> AbstractContextManager[MessageHandler]:
         return nullcontext(self.tell)
 
 
@@ -157,13 +157,13 @@ def run(
         pace=options.pace,
         latency=repr(options.latency_ms) if options.latency_ms else "",
     )
-    given = RunObjects(
+    objects = RunObjects(
         suite=None if isinstance(suite, str) else suite,
         policy=None if isinstance(policy, str) else policy,
         options=options,
         host=host,
     )
-    return execute_run(config, given=given, reporter=Silent(tell))
+    return execute_run(config, objects=objects, reporter=Silent(tell))
 
 
 def _refuse_for_object(
@@ -175,12 +175,12 @@ def _refuse_for_object(
         f"on='{on}'": on != "",
         "host": host.isolated != "no",
     }
-    asked = next(
-        (words for words, is_asked in needs.items() if is_asked), "shared_renderer=True" * shared
+    option = next(
+        (words for words, is_set in needs.items() if is_set), "shared_renderer=True" * shared
     )
-    if asked and not isinstance(policy, str):
+    if option and not isinstance(policy, str):
         raise UsageError(
-            f"{asked} needs a policy by its name, such as 'my.py:Class': "
+            f"{option} needs a policy by its name, such as 'my.py:Class': "
             "every process makes one of its own; an object drives in this process alone"
         )
 
@@ -188,86 +188,86 @@ def _refuse_for_object(
 def execute_run(
     config: RunConfig,
     *,
-    given: RunObjects | None = None,
+    objects: RunObjects | None = None,
     reporter: Reporter = Silent(),  # noqa: B008  a frozen value
-    carrier: Carrier | None = None,
+    workers: WorkerConnection | None = None,
 ) -> pd.DataFrame:
     """Run a config, and return the table of its results.
 
-    given: objects in place of names in the config.
+    objects: objects in place of names in the config.
     reporter: shows progress.
-    carrier: connects to workers, in place of those that the config requests.
+    workers: connects to workers, in place of those that the config requests.
     Raises what `run` raises.
     """
     ends = config.ends
-    _check_ros2(config, carrier)
+    _check_ros2(config, workers)
     for line in (line for end in ends.all for line in connection_warnings(end)):
         reporter.say(line)
-    _check_cluster(config, given)
+    _check_cluster(config, objects)
     if config.robot:
         check_robot(robot_called(config.robot))
     if config.out is not None:
         (refuse_not_begun if config.resume else refuse_used)(config.out)
-    whole = _loaded(config, given, reporter)
-    of_run = select_scenarios(
-        whole,
+    suite = _loaded(config, objects, reporter)
+    selected = select_scenarios(
+        suite,
         config.scenario,
         config.episodes,
         config.event,
         split_called(config.split),
         decoys=not config.no_decoys,
     )
-    of_run = tuple(
-        scenario.driven_by(config.robot).in_weather(config.weather) for scenario in of_run
+    selected = tuple(
+        scenario.driven_by(config.robot).in_weather(config.weather) for scenario in selected
     )
-    plan = _planned(config, given, whole, of_run, ends)
+    plan = _planned(config, objects, suite, selected, ends)
     reporter.planned(plan)
     with ExitStack() as stack:
-        folder = config.out or _default_folder(plan, stack, temporary=given is not None)
-        plan = _checked(plan, folder, reporter, 1 if given else _checking_jobs(config, carrier))
+        folder = config.out or _default_folder(plan, stack, temporary=objects is not None)
+        plan = _checked(plan, folder, reporter, 1 if objects else _checking_jobs(config, workers))
         stack.enter_context(reporter.opening(plan, folder))
-        create_transport = stack.enter_context(carrier or _workers(plan, given, reporter))
+        create_transport = stack.enter_context(workers or _workers(plan, objects, reporter))
         plan = stack.enter_context(_connected(plan, folder, ends, reporter))
-        held = stack.enter_context(held_run(plan, folder))
-        with reporter.running(plan, held) as handle:
-            _run_todo(plan, held, create_transport, handle)
-        return held.held.finish()
+        run = stack.enter_context(locked_run(plan, folder))
+        with reporter.running(plan, run) as handle:
+            _run_todo(plan, run, create_transport, handle)
+        return run.folder.finish()
 
 
-def _check_cluster(config: RunConfig, given: RunObjects | None) -> None:
+def _check_cluster(config: RunConfig, objects: RunObjects | None) -> None:
     """Check that a cluster supports the options of a run. Raises UsageError."""
     if not config.on:
         return
     from scenarios.runs.ray_workers import check_on_ray  # slow: the importer of maps comes with it
 
-    of_here: dict[str, Any] = {
+    local_options: dict[str, Any] = {
         "shared_renderer": config.shared_renderer,
         "real_time": config.real_time,
-        "live": config.live if given is None or given.options is None else given.options.live,
+        "live": config.live if objects is None or objects.options is None else objects.options.live,
         "pace": config.pace,
         "rerun": config.rerun,
     }
-    words = {name: name if given else f"--{name.replace('_', '-')}" for name in of_here}
-    check_on_ray(config.on, {words[name]: asked for name, asked in of_here.items()})
+    words = {name: name if objects else f"--{name.replace('_', '-')}" for name in local_options}
+    check_on_ray(config.on, {words[name]: is_set for name, is_set in local_options.items()})
 
 
-def _check_ros2(config: RunConfig, carrier: Carrier | None) -> None:
+def _check_ros2(config: RunConfig, workers: WorkerConnection | None) -> None:
     """Check that a ROS 2 node and its environment processes are on one network. Raises
     UsageError."""
-    if config.ros2 is not None and (config.on or carrier is not None):
+    if config.ros2 is not None and (config.on or workers is not None):
         raise UsageError(
             f"policy '{config.policy}' drives in the processes of this machine: use `cosim run` "
             "without --on"
         )
 
 
-def _loaded(config: RunConfig, given: RunObjects | None, reporter: Reporter) -> Suite:
+def _loaded(config: RunConfig, objects: RunObjects | None, reporter: Reporter) -> Suite:
     """Load the suite of a run, with its crowd. Raises UsageError, SpecError, MapError."""
-    if given is not None and given.suite is not None:
-        whole = given.suite
+    if objects is not None and objects.suite is not None:
+        suite = objects.suite
     elif config.map is not None:
         with reporter.stage(f"drawing routes on {config.map}"):
-            whole = suite_on_map(
+            suite = suite_on_map(
                 config.suite,
                 config.map,
                 config.seed or 0,
@@ -276,11 +276,11 @@ def _loaded(config: RunConfig, given: RunObjects | None, reporter: Reporter) -> 
                 config.event,
                 robot=robot_called(config.robot or COURIER.name),
             )
-        reporter.say(whole.description)
+        reporter.say(suite.description)
     else:
-        whole = load_suite(config.suite)
+        suite = load_suite(config.suite)
     return with_crowd(
-        whole,
+        suite,
         persons=config.crowd,
         vehicles=None if config.crowd is None else round(_VEHICLES_SHARE * config.crowd),
         residents=config.residents,
@@ -292,16 +292,21 @@ def _loaded(config: RunConfig, given: RunObjects | None, reporter: Reporter) -> 
 
 def _planned(
     config: RunConfig,
-    given: RunObjects | None,
-    whole: Suite,
-    of_run: Sequence[Scenario],
+    objects: RunObjects | None,
+    suite: Suite,
+    selected: Sequence[Scenario],
     ends: RunConnections,
 ) -> PlannedRun:
-    if given is not None:
+    if objects is not None:
         return planned_run(
-            config, whole, of_run, policy=given.policy, options=given.options, host=given.host
+            config,
+            suite,
+            selected,
+            policy=objects.policy,
+            options=objects.options,
+            host=objects.host,
         )
-    return planned_run(config, whole, of_run, host=host_of(config, ends.servers))
+    return planned_run(config, suite, selected, host=host_of(config, ends.servers))
 
 
 def _default_folder(plan: PlannedRun, stack: ExitStack, *, temporary: bool) -> Path:
@@ -310,12 +315,12 @@ def _default_folder(plan: PlannedRun, stack: ExitStack, *, temporary: bool) -> P
         return Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     shard = "" if plan.shard is None else f"-{plan.shard.number}-of-{plan.shard.of}"
-    return Path("runs") / f"{plan.whole.name}-{plan.driver.manifest.name}-{stamp}{shard}"
+    return Path("runs") / f"{plan.suite.name}-{plan.driver.manifest.name}-{stamp}{shard}"
 
 
-def _checking_jobs(config: RunConfig, carrier: Carrier | None) -> int:
+def _checking_jobs(config: RunConfig, workers: WorkerConnection | None) -> int:
     """Return the number of processes that check places."""
-    return (config.jobs or 1) if carrier is None and not config.on else len(os.sched_getaffinity(0))
+    return (config.jobs or 1) if workers is None and not config.on else len(os.sched_getaffinity(0))
 
 
 def _checked(plan: PlannedRun, folder: Path, reporter: Reporter, jobs: int) -> PlannedRun:
@@ -328,7 +333,7 @@ def _checked(plan: PlannedRun, folder: Path, reporter: Reporter, jobs: int) -> P
     if plan.config.resume:
         check_folder(plan, folder)
     with reporter.stage(LOOKING) as looking:
-        check_places(plan.whole, plan.picked, looking, jobs)
+        check_places(plan.suite, plan.scenarios, looking, jobs)
     return _with_latency(plan, _measured(plan, reporter)) if latency_ms is None else plan
 
 
@@ -338,20 +343,19 @@ def _with_latency(plan: PlannedRun, latency_ms: float) -> PlannedRun:
 
 def _measured(plan: PlannedRun, reporter: Reporter) -> float:
     """Measure the latency of the policy in the first episode, in ms, and report it."""
-    first = plan.picked[0]
+    first = plan.scenarios[0]
     with reporter.stage(f"measuring the latency of {plan.policy} in {first.id}"):
         answer_ms, latency_ms = measured_latency(
-            plan.whole, first, plan.policy, plan.options, plan.host
+            plan.suite, first, plan.policy, plan.options, plan.host
         )
     reporter.say(
-        f"Latency {latency_ms:g} ms, that of every command of this run: in {first.id} an "
-        f"answer took "
+        f"Latency {latency_ms:g} ms for every command of this run: in {first.id} an answer took "
         f"{milliseconds(answer_ms)} (median), and commands take effect at whole ticks of 50 ms."
     )
     if latency_ms > (period_ms := 1000.0 / plan.driver.manifest.rate_hz):
         reporter.say(
-            f"That is longer than its period of {period_ms:g} ms, at which it is asked all the "
-            "same. With --real-time it is not asked again before it has answered."
+            f"That is longer than its period of {period_ms:g} ms, at which it is still queried. "
+            "With --real-time it is not queried again before it has answered."
         )
     return latency_ms
 
@@ -368,7 +372,7 @@ class MeasuredLatency(NamedTuple):
 
 
 def measured_latency(
-    whole: Suite,
+    suite: Suite,
     first: Scenario,
     policy: str,
     options: EpisodeOptions,
@@ -386,7 +390,7 @@ def measured_latency(
         appearance=options.appearance,
         real_time=True,
     )
-    row = run(whole, policy, scenarios=[first.id], options=real_time, host=host).iloc[0]
+    row = run(suite, policy, scenarios=[first.id], options=real_time, host=host).iloc[0]
     if not isinstance(row["ended"], str):
         raise UsageError(
             f"the latency of '{policy}' cannot be measured: {first.id} is {row['status']}: "
@@ -395,25 +399,25 @@ def measured_latency(
     return MeasuredLatency(float(row["answer_ms"]), float(row["latency_ms"]))
 
 
-def _workers(plan: PlannedRun, given: RunObjects | None, reporter: Reporter) -> Carrier:
+def _workers(plan: PlannedRun, objects: RunObjects | None, reporter: Reporter) -> WorkerConnection:
     """Return the connection to the workers of a run: on Ray, this process, or child processes."""
     if plan.config.on:
-        from scenarios.runs.ray_workers import ray_carrier
+        from scenarios.runs.ray_workers import ray_workers
 
-        return ray_carrier(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
-    if given is not None and given.policy is not None:
+        return ray_workers(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
+    if objects is not None and objects.policy is not None:
         return nullcontext(partial(_in_this_process, plan.driver))
-    return nullcontext(partial(_by_processes, plan.config.jobs or 1))
+    return nullcontext(partial(_local_processes, plan.config.jobs or 1))
 
 
-def _by_processes(
-    jobs: int, run: HeldRun, handle: MessageHandler
+def _local_processes(
+    jobs: int, run: LockedRun, handle: MessageHandler
 ) -> AbstractContextManager[tuple[LocalProcesses, MessageHandler]]:
-    return nullcontext((LocalProcesses(run.held.path / "logs", jobs), handle))
+    return nullcontext((LocalProcesses(run.folder.path / "logs", jobs), handle))
 
 
 def _in_this_process(
-    driver: PolicyCaller, run: HeldRun, handle: MessageHandler
+    driver: PolicyCaller, run: LockedRun, handle: MessageHandler
 ) -> AbstractContextManager[tuple[InProcess, MessageHandler]]:
     return nullcontext((InProcess(driver), handle))
 
@@ -466,7 +470,7 @@ def _live(connection: Connection | None, named: str) -> Iterator[LiveAddress | N
 
 
 def _run_todo(
-    plan: PlannedRun, run: HeldRun, create_transport: TransportFactory, handle: MessageHandler
+    plan: PlannedRun, run: LockedRun, create_transport: TransportFactory, handle: MessageHandler
 ) -> None:
     """Run the episodes without a result. Raises MachineError, UsageError."""
     if not run.todo:
@@ -474,7 +478,7 @@ def _run_todo(
     with ExitStack() as stack:
         renderer = None
         if plan.config.shared_renderer:
-            logs = run.held.path / "logs"
+            logs = run.folder.path / "logs"
             renderer = SharedRenderer(
                 logs,
                 run.hello,
@@ -484,7 +488,7 @@ def _run_todo(
             stack.enter_context(renderer)
         transport, handle = stack.enter_context(create_transport(run, handle))
         run_all(
-            run.held,
+            run.folder,
             run.todo,
             run.hello,
             transport,

@@ -78,21 +78,21 @@ class Transport(Protocol):
         """Wait until a worker may have something to report, or the time is over."""
 
 
-class HeldRun(NamedTuple):
+class LockedRun(NamedTuple):
     """A run whose folder is locked by this process.
 
     hello: introduces its policy.
-    picked: its scenarios, or those of its shard.
+    scenarios: its scenarios, or those of its shard.
     todo: those of them without a result.
     """
 
-    held: RunFolder
+    folder: RunFolder
     hello: Hello
-    picked: Sequence[Scenario]
+    scenarios: Sequence[Scenario]
     todo: Sequence[Scenario]
 
 
 TransportFactory = Callable[
-    [HeldRun, MessageHandler], AbstractContextManager[tuple[Transport, MessageHandler]]
+    [LockedRun, MessageHandler], AbstractContextManager[tuple[Transport, MessageHandler]]
 ]
 """Creates the transport for a run and wraps its progress callback."""

@@ -310,8 +310,14 @@ def run_job(
     if outcome.traceback:
         print(f"--- {name}\n{outcome.traceback}", file=sys.stderr, flush=True)
     log = b"" if outcome.log is None else outcome.log.encoded()
-    shown = b"" if expert is None else expert.kept(job.scenario, outcome.record, outcome.log)
-    done = Done(name, outcome.record.status, outcome.record.encoded(), log, outcome.again, shown)
+    demonstration = (
+        b""
+        if expert is None
+        else expert.encoded_demonstration(job.scenario, outcome.record, outcome.log)
+    )
+    done = Done(
+        name, outcome.record.status, outcome.record.encoded(), log, outcome.again, demonstration
+    )
     return done, bool(outcome.traceback)
 
 

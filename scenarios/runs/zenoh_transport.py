@@ -39,7 +39,7 @@ from scenarios.runs.protocol import (
     run_hash,
 )
 from scenarios.runs.status import WorkerRegistry
-from scenarios.runs.transport import AdoptedJob, HeldRun, LateResult, Reception
+from scenarios.runs.transport import AdoptedJob, LateResult, LockedRun, Reception
 
 LEASE_S: Final = 15.0
 """Seconds without a report after which a worker has lost its lease, whether or not Zenoh still
@@ -371,15 +371,15 @@ def _answer(query: Query, reply: CoordinatorReply) -> None:
 
 @contextmanager
 def workers_of_run(
-    session: Session, run: HeldRun, handle: MessageHandler, *, resumed: bool
+    session: Session, run: LockedRun, handle: MessageHandler, *, resumed: bool
 ) -> Iterator[tuple[ZenohWorkers, MessageHandler]]:
     """Create the transport of a run and wrap its progress callback.
 
     At the end of the block, unless it failed, workers are informed that the run is over."""
-    registry = WorkerRegistry(run.held, run.picked, len(run.picked) - len(run.todo), handle)
-    workers = ZenohWorkers(session, run.held.spec, run.hello, registry, resumed=resumed)
+    registry = WorkerRegistry(run.folder, run.scenarios, len(run.scenarios) - len(run.todo), handle)
+    workers = ZenohWorkers(session, run.folder.spec, run.hello, registry, resumed=resumed)
     workers.open()
-    registry.note(f"run {workers.run}: {len(run.todo)} of {len(run.picked)} episodes to be run")
+    registry.note(f"run {workers.run}: {len(run.todo)} of {len(run.scenarios)} episodes to be run")
     yield workers, registry.handle
     registry.note("the run is over")
     workers.close()

@@ -83,14 +83,14 @@ def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[st
         )
         return
     for scenario in scenarios:
-        told = (
+        faults = (
             *_off(scenario, area),
             *_odd_crossings(scenario, street_map),
             *_odd_barriers(scenario, street_map),
             *_odd_obstacles(scenario, area),
             *_crowded(scenario, street_map),
         )
-        yield from (f"scenario '{scenario.id}': {fault}" for fault in told)
+        yield from (f"scenario '{scenario.id}': {fault}" for fault in faults)
 
 
 def _off(scenario: Scenario, area: WalkableArea) -> Iterator[str]:

@@ -76,7 +76,7 @@ def test_an_episode_that_comes_out_otherwise_is_not_shown(run: Path, column: str
 def test_a_replay_that_is_judged_alone_has_no_result(run: Path) -> None:
     """It ends when the recorded one did; what was measured in it is not to be had."""
     told = load_recorded(run, NAME)
-    episode, policy = replay_episode(told, judged_alone=True)
+    episode, policy = replay_episode(told, without_measures=True)
     with episode:
         observation = episode.reset()
         while not episode.over:

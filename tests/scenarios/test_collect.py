@@ -134,7 +134,9 @@ def shown_here(
     demonstrator = Demonstrator(expert, collecting, "route_point", beside)
     options = EpisodeOptions(goal="route_point", seed=0)
     outcome = run_episode(way, demonstrator, options)
-    return Demonstration.decoded(demonstrator.kept(way, outcome.record, outcome.log), way.id)
+    return Demonstration.decoded(
+        demonstrator.encoded_demonstration(way, outcome.record, outcome.log), way.id
+    )
 
 
 def test_what_was_killed_and_went_on_is_to_the_byte_what_one_process_drives(

@@ -42,7 +42,7 @@ from scenarios.runs.protocol import (
     run_hash,
 )
 from scenarios.runs.status import RunStatus
-from scenarios.runs.transport import HeldRun
+from scenarios.runs.transport import LockedRun
 from scenarios.runs.zenoh_transport import workers_of_run
 from sumo_nets.net.raw_file import net_xml_hash
 from tests.conftest import PATIENCE_S, Cosim, wait_until
@@ -132,7 +132,7 @@ class Run:
             done = held.finished()
             todo = [one for one in SUITE.scenarios if one.id not in done]
             try:
-                run = HeldRun(held, hello, SUITE.scenarios, todo)
+                run = LockedRun(held, hello, SUITE.scenarios, todo)
                 with workers_of_run(hub, run, lambda _: None, resumed=self._resumed) as (
                     transport,
                     tell,

@@ -18,10 +18,10 @@ from scenarios.suites.catalog import SUITES, load_suite
 from scenarios.tools.verify import engines
 from scenarios.tools.verify import shipped as shipped_values
 from scenarios.tools.verify.cases import verified_cases
-from scenarios.tools.verify.engines import DRIVER, ROOMS, room_hashes, textures
-from scenarios.tools.verify.shipped import SHIPPED, Given, trace_of, writable
+from scenarios.tools.verify.engines import DRIVER, TOP_FOLDERS, source_hashes, textures
+from scenarios.tools.verify.shipped import SHIPPED, Results, trace_of, writable
 from scenarios.tools.verify.traces import Trace, kept_picture, traced
-from scenarios.tools.verify.verdict import blamed, findings, first_difference
+from scenarios.tools.verify.verdict import BLAMES, blamed, findings, first_difference
 from sumo_nets.crowd import shown_people
 from tests.conftest import ROOT, Cosim
 
@@ -30,11 +30,11 @@ replace = msgspec.structs.replace
 
 
 @pytest.fixture(scope="module")
-def shipped() -> Given:
-    return Given.load(SHIPPED)
+def shipped() -> Results:
+    return Results.load(SHIPPED)
 
 
-def test_what_is_shipped_is_of_the_shipped_suites(shipped: Given) -> None:
+def test_what_is_shipped_is_of_the_shipped_suites(shipped: Results) -> None:
     """Twelve cases by the rule, each with both pictures. `scans` has no structure of its own."""
     assert shipped.suites == {name: load_suite(name).content_hash for name in SUITES}, REMADE
     cases = verified_cases()
@@ -47,9 +47,9 @@ def test_what_is_shipped_is_of_the_shipped_suites(shipped: Given) -> None:
     assert writable(shipped, [case.id for case in cases]) is shipped
 
 
-def test_what_is_shipped_was_made_by_the_sources_as_they_are(shipped: Given) -> None:
+def test_what_is_shipped_was_made_by_the_sources_as_they_are(shipped: Results) -> None:
     """Else a difference is blamed on a source that is as it was shipped."""
-    here = room_hashes()
+    here = source_hashes()
     other = [
         room for room in {*here, *shipped.sources} if here.get(room) != shipped.sources.get(room)
     ]
@@ -59,7 +59,12 @@ def test_what_is_shipped_was_made_by_the_sources_as_they_are(shipped: Given) -> 
     )
 
 
-def told(shipped: Given, here: Given) -> tuple[list[str], str]:
+def test_a_difference_is_blamed_on_packages_that_exist() -> None:
+    """Every package that a blame names has a source hash, so that an edited one is found."""
+    assert {source for blame in BLAMES.values() for source in blame.sources} <= {*source_hashes()}
+
+
+def differences(shipped: Results, here: Results) -> tuple[list[str], str]:
     """What differs, and all that is said of it."""
     wrong = [one for one in findings(shipped, here) if not one.fine]
     words = [f"{one.name}: {one.words}" for one in wrong]
@@ -74,19 +79,19 @@ def changed_at(trace: Trace, part: str, tick: int) -> Trace:
     return replace(trace, ticks=later | {part: trace.ticks[part][:at] + other}, state_hash="other")
 
 
-def with_trace(given: Given, case: str, change: Callable[[Trace], Trace | str]) -> Given:
+def with_trace(given: Results, case: str, change: Callable[[Trace], Trace | str]) -> Results:
     trace = given.traces[case]
     assert isinstance(trace, Trace)
     return replace(given, traces=given.traces | {case: change(trace)})
 
 
-def test_the_shipped_installation_is_found_whole(shipped: Given) -> None:
+def test_the_shipped_installation_is_found_whole(shipped: Results) -> None:
     """Beside itself nothing differs, and there is a line for every case."""
-    assert told(shipped, shipped) == ([], "")
+    assert differences(shipped, shipped) == ([], "")
     assert {*shipped.traces} < {one.name for one in findings(shipped, shipped)}
 
 
-PLANTED: dict[str, tuple[Callable[[Given], Given], list[str], tuple[str, ...]]] = {
+PLANTED: dict[str, tuple[Callable[[Results], Results], list[str], tuple[str, ...]]] = {
     "package": (
         lambda g: replace(g, versions=g.versions | {"numpy": "9.9"}),
         ["package numpy"],
@@ -166,10 +171,10 @@ PLANTED: dict[str, tuple[Callable[[Given], Given], list[str], tuple[str, ...]]] 
 
 @pytest.mark.parametrize("plant, names, words", PLANTED.values(), ids=PLANTED)
 def test_what_is_planted_is_named_with_its_remedy(
-    shipped: Given, plant: Callable[[Given], Given], names: list[str], words: tuple[str, ...]
+    shipped: Results, plant: Callable[[Results], Results], names: list[str], words: tuple[str, ...]
 ) -> None:
     """Nothing else differs, and the words say which engine, version or part it is."""
-    found, said = told(shipped, plant(shipped))
+    found, said = differences(shipped, plant(shipped))
     assert found == names
     for word in words:
         assert word in said
@@ -197,11 +202,11 @@ def picture(level: int) -> Frame:
     ],
 )
 def test_pictures_may_differ_a_little_where_another_driver_draws(
-    shipped: Given, level: int, driver: str, fine: bool
+    shipped: Results, level: int, driver: str, fine: bool
 ) -> None:
     """Where the shipped driver draws they are the same to the bit."""
 
-    def with_picture(given: Given, level: int) -> Given:
+    def with_picture(given: Results, level: int) -> Results:
         one = kept_picture(picture(level))
         return with_trace(
             given, "curve-001", lambda t: replace(t, pictures=t.pictures | {"gl": one})
@@ -211,7 +216,7 @@ def test_pictures_may_differ_a_little_where_another_driver_draws(
     after = with_picture(shipped, level)
     if driver == "another":
         after = replace(after, alone=after.alone | {DRIVER: "0"}, renderer="gl: other")
-    found, said = told(before, after)
+    found, said = differences(before, after)
     assert found == ([] if fine else ["curve-001"])
     assert fine or "its picture by gl is not: 100.00 % of the labels" in said
 
@@ -228,20 +233,22 @@ def test_a_changed_texture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     before = textures()
     monkeypatch.setattr(engines, "_STACKS", (ground_layers, *engines._STACKS[1:]))
-    assert {name for name, told in textures().items() if before[name] != told} == {"ground asphalt"}
+    assert {name for name, differences in textures().items() if before[name] != differences} == {
+        "ground asphalt"
+    }
 
 
 def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
     """In a copy of the tree one constant is another one: the hash of its room is, and no other."""
-    for room in ROOMS:
+    for room in TOP_FOLDERS:
         shutil.copytree(
             ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__", "*.json")
         )
-    before = room_hashes(tmp_path)
+    before = source_hashes(tmp_path)
     edited = tmp_path / "sumo_nets" / "crowd" / "shown_people.py"
     edited.write_text(edited.read_text().replace("MAX_SPEED_MPS = 2.2", "MAX_SPEED_MPS = 2.1"))
-    after = room_hashes(tmp_path)
-    assert before == room_hashes(ROOT)
+    after = source_hashes(tmp_path)
+    assert before == source_hashes(ROOT)
     assert {room for room in before if before[room] != after[room]} == {"sumo_nets/crowd"}
 
 
@@ -252,9 +259,9 @@ def test_damaged_values_are_named(tmp_path: Path, content: bytes) -> None:
     """In one line, with the remedy."""
     (tmp_path / "verify.json").write_bytes(content)
     with pytest.raises(
-        RunError, match=r"verify\.json: holds nothing to verify by: .*\. Install anew$"
+        RunError, match=r"verify\.json: holds nothing to verify by: .*\. Install again$"
     ):
-        Given.load(tmp_path / "verify.json")
+        Results.load(tmp_path / "verify.json")
 
 
 def test_whatever_a_case_raises_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,11 +293,11 @@ def test_this_installation_is_verified(cosim: Cosim) -> None:
 
 @pytest.mark.engine
 def test_a_changed_constant_of_the_crowd_is_found(
-    monkeypatch: pytest.MonkeyPatch, shipped: Given
+    monkeypatch: pytest.MonkeyPatch, shipped: Results
 ) -> None:
     """The crowd differs first, before all that hangs on it."""
     (case,) = [case for case in verified_cases() if case.id == "lh-001-00"]
     monkeypatch.setattr(shown_people, "MAX_SPEED_MPS", 1.2)
     trace = traced(replace(case, time_limit_s=1.0))
-    told = shipped.traces[case.id]
-    assert isinstance(told, Trace) and first_difference(told, trace)[0] == "crowd"
+    differences = shipped.traces[case.id]
+    assert isinstance(differences, Trace) and first_difference(differences, trace)[0] == "crowd"

@@ -44,7 +44,7 @@ from scenarios.runs.protocol import (
     digest_of,
     installed_here,
 )
-from scenarios.runs.transport import HeldRun
+from scenarios.runs.transport import LockedRun
 from scenarios.runs.zenoh_transport import workers_of_run
 
 _MODULE: Final = "tests.support.coordinating"
@@ -103,7 +103,7 @@ def serve_made_up(workers: int, jobs: int) -> Served:
             RunFolder.create(Path(folder) / "run", spec, suite) as held,
             open_session(Connection(role="coordinator", listen=endpoint)) as session,
             workers_of_run(
-                session, HeldRun(held, hello, scenarios, scenarios), lambda _: None, resumed=False
+                session, LockedRun(held, hello, scenarios, scenarios), lambda _: None, resumed=False
             ) as of,
         ):
             load = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

@@ -26,11 +26,11 @@ def own_faults(file: OwnFile, progress: Progress = ignore) -> list[str]:
     """Return all faults of the scenarios of a file, each once, in the order of the scenarios."""
     found: dict[str, None] = {}
     for made in made_of(file, progress):
-        told = made.faults
-        if made.scenario is not None and not told:
-            told = tuple(_faults_on_the_street(made.scenario))
+        faults = made.faults
+        if made.scenario is not None and not faults:
+            faults = tuple(_faults_on_the_street(made.scenario))
         named = f"scenario '{made.variant.id}': "
-        found |= dict.fromkeys(fault.replace(named, "").removeprefix(named) for fault in told)
+        found |= dict.fromkeys(fault.replace(named, "").removeprefix(named) for fault in faults)
     return list(found)
 
 
@@ -49,9 +49,9 @@ def _faults_on_the_street(scenario: Scenario) -> Iterator[str]:
             read_hdri(scenario.light.hdri)
     except SpecError as error:
         yield f"light.hdri: {error}"
-    told = list(misfits([scenario], street_map))
-    yield from told
-    if not told:
+    faults = list(misfits([scenario], street_map))
+    yield from faults
+    if not faults:
         street = msgspec.structs.replace(
             scenario, id="own", suite="own", crowd=NO_CROWD, light=Light()
         )

@@ -184,8 +184,8 @@ def _faults_of_each(tree: dict[str, Any], axes: Sequence[Axis]) -> list[str]:
         first,
         *(_with(first, axis.field, value) for axis in axes for value in axis.values[1:]),
     ]
-    told = (fault for one in trees for fault in (*_misread(one), *_unknown_names(one)))
-    return list(dict.fromkeys(told))
+    faults = (fault for one in trees for fault in (*_misread(one), *_unknown_names(one)))
+    return list(dict.fromkeys(faults))
 
 
 def _misread(tree: dict[str, Any]) -> Iterator[str]:

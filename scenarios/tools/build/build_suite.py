@@ -351,8 +351,8 @@ def _line(folder: Path, slot: Slot) -> str:
     if kept is None:
         return f"{slot.name}: NOT SOLVED; {_in_words(_tried(folder, slot.name).dropped)}"
     length_m = kept.scenario.route_line.length_m
-    told = f"{slot.name}: {length_m:.0f} m, {kept.proof.time_s:.0f} s"
-    return f"{told}; dropped: {_in_words(kept.proof.dropped)}" if kept.proof.dropped else told
+    line = f"{slot.name}: {length_m:.0f} m, {kept.proof.time_s:.0f} s"
+    return f"{line}; dropped: {_in_words(kept.proof.dropped)}" if kept.proof.dropped else line
 
 
 def _in_words(dropped: Sequence[Dropped]) -> str:

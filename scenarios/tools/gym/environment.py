@@ -182,5 +182,5 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
 def _outcome(record: Record) -> _Told:
     """Return the final info of an episode."""
     metrics = {name: value for name, value in record.measures.items() if value is not None}
-    told = msgspec.structs.replace(record, clock={})
-    return {"record": told, "metrics": metrics, "is_success": metrics.get("success") == 1.0}
+    published = msgspec.structs.replace(record, clock={})
+    return {"record": published, "metrics": metrics, "is_success": metrics.get("success") == 1.0}

@@ -157,10 +157,10 @@ def _drive(
         rays: RayCaster | None = None
         if range_m := sensing_range_m(manifest):
             rays = stack.enter_context(RayCaster(surface, (), (), robot, range_m))
-        told = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
+        exact = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
         observer = Observer(
             scenario,
-            told,
+            exact,
             0,
             lambda now: privileged_state(scenario, free(), (), now),
             cameras,

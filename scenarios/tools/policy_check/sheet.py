@@ -62,10 +62,10 @@ def _panel(
     answer = None
     try:
         answer = asker.answer(scene, *edits)
-        told = f"{name}: {answer.v_mps:.2f} m/s, {answer.degrees}"
+        label = f"{name}: {answer.v_mps:.2f} m/s, {answer.degrees}"
         path = path_of(answer)
     except PolicyError as error:
-        told = f"{name}: {error}"
+        label = f"{name}: {error}"
         path = np.zeros((0, 2))
     index = asker.manifest.waypoints.index
     followed = (
@@ -79,7 +79,7 @@ def _panel(
         _draw(picture, pixels_of(path, seen.camera) * (_WIDE_PX / seen.rgb.shape[1]), followed)
     _draw_above(picture, path, followed)
     shade(picture, (0, 0, _WIDE_PX, _BAR_PX))
-    words(picture, told, (8, 18), 0.45)
+    words(picture, label, (8, 18), 0.45)
     picture[:, -2:] = 250
     picture[-2:] = 250
     return np.asarray(picture)

@@ -22,7 +22,7 @@ from physics.textures.ground import ground_layers
 from physics.textures.walls import prop_layers, wall_layers
 from sumo_nets.net.engine_check import reference_hashes
 
-ROOMS: Final = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
+TOP_FOLDERS: Final = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 DRIVER: Final = "OpenGL driver"
 _STACKS: Final = (ground_layers, wall_layers, prop_layers, facade_layers)
 _PX: Final = 256
@@ -33,11 +33,11 @@ def engines_alone() -> dict[str, str]:
 
     The driver is absent if the machine has none. No SUMO may run in this process.
     """
-    told = {**_arithmetic(), **reference_hashes(), **bullet_fingerprint()}
+    hashes = {**_arithmetic(), **reference_hashes(), **bullet_fingerprint()}
     try:
-        return {**told, DRIVER: driver_alone()}
+        return {**hashes, DRIVER: driver_alone()}
     except EngineError:
-        return told
+        return hashes
 
 
 def _arithmetic() -> dict[str, str]:
@@ -57,29 +57,29 @@ def _arithmetic() -> dict[str, str]:
 
 def textures() -> dict[str, str]:
     """Return a hash of each texture by its name."""
-    told: dict[str, str] = {}
+    hashes: dict[str, str] = {}
     for stack in _STACKS:
         layers = stack(_PX)
         for i, name in enumerate(layers.names):
             finish = [] if layers.finish is None else [layers.finish[i]]
-            told[f"{stack.__name__.removesuffix('_layers')} {name}"] = _hash(
+            hashes[f"{stack.__name__.removesuffix('_layers')} {name}"] = _hash(
                 layers.rgba[i], *finish
             )
-    return told
+    return hashes
 
 
-def room_hashes(root: Path | None = None) -> dict[str, str]:
+def source_hashes(root: Path | None = None) -> dict[str, str]:
     """Return a hash of the source of each package, such as "physics/textures".
 
     Files outside packages count for their top folder.
     """
     root = Path(cosim.__file__).parents[1] if root is None else root
-    rooms: dict[str, list[Path]] = {}
-    for top in ROOMS:
+    sources: dict[str, list[Path]] = {}
+    for top in TOP_FOLDERS:
         for path in sorted([*(root / top).rglob("*.py"), *(root / top).rglob("*.urdf")]):
             inside = path.relative_to(root).parts
-            rooms.setdefault("/".join(inside[: 2 if len(inside) > 2 else 1]), []).append(path)
-    return {room: _source_hash(root, paths) for room, paths in rooms.items()}
+            sources.setdefault("/".join(inside[: 2 if len(inside) > 2 else 1]), []).append(path)
+    return {room: _source_hash(root, paths) for room, paths in sources.items()}
 
 
 def _source_hash(root: Path, paths: Sequence[Path]) -> str:

@@ -20,14 +20,14 @@ from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
 from scenarios.episodes.run_episode import error_message
 from scenarios.suites.catalog import SUITES, load_suite
-from scenarios.tools.verify.engines import DRIVER, engines_alone, room_hashes, textures
+from scenarios.tools.verify.engines import DRIVER, engines_alone, source_hashes, textures
 from scenarios.tools.verify.traces import Trace, traced
 
 SHIPPED: Final = next(iter(SUITES.values())).parent / "verify.json"
 _SCHEMA: Final = 1
 
 
-class Given(msgspec.Struct, frozen=True, kw_only=True):
+class Results(msgspec.Struct, frozen=True, kw_only=True):
     """Results of an installation.
 
     renderer: of the gl camera, "" without one.
@@ -52,20 +52,20 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
             raise unwritable(path, error) from error
 
     @classmethod
-    def load(cls, path: Path) -> Given:
+    def load(cls, path: Path) -> Results:
         """Raises RunError that names the file and the remedy."""
         try:
-            given = msgspec.json.decode(path.read_bytes(), type=cls)
+            results = msgspec.json.decode(path.read_bytes(), type=cls)
         except (OSError, msgspec.DecodeError) as error:
-            raise RunError(f"{path}: holds nothing to verify by: {error}. Install anew") from error
-        if given.schema != _SCHEMA:
+            raise RunError(f"{path}: holds nothing to verify by: {error}. Install again") from error
+        if results.schema != _SCHEMA:
             raise RunError(
-                f"{path}: schema {given.schema}; this version reads {_SCHEMA}. Install anew"
+                f"{path}: schema {results.schema}; this version reads {_SCHEMA}. Install again"
             )
-        return given
+        return results
 
 
-def given_here(cases: Sequence[Scenario], jobs: int, progress: Progress) -> Given:
+def results_here(cases: Sequence[Scenario], jobs: int, progress: Progress) -> Results:
     """Return the results of this installation.
 
     jobs: number of processes; this one is used for 1.
@@ -78,11 +78,11 @@ def given_here(cases: Sequence[Scenario], jobs: int, progress: Progress) -> Give
     alone, layers, *traces = (
         _done_here(work, progress) if jobs == 1 else _done_in_processes(work, jobs, progress)
     )
-    return Given(
+    return Results(
         versions=versions(),
         renderer=renderer_of(camera_of_choice("gl")) if DRIVER in alone else "",
         suites={name: load_suite(name).content_hash for name in SUITES},
-        sources=room_hashes(),
+        sources=source_hashes(),
         alone=alone,
         textures=layers,
         traces={case.id: trace for case, trace in zip(cases, traces, strict=True)},
@@ -122,15 +122,17 @@ def trace_of(case: Scenario) -> Trace | str:
         return error_message(error)
 
 
-def writable(given: Given, cases: Sequence[str]) -> Given:
+def writable(results: Results, cases: Sequence[str]) -> Results:
     """Return results that may be shipped: all cases, each run, by both cameras. Raises RunError."""
-    broken = [f"{name} ({trace})" for name, trace in given.traces.items() if isinstance(trace, str)]
-    lacking = [name for name in cases if name not in given.traces]
-    if broken or lacking or not given.renderer:
+    broken = [
+        f"{name} ({trace})" for name, trace in results.traces.items() if isinstance(trace, str)
+    ]
+    lacking = [name for name in cases if name not in results.traces]
+    if broken or lacking or not results.renderer:
         why = (
             f"cases that did not run: {', '.join(broken + lacking)}"
             if broken or lacking
             else "there is no gl camera"
         )
         raise RunError(f"what is shipped is made of all cases and both cameras, and here {why}")
-    return given
+    return results

@@ -110,7 +110,7 @@ PARTS: Final[Mapping[str, Callable[[Step, Verdict], list[bytes]]]] = {
 
 def traced(case: Scenario) -> Trace:
     """Run a case with the oracle and take its trace. Raises what an Episode raises."""
-    told: dict[str, list[str]] = {part: [] for part in PARTS}
+    digits_of: dict[str, list[str]] = {part: [] for part in PARTS}
     pictures: dict[str, Shown] = {}
     stages: list[StagedScenario] = []
 
@@ -118,9 +118,9 @@ def traced(case: Scenario) -> Trace:
         if step.tick == 0:
             before = {"crowd": _street(step.street), "robot": [_robot(step.robot)]}
             for part in PARTS:
-                told[part].append(_digits(before.get(part, [])))
+                digits_of[part].append(_digits(before.get(part, [])))
         for part, data in PARTS.items():
-            told[part].append(_digits(data(step, verdict)))
+            digits_of[part].append(_digits(data(step, verdict)))
         if step.tick == PICTURE_AT_TICK:
             pictures.update(_pictures(stages[0], case, step))
 
@@ -130,7 +130,7 @@ def traced(case: Scenario) -> Trace:
         record, _ = episode.result()
     return Trace(
         scenario_hash=content_hash(case),
-        ticks={part: "".join(digits) for part, digits in told.items()},
+        ticks={part: "".join(digits) for part, digits in digits_of.items()},
         ended=str(record.ended),
         state_hash=record.state_hash,
         measures=record.measures,

@@ -67,11 +67,11 @@ def write_bag(
     message_store()
     if output.exists():
         raise UsageError(f"{output} is there already: choose another name, or remove it")
-    told = load_recorded(folder, scenario_id)
-    manifest = manifest_of_bag(told.record.manifest, picture)
+    recorded = load_recorded(folder, scenario_id)
+    manifest = manifest_of_bag(recorded.record.manifest, picture)
     try:
         with atomic_folder(output, existing="refuse") as part:
-            return _write(folder, told, manifest, part / "bag", camera, progress)
+            return _write(folder, recorded, manifest, part / "bag", camera, progress)
     except OSError as error:
         raise unwritable(output, error) from error
 
@@ -93,7 +93,7 @@ def manifest_of_bag(recorded: Manifest, picture: CameraSpec | None) -> Manifest:
 
 def _write(
     folder: Path,
-    told: RecordedEpisode,
+    recorded: RecordedEpisode,
     manifest: Manifest,
     path: Path,
     camera: CameraChoice,
@@ -103,11 +103,11 @@ def _write(
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     progress("reading the street map, starting SUMO and PyBullet")
-    episode, answers = observed_replay(told, manifest, camera)
+    episode, answers = observed_replay(recorded, manifest, camera)
     stream = messages.EpisodeStream(episode.id, episode.seed)
     with Writer(path, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as writer, episode:
         tape = _Tape(writer)
-        episode.watch(ReplayChecker(folder, told).watch)
+        episode.watch(ReplayChecker(folder, recorded).watch)
         for topic, sent in stream.begun():
             tape.write(topic, sent, stream.time_ns(0))
         seen = episode.reset()
@@ -119,8 +119,8 @@ def _write(
             command, delay = answers.at(seen.tick)
             tape.answer(command, now_ns)
             seen = episode.advance(command, delay=delay)
-            progress(f"recording {told.scenario.id}", episode.moment.tick / len(told.log))
-        check_state_hash(folder, told, episode.state_hash)
+            progress(f"recording {recorded.scenario.id}", episode.moment.tick / len(recorded.log))
+        check_state_hash(folder, recorded, episode.state_hash)
     for file in path.iterdir():
         file.rename(path.parent / file.name)
     path.rmdir()

@@ -123,12 +123,12 @@ def failure_to_film(folder: Path, scenario_id: str | None) -> FilmedFailure:
             or "no episode has ended"
         )
         raise RunError(f"{folder}: no episode failed: {counts}. Name an EPISODE to film it")
-    told = load_recorded(folder, scenario_id or failed[0])
-    mishap = mishaps_of(told.record)[0]
+    recorded = load_recorded(folder, scenario_id or failed[0])
+    mishap = mishaps_of(recorded.record)[0]
     at_s = Clock().time_s(mishap.tick + 1)
-    reason = reason_of(told.scenario, told.record, mishap, told.log)
+    reason = reason_of(recorded.scenario, recorded.record, mishap, recorded.log)
     return FilmedFailure(
-        told.record.scenario.id, at_s, reason, max(0.0, at_s - BEFORE_S), at_s + AFTER_S
+        recorded.record.scenario.id, at_s, reason, max(0.0, at_s - BEFORE_S), at_s + AFTER_S
     )
 
 
@@ -151,8 +151,8 @@ def make_film(
     Returns the simulated second at which it ends, infinite for the end of the episode. Raises
     RunError if the episode does not exist or the replay differs. No file is then written.
     """
-    told = load_recorded(folder, scenario_id)
-    scenario, log = told.scenario, told.log
+    recorded = load_recorded(folder, scenario_id)
+    scenario, log = recorded.scenario, recorded.log
     if not cut.from_s < cut.to_s:
         raise RunError(
             f"nothing lies between --from {cut.from_s:g} s and --to {cut.to_s:g} s: give a "
@@ -174,18 +174,18 @@ def make_film(
     fps = round(1.0 / Clock().tick_s)
     with ExitStack() as stack:
         video = stack.enter_context(Video(output, cut.size, fps))
-        episode, policy = replay_episode(told, cut.camera, appearance=cut.appearance)
+        episode, policy = replay_episode(recorded, cut.camera, appearance=cut.appearance)
         stack.enter_context(episode)
         camera = stack.enter_context(episode.eyes(robot_eye(cut)))
         minimap = Minimap(street_map, scenario, episode.footprint_m)
-        reel = _Reel(told, minimap, camera, video, cut, last, progress)
-        for watch in (ReplayChecker(folder, told).watch, reel.take):
+        reel = _Reel(recorded, minimap, camera, video, cut, last, progress)
+        for watch in (ReplayChecker(folder, recorded).watch, reel.take):
             episode.watch(watch)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < last:
             observation = episode.advance(policy.act(observation))
         if episode.over:
-            check_state_hash(folder, told, episode.result()[0].state_hash)
+            check_state_hash(folder, recorded, episode.result()[0].state_hash)
     return math.inf if last == len(log) else Clock().time_s(last)
 
 
@@ -202,7 +202,7 @@ class _Reel:
 
     def __init__(
         self,
-        told: RecordedEpisode,
+        recorded: RecordedEpisode,
         minimap: Minimap,
         camera: ViewCamera,
         video: Video,
@@ -210,11 +210,11 @@ class _Reel:
         last: int,
         progress: Progress,
     ) -> None:
-        self._scenario = told.scenario
-        self._record = told.record
+        self._scenario = recorded.scenario
+        self._record = recorded.record
         self._minimap = minimap
-        self._following = WaypointReplay(told.log)
-        self._credit = credit_of(told.scenario.place)
+        self._following = WaypointReplay(recorded.log)
+        self._credit = credit_of(recorded.scenario.place)
         self._plan: Floats | None = None
         self._camera = camera
         self._video = video
@@ -222,7 +222,7 @@ class _Reel:
         self._last = last
         self._progress = progress
         self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
-        if isinstance(robot_called(told.scenario.robot).drive, Legs):
+        if isinstance(robot_called(recorded.scenario.robot).drive, Legs):
             self._counts["fall"] = 0
         self._triggered: set[str] = set()
         self._caption = ("", hud.INK)

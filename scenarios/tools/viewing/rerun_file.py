@@ -109,10 +109,10 @@ def record_for_rerun(
     import rerun as rr
     import rerun.blueprint as rrb
 
-    told = load_recorded(folder, scenario_id)
+    recorded = load_recorded(folder, scenario_id)
     progress("reading the street map, starting SUMO, PyBullet and the camera")
     recording = rr.RecordingStream(
-        "cosim", recording_id=f"{told.record.scenario.id}-{told.record.state_hash}"
+        "cosim", recording_id=f"{recorded.record.scenario.id}-{recorded.record.state_hash}"
     )
     try:
         with atomic_file(output) as part:
@@ -121,7 +121,7 @@ def record_for_rerun(
                 recording.save(str(part), default_blueprint=_blueprint(rrb))
                 recording.set_log_time_enabled(False)
                 recording.set_log_tick_enabled(False)
-                _replay_into(_Tape(rr, recording, told), folder, told, camera, progress)
+                _replay_into(_Tape(rr, recording, recorded), folder, recorded, camera, progress)
                 recording.flush()
             finally:
                 recording.disconnect()
@@ -155,37 +155,37 @@ def _blueprint(rrb: Any) -> Any:
 
 
 def _replay_into(
-    tape: _Tape, folder: Path, told: RecordedEpisode, camera: CameraChoice, progress: Progress
+    tape: _Tape, folder: Path, recorded: RecordedEpisode, camera: CameraChoice, progress: Progress
 ) -> None:
-    spec = replace(told.record.manifest.camera or _SPEC, depth=True, labels=True)
-    episode, policy = replay_episode(told, camera)
-    with episode, episode.eyes(spec) as eyes, sensor_replay(told) as sensors:
-        surface = surface_of_place(told.scenario.place)
+    spec = replace(recorded.record.manifest.camera or _SPEC, depth=True, labels=True)
+    episode, policy = replay_episode(recorded, camera)
+    with episode, episode.eyes(spec) as eyes, sensor_replay(recorded) as sensors:
+        surface = surface_of_place(recorded.scenario.place)
         tape.begin(surface, spec)
         for watch in (
-            ReplayChecker(folder, told).watch,
+            ReplayChecker(folder, recorded).watch,
             lambda step, verdict: tape.tick(step, verdict, eyes, sensors),
         ):
             episode.watch(watch)
         observation = episode.reset()
         while not episode.over:
             observation = episode.advance(policy.act(observation))
-            progress(f"recording {told.scenario.id}", episode.moment.tick / len(told.log))
-        check_state_hash(folder, told, episode.result()[0].state_hash)
+            progress(f"recording {recorded.scenario.id}", episode.moment.tick / len(recorded.log))
+        check_state_hash(folder, recorded, episode.result()[0].state_hash)
     tape.plots()
 
 
 class _Tape:
     """Writes into a recording. rr: the package."""
 
-    def __init__(self, rr: Any, recording: Any, told: RecordedEpisode) -> None:
+    def __init__(self, rr: Any, recording: Any, recorded: RecordedEpisode) -> None:
         self._rr = rr
         self._to = recording
-        self._told = told
-        self._robot = robot_called(told.scenario.robot)
+        self._recorded = recorded
+        self._robot = robot_called(recorded.scenario.robot)
         self._triggered: set[str] = set()
         self._middles: dict[str, Floats] = {}
-        self._following = WaypointReplay(told.log)
+        self._following = WaypointReplay(recorded.log)
         self._planned: Floats | None = None
         self._surface: Surface
 
@@ -199,7 +199,7 @@ class _Tape:
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         names = [(number, name, _LABEL_COLOURS[number]) for name, number in LABELS.items()]
         self._log("world", rr.AnnotationContext(names), static=True)
-        self._map(self._told.scenario)
+        self._map(self._recorded.scenario)
         length, width = self._robot.footprint_m
         body = rr.Boxes3D(
             half_sizes=[[length / 2, width / 2, 0.25]], centers=[[0, 0, 0.2]], colors=[(30, 30, 30)]
@@ -420,7 +420,7 @@ class _Tape:
     def _say(self, step: Step, verdict: Verdict) -> None:
         """Log the events of the tick as text."""
         said: list[tuple[str, str]] = []
-        for event, state in zip(self._told.scenario.events, step.events.states, strict=True):
+        for event, state in zip(self._recorded.scenario.events, step.events.states, strict=True):
             if state.phase == "acting" and event.id not in self._triggered:
                 self._triggered.add(event.id)
                 said.append((f"event {event.id} {event.kind}", "INFO"))
@@ -435,7 +435,7 @@ class _Tape:
 
     def plots(self) -> None:
         """Log the plots of the trajectory."""
-        log = self._told.log
+        log = self._recorded.log
         rr = self._rr
         ticks = np.arange(1, len(log) + 1)
         columns = {

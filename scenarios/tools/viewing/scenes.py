@@ -107,22 +107,27 @@ def show_again(
 
     Raises RunError when it comes out otherwise.
     """
-    told = load_recorded(folder, scenario_id)
-    _, street_map = place(told.scenario.place)
-    following = WaypointReplay(told.log)
-    reels = [_Reel(told, mishap, following.follows) for mishap in mishaps]
+    recorded = load_recorded(folder, scenario_id)
+    _, street_map = place(recorded.scenario.place)
+    following = WaypointReplay(recorded.log)
+    reels = [_Reel(recorded, mishap, following.follows) for mishap in mishaps]
     last = _last_tick(mishaps)
     with ExitStack() as stack:
-        episode, policy = replay_episode(told, camera, judged_alone=True)
+        episode, policy = replay_episode(recorded, camera, without_measures=True)
         stack.enter_context(episode)
-        spec = robots_camera(told.record.manifest.camera)
+        spec = robots_camera(recorded.record.manifest.camera)
         # Each camera caches the surroundings of its own place. A shared camera would rebuild them
         # for each picture.
         seen, outside = (stack.enter_context(episode.eyes(spec)) for _ in range(2))
         shots = _Shots(
-            told, spec, seen, outside, set[int]().union(*map(_pictured, mishaps)), following.follows
+            recorded,
+            spec,
+            seen,
+            outside,
+            set[int]().union(*map(_pictured, mishaps)),
+            following.follows,
         )
-        episode.watch(ReplayChecker(folder, told).watch)
+        episode.watch(ReplayChecker(folder, recorded).watch)
 
         def watch(step: Step, verdict: Verdict) -> None:
             plan = following.take(step, verdict.reset is not None)
@@ -173,14 +178,14 @@ class _Shots:
 
     def __init__(
         self,
-        told: RecordedEpisode,
+        recorded: RecordedEpisode,
         spec: CameraSpec,
         seen: ViewCamera,
         outside: ViewCamera,
         ticks: Set[int],
         follows: int,
     ) -> None:
-        self._scenario = told.scenario
+        self._scenario = recorded.scenario
         self.spec = spec
         self._follows = follows
         self._seen = seen
@@ -230,8 +235,8 @@ class _Shots:
 class _Reel:
     """Collector of the moments before one failure. follows: see `WaypointReplay`."""
 
-    def __init__(self, told: RecordedEpisode, mishap: Mishap, follows: int) -> None:
-        self._scenario = told.scenario
+    def __init__(self, recorded: RecordedEpisode, mishap: Mishap, follows: int) -> None:
+        self._scenario = recorded.scenario
         self._mishap = mishap
         self._follows = follows
         self._first = max(0, mishap.tick - Clock().ticks(SHOWN_S))
