@@ -178,7 +178,7 @@ def draw_own(
     """Draw the map from above, with coordinates, route, fences, obstacles and events."""
     from cosim.report.mapsheet import draw_plan, write_png
     from scenarios.places.nets import place
-    from scenarios.suites.user_scenarios.build import made_one, place_of_own
+    from scenarios.suites.user_scenarios.build import build_scenario, place_of_own
     from scenarios.suites.user_scenarios.read import read_own
     from sumo_nets.maps.map_store import credit_of
 
@@ -190,7 +190,7 @@ def draw_own(
     variant = variants[scenario] if scenario else own.variants[0]
     instead = replacement_note(picture)
     with doing(f"drawing {variant.id}"):
-        made = made_one(variant, own.name)
+        made = build_scenario(variant, own.name)
         if made.scenario is None and not whole and part is None:
             faults = "\n  ".join(made.faults)
             raise SpecError(

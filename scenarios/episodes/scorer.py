@@ -57,7 +57,7 @@ class Scorer:
         self._hashes = False
 
     def skip_measures(self) -> None:
-        """Record no measures from now on, so that there is no result: only the referee judges."""
+        """Record nothing from now on, so that there is no result. Only the referee continues."""
         self._measures = ()
 
     def only_hash(self) -> None:
@@ -117,9 +117,7 @@ class Scorer:
         Raises UsageError after `skip_measures` and `only_hash`.
         """
         if not self._measures:
-            raise UsageError(
-                "this episode was judged alone, nothing of it was recorded: it has no result"
-            )
+            raise UsageError("this episode recorded no measures: it has no result")
         scenario = self._scenario
         log = self._recorder.log(self._monitor.tracks, commands)
         setup = begun.setup

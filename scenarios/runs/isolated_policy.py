@@ -193,7 +193,7 @@ def _driver(
         manifest = with_goal(checked_manifest(name, info.manifest), None)
         if manifest.privileged:
             raise UsageError(
-                f"policy '{manifest.name}' is told what the simulator knows (privileged), and an "
+                f"policy '{manifest.name}' needs privileged state, and an "
                 "isolated one sees only observations: leave --isolated out"
             )
         stack.pop_all()

@@ -203,7 +203,7 @@ class RayWorkers:
         except ConnectionError as error:
             raise MachineError(
                 f"the Ray cluster was lost: {_first_line(error)}: finished episodes are "
-                f"kept, go on with --resume"
+                f"stored, continue with --resume"
             ) from None
 
     def _tend(self) -> None:

@@ -100,7 +100,7 @@ class PolicyServers:
         same = [one for one in found if (one.info.manifest, one.info.source) == self._wanted]
         if not same:
             raise MachineError(
-                f"policy '{self.name}' was changed while the run was going on: serve the one that "
+                f"policy '{self.name}' was changed during the run: serve the one that "
                 "it began with, and add --resume, or begin another run"
             )
         random.shuffle(same)
@@ -256,8 +256,7 @@ def _check(name: str, manifest: Manifest) -> None:
     """Check that a policy can be queried over a network. Raises UsageError."""
     if manifest.privileged:
         raise UsageError(
-            f"policy '{name}' is told what the simulator knows (privileged), and a remote "
-            f"one sees only observations"
+            f"policy '{name}' needs privileged state, and a remote one sees only observations"
         )
     if (size := observation_bytes(manifest)) > LARGEST_MESSAGE_BYTES:
         raise UsageError(

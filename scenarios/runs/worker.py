@@ -241,9 +241,8 @@ def _checked(driver: PolicyCaller, expected: Hello, again: bool) -> PolicyCaller
     """Return a driver if it equals that of the run. Raises UsageError."""
     if driver.source_hash != expected.source_hash:
         raise UsageError(
-            f"policy '{expected.policy}' was edited while the run was going on: begin another "
-            f"run. Or it is a network "
-            "on another kind of processor than the run's, which answers otherwise in the last bit"
+            f"policy '{expected.policy}' was edited during the run: begin another run. Or it is a "
+            "network on another kind of processor than the run's, whose answers differ in the last bit"
         )
     if again:
         driver.manifest = expected.manifest

@@ -149,7 +149,7 @@ class _Contact:
         ago."""
         if self._once and time.monotonic() - self._at_s > GIVEN_UP_S:
             raise MachineError(
-                f"no run was heard of at {self._endpoint} for {GIVEN_UP_S:g} s: is it over? "
+                f"no run replied at {self._endpoint} for {GIVEN_UP_S:g} s: is it over? "
                 "Without --once a worker waits for the next one"
             )
         if not self._quiet:
@@ -209,7 +209,7 @@ class _Service:
             while not self._leaving.signal:
                 self._turn(listen=True)
                 if self._other_run():
-                    self._say("another run is there now")
+                    self._say("another run has replaced it")
                     return False
             self._hand_back()
         except RunEnded:

@@ -75,9 +75,9 @@ def holding(scenario_id: str) -> Suite:
     """
     ids: list[str] = []
     for name in SUITES:
-        whole = load_suite(name)
-        if scenario_id in (here := [s.id for s in whole.scenarios]):
-            return whole
+        suite = load_suite(name)
+        if scenario_id in (here := [s.id for s in suite.scenarios]):
+            return suite
         ids += here
     raise UsageError(
         f"{unknown('scenario', scenario_id, ids)} For one that was drawn by --map, give the run "
@@ -103,25 +103,25 @@ def one_scenario(
                 f"--scenario chooses from a suite or a file, and '{name}' is not a suite's name; "
                 f"for a scenario's id, leave --scenario out. Suites: {', '.join(SUITES)}"
             )
-        whole = holding(name) if suite is None else load_suite(suite)
-        return msgspec.structs.replace(whole, scenarios=select_scenarios(whole, [name])), 1
+        found = holding(name) if suite is None else load_suite(suite)
+        return msgspec.structs.replace(found, scenarios=select_scenarios(found, [name])), 1
     if suite is not None:
         raise UsageError(
             f"{name} is a suite or a file: leave --suite out, and choose one of its scenarios by "
             "--scenario"
         )
     if not name.endswith(".toml"):
-        whole = load_suite(name)
-        one = _picked([scenario.id for scenario in whole.scenarios], which)
-        return msgspec.structs.replace(whole, scenarios=(whole.scenarios[one],)), len(
-            whole.scenarios
+        found = load_suite(name)
+        one = _picked([scenario.id for scenario in found.scenarios], which)
+        return msgspec.structs.replace(found, scenarios=(found.scenarios[one],)), len(
+            found.scenarios
         )
-    from scenarios.suites.user_scenarios.build import made_one, suite_of
+    from scenarios.suites.user_scenarios.build import build_scenario, suite_of
     from scenarios.suites.user_scenarios.read import read_own
 
     own = read_own(Path(name))
     variant = own.variants[_picked([variant.id for variant in own.variants], which)]
-    return suite_of(own, [made_one(variant, own.name)]), len(own.variants)
+    return suite_of(own, [build_scenario(variant, own.name)]), len(own.variants)
 
 
 def _picked(ids: Sequence[str], which: str | None) -> int:
@@ -135,25 +135,25 @@ def _picked(ids: Sequence[str], which: str | None) -> int:
     raise UsageError(f"{unknown('scenario', which, ids)} Or its number, 1 to {len(ids)}.")
 
 
-def with_crowd(whole: Suite, **asked: float | None) -> Suite:
+def with_crowd(suite: Suite, **crowd_fields: float | None) -> Suite:
     """Return the suite with these fields of `CrowdSpec` in each scenario.
 
     It is another suite, with another version. Fields that are None stay unchanged. A number of
     persons replaces a density. Raises SpecError for an invalid crowd.
     """
-    changes = {field: value for field, value in asked.items() if value is not None}
+    changes = {field: value for field, value in crowd_fields.items() if value is not None}
     if not changes:
-        return whole
+        return suite
     replace = msgspec.structs.replace
     fields = {"density": None, **changes} if "persons" in changes else changes
     scenarios = tuple(
-        replace(s, crowd=replace(s.crowd, **fields, added=True)) for s in whole.scenarios
+        replace(s, crowd=replace(s.crowd, **fields, added=True)) for s in suite.scenarios
     )
-    version = "-".join([whole.version, *(f"{field}{value:g}" for field, value in changes.items())])
-    return replace(whole, scenarios=scenarios, version=version)
+    version = "-".join([suite.version, *(f"{field}{value:g}" for field, value in changes.items())])
+    return replace(suite, scenarios=scenarios, version=version)
 
 
-def with_robot(whole: Suite, robot: str) -> Suite:
+def with_robot(suite: Suite, robot: str) -> Suite:
     """Return the suite with this robot in each scenario.
 
     The robot belongs to a run, not to its suite: the identity of a run has the `content_hash` of
@@ -164,18 +164,18 @@ def with_robot(whole: Suite, robot: str) -> Suite:
         from physics.robots.check import check_robot  # imported only where needed: loads OpenCV
 
         check_robot(robot_called(robot))
-    scenarios = tuple(scenario.driven_by(robot) for scenario in whole.scenarios)
-    if scenarios == whole.scenarios:
-        return whole
-    return msgspec.structs.replace(whole, scenarios=scenarios)
+    scenarios = tuple(scenario.driven_by(robot) for scenario in suite.scenarios)
+    if scenarios == suite.scenarios:
+        return suite
+    return msgspec.structs.replace(suite, scenarios=scenarios)
 
 
-def with_weather(whole: Suite, weather: str) -> Suite:
+def with_weather(suite: Suite, weather: str) -> Suite:
     """Return the suite in this weather; unchanged if `weather` is "". Raises SpecError.
 
     Like the robot, the weather belongs to a run, not to its suite.
     """
     if not weather:
-        return whole
-    scenarios = tuple(scenario.in_weather(weather) for scenario in whole.scenarios)
-    return msgspec.structs.replace(whole, scenarios=scenarios)
+        return suite
+    scenarios = tuple(scenario.in_weather(weather) for scenario in suite.scenarios)
+    return msgspec.structs.replace(suite, scenarios=scenarios)

@@ -38,7 +38,7 @@ begin, and corners are wide.
 
 
 def check_places(
-    whole: Suite, scenarios: Sequence[Scenario], progress: Progress = ignore, jobs: int = 1
+    suite: Suite, scenarios: Sequence[Scenario], progress: Progress = ignore, jobs: int = 1
 ) -> None:
     """Check that each scenario of a suite fits its place, and generate missing places.
 
@@ -55,7 +55,7 @@ def check_places(
     for found in parallel_map(_misfits_at, list(there.items()), jobs, progress, LOOKING):
         faults += found
     if faults:
-        raise SpecError(f"suite '{whole.name}': {join_faults(faults)}")
+        raise SpecError(f"suite '{suite.name}': {join_faults(faults)}")
 
 
 def _misfits_at(of_place: tuple[Place, Sequence[Scenario]]) -> list[str]:

@@ -76,14 +76,14 @@ def read_proofs(suite: Path) -> Proofs:
         return msgspec.json.decode(path.read_bytes(), type=Proofs)
     except (OSError, msgspec.DecodeError) as error:
         raise SpecError(
-            f"{path}: no proofs that can be read: {error}: build the suite anew"
+            f"{path}: no proofs that can be read: {error}: build the suite again"
         ) from error
 
 
 def write_proofs(suite: Path, name: str, suite_hash: str, proofs: Sequence[Proof]) -> Proofs:
     """Write the proofs of a suite file, one a line."""
     reasons = Counter(dropped.reason for proof in proofs for dropped in proof.dropped)
-    whole = Proofs(
+    document = Proofs(
         suite=name,
         suite_hash=suite_hash,
         expert=", ".join(sorted({f"{proof.expert} {proof.expert_version}" for proof in proofs})),
@@ -91,8 +91,8 @@ def write_proofs(suite: Path, name: str, suite_hash: str, proofs: Sequence[Proof
         dropped=dict(sorted(reasons.items(), key=lambda item: (-item[1], item[0]))),
         proofs=tuple(proofs),
     )
-    head = msgspec.json.encode(msgspec.structs.replace(whole, proofs=()))
+    head = msgspec.json.encode(msgspec.structs.replace(document, proofs=()))
     rows = b",\n".join(msgspec.json.encode(proof) for proof in proofs)
     assert head.endswith(b'"proofs":[]}')
     write_atomic(proofs_path(suite), head.removesuffix(b"]}") + b"\n" + rows + b"\n]}\n")
-    return whole
+    return document

@@ -185,7 +185,7 @@ def reactive_on(
         robot=robot,
     )
     of_kind = {"structure": kind.name, "ends_at": kind.ends_at}
-    whole = msgspec.structs.replace(
+    scenario = msgspec.structs.replace(
         bare,
         crowd=NO_CROWD,
         ends_on_failure=True,
@@ -193,7 +193,7 @@ def reactive_on(
         events=(_event_at(kind, at, wanted, rng, robot),),
         **of_kind,
     )
-    return with_lanes_blocked(whole, kind, street_map)
+    return with_lanes_blocked(scenario, kind, street_map)
 
 
 def _wanted_in_turn(rng: np.random.Generator, *, scanned: bool) -> Iterator[Wanted]:

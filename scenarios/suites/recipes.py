@@ -137,10 +137,10 @@ def candidate(slot: Slot, seed: int) -> Scenario:
     rng = np.random.default_rng([seed, zlib.crc32(slot.name.encode())])
     # Each structure has another offset, so that those of one city are not all of one hour.
     light = drawn_daylight(rng, slot.number + 5 * zlib.crc32(slot.structure.encode()) % 84)
-    whole = msgspec.structs.replace(
+    scenario = msgspec.structs.replace(
         drawn, suite=slot.suite, light=light, split=slot.split, structure=slot.structure
     )
-    return msgspec.convert(_in_few_digits(msgspec.to_builtins(whole)), Scenario)
+    return msgspec.convert(_in_few_digits(msgspec.to_builtins(scenario)), Scenario)
 
 
 def _in_few_digits(value: Any) -> Any:

@@ -96,8 +96,8 @@ def drawn_on_map(
         return suite_on_map("reactive", called, int(seed), 1, roughness, (what,), robot=robot)
     if what is None:
         return suite_on_map("long-horizon", called, int(seed), 1, roughness, robot=robot)
-    whole = suite_on_map("unit", called, int(seed), None, roughness, robot=robot)
-    return msgspec.structs.replace(whole, scenarios=select_scenarios(whole, [scenario_id]))
+    drawn = suite_on_map("unit", called, int(seed), None, roughness, robot=robot)
+    return msgspec.structs.replace(drawn, scenarios=select_scenarios(drawn, [scenario_id]))
 
 
 class _Drawn(NamedTuple):
@@ -128,14 +128,14 @@ class _Drawn(NamedTuple):
         names: Iterable[str],
         draw: Callable[[str, int], Scenario],
         count: int | None,
-        asked: Sequence[str] = (),
+        required: Sequence[str] = (),
     ) -> tuple[list[Scenario], list[str]]:
         """Draw `count` scenarios by name, which take turns.
 
-        asked: only these names, each of which must have room.
+        required: only these names, each of which must have room.
         Returns the scenarios, and a sentence for each name without room.
         """
-        left = [name for name in names if name in asked or not asked]
+        left = [name for name in names if name in required or not required]
         found: list[Scenario] = []
         left_out: list[str] = []
         for seed in itertools.count(self.seed):
@@ -143,7 +143,7 @@ class _Drawn(NamedTuple):
                 try:
                     found.append(draw(name, seed))
                 except (SpecError, MapError) as refusal:
-                    if asked:
+                    if required:
                         raise
                     left.remove(name)
                     left_out.append(f"No '{name}': {refusal}.")

@@ -104,8 +104,10 @@ def unit_along(
         time_limit_s=LIMIT_S,
         robot=robot,
     )
-    whole = msgspec.structs.replace(bare, crowd=NO_CROWD, ends_on_failure=True, structure=structure)
-    return with_obstacles(whole, street_map)
+    scenario = msgspec.structs.replace(
+        bare, crowd=NO_CROWD, ends_on_failure=True, structure=structure
+    )
+    return with_obstacles(scenario, street_map)
 
 
 def lies_on(structure: Structure) -> Literal["sidewalk", "crossing"]:

@@ -73,8 +73,8 @@ def test_an_episode_that_comes_out_otherwise_is_not_shown(run: Path, column: str
         path.write_bytes(kept)
 
 
-def test_a_replay_that_is_judged_alone_has_no_result(run: Path) -> None:
-    """It ends when the recorded one did; what was measured in it is not to be had."""
+def test_a_replay_without_measures_has_no_result(run: Path) -> None:
+    """It ends when the recorded one did, and its result raises UsageError."""
     told = load_recorded(run, NAME)
     episode, policy = replay_episode(told, without_measures=True)
     with episode:
@@ -82,5 +82,5 @@ def test_a_replay_that_is_judged_alone_has_no_result(run: Path) -> None:
         while not episode.over:
             observation = episode.advance(policy.act(observation))
         assert episode.moment.tick == told.record.ticks
-    with pytest.raises(UsageError, match="judged alone"):
+    with pytest.raises(UsageError, match="no measures"):
         episode.result()

@@ -358,6 +358,6 @@ def test_isolated_what_cannot_be_loaded_is_said(
     with pytest.raises(UsageError, match=r"it gave no answer for 1 s: --start-timeout gives it"):
         isolated_driver(f"{hostile.__name__}:Hanging", start_s=1.0)
     said = cosim("run", "unit", "--policy", "route", "--isolated", "--episodes", "1", cwd=tmp_path)
-    assert said.returncode == 2 and "is told what the simulator knows (privileged)" in said.stderr
+    assert said.returncode == 2 and "needs privileged state" in said.stderr
     with pytest.raises(UsageError, match="needs a policy by its name"):
         suite_run.run("unit", Honest(), host=PolicyHost(isolated="auto"))

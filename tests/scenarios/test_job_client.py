@@ -172,10 +172,10 @@ def test_a_worker_for_one_run_does_not_wait_for_ever(
     other = threading.Thread(target=over_unheard)
     other.start()
     at = Connection(role="worker", connect=run.endpoint)
-    with pytest.raises(MachineError, match=r"no run was heard of at .* for 0\.5 s: is it over\?"):
+    with pytest.raises(MachineError, match=r"no run replied at .* for 0\.5 s: is it over\?"):
         work(at, 1, lambda line, *_: said.append(line), once=True)
     other.join()
     assert any(line.startswith("works for run") for line in said)
     run.over()
-    with pytest.raises(MachineError, match="no run was heard of"):
+    with pytest.raises(MachineError, match="no run replied"):
         work(at, 1, lambda line, *_: said.append(line), once=True)

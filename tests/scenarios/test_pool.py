@@ -81,7 +81,7 @@ CANNOT_BEGIN = {
     "Changes": (2, "error: policy 'mine:Changes' has another manifest in each process"),
     "Edits": (
         2,
-        "error: policy 'mine:Edits' was edited while the run was going on: begin another run",
+        "error: policy 'mine:Edits' was edited during the run: begin another run",
     ),
 }
 
@@ -208,7 +208,7 @@ class Fake:
     """A process that says what a test has prepared, and then nothing; or it ends."""
 
     log = "worker-0.log"
-    called = "environment"
+    kind = "environment"
     descriptor = None
 
     def __init__(

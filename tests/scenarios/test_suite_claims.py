@@ -709,7 +709,7 @@ def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim:
     assert fault.claim == "proofs to the bit" and "its state is" in fault.words
     (parts / "made-by.txt").write_text("another version")
     refused = cosim("suite", "build", "unit", str(out), "--only", "straight-001")
-    assert refused.returncode == 2 and "delete it and build anew" in refused.stderr
+    assert refused.returncode == 2 and "delete it and build again" in refused.stderr
 
 
 @pytest.mark.parametrize("name", SUITES)

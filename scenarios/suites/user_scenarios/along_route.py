@@ -31,13 +31,13 @@ _BEYOND_M: Final = 5.0
 
 
 def event_along(
-    number: int, asked: OwnEvent, scenario: Scenario, street_map: StreetMap, robot: Robot
+    number: int, wanted: OwnEvent, scenario: Scenario, street_map: StreetMap, robot: Robot
 ) -> Event:
     """Return the event of a file on the way of a scenario.
 
     Raises SpecError with the reason, and the places where it fits.
     """
-    kind = EVENT_KINDS[asked.kind]
+    kind = EVENT_KINDS[wanted.kind]
     route = scenario.route_line
     half_length_m = 0.0
     if kind.layout is None:
@@ -48,9 +48,9 @@ def event_along(
                 "leads straight over, and there is none: give another start and goal, or route, "
                 "or a way of kind 'crosswalk'"
             )
-        at_m = route.length_m / 2 if asked.at_m is None else asked.at_m
+        at_m = route.length_m / 2 if wanted.at_m is None else wanted.at_m
         spot = min(spots, key=lambda one: abs(one.s_m - at_m))
-        if asked.at_m is not None and abs(spot.s_m - at_m) > spot.half_length_m:
+        if wanted.at_m is not None and abs(spot.s_m - at_m) > spot.half_length_m:
             where = _listed(
                 [(one.s_m - one.half_length_m, one.s_m + one.half_length_m) for one in spots]
             )
@@ -59,7 +59,7 @@ def event_along(
             )
         at_m, half_width_m, half_length_m = spot.s_m, spot.half_width_m, spot.half_length_m
     else:
-        at_m = _place_of(asked, kind, scenario, street_map, robot)
+        at_m = _place_of(wanted, kind, scenario, street_map, robot)
         half_width_m = _half_width_m(route, at_m, street_map)
     pose = _beyond(route, at_m)
     before, behind = (route.at(at_m + d_m) for d_m in (-half_length_m, half_length_m))
@@ -77,9 +77,9 @@ def event_along(
         route_s_m=at_m,
         half_width_m=half_width_m,
         half_length_m=half_length_m,
-        people=kind.people[0] if asked.people is None else asked.people,
-        speed_mps=asked.speed_mps,
-        side=1 if asked.side == "left" else -1,
+        people=kind.people[0] if wanted.people is None else wanted.people,
+        speed_mps=wanted.speed_mps,
+        side=1 if wanted.side == "left" else -1,
     )
 
 
@@ -99,31 +99,31 @@ def narrow_events(scenario: Scenario) -> Iterator[str]:
             )
 
 
-def obstacle_along(asked: OwnObstacle, route: Polyline) -> Obstacle:
+def obstacle_along(wanted: OwnObstacle, route: Polyline) -> Obstacle:
     """Return the obstacle of a file at its place along the route.
 
     Raises SpecError if the route is too short.
     """
-    if asked.at_m > route.length_m:
+    if wanted.at_m > route.length_m:
         raise SpecError(
-            f"at_m {asked.at_m:g} is past the goal: the way is {route.length_m:.1f} m long"
+            f"at_m {wanted.at_m:g} is past the goal: the way is {route.length_m:.1f} m long"
         )
-    return asked.standing(*route.at(asked.at_m))
+    return wanted.standing(*route.at(wanted.at_m))
 
 
 def _place_of(
-    asked: OwnEvent, kind: EventKind, scenario: Scenario, street_map: StreetMap, robot: Robot
+    wanted: OwnEvent, kind: EventKind, scenario: Scenario, street_map: StreetMap, robot: Robot
 ) -> float:
     """Return the place of an event on sidewalks, in metres along the route.
 
     It is the given place, or the suitable place nearest to the middle of the route.
     """
     route = scenario.route_line
-    if asked.at_m is not None:
-        reason = _misfit(kind, asked.at_m, route, street_map, robot)
+    if wanted.at_m is not None:
+        reason = _misfit(kind, wanted.at_m, route, street_map, robot)
         if not reason:
-            return asked.at_m
-        refusal = f"at_m {asked.at_m:g} does not do for '{kind.name}': {reason}"
+            return wanted.at_m
+        refusal = f"at_m {wanted.at_m:g} does not do for '{kind.name}': {reason}"
     else:
         reason = _misfit(kind, route.length_m / 2, route, street_map, robot)
         refusal = f"no place for '{kind.name}': in the middle of the way, {reason}"
@@ -134,7 +134,7 @@ def _place_of(
             f"{refusal}; it fits nowhere on this way of {route.length_m:.1f} m: give another "
             f"way or kind"
         )
-    if asked.at_m is not None:
+    if wanted.at_m is not None:
         raise SpecError(f"{refusal}; it fits from {_listed(_runs(at, fits))}")
     return float(at[fits][np.argmin(abs(at[fits] - route.length_m / 2))])
 

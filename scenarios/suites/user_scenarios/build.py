@@ -29,14 +29,14 @@ from sumo_nets.maps.place_names import imported_place, resolve_place
 
 _MAKING: Final = "making the scenarios"
 _VERSION: Final = "own"
-_NOBODYS: Final = "scenario 'own': "
+_UNNAMED: Final = "scenario 'own': "
 """Prefix of messages about a scenario without a name."""
 _SLOWEST_MPS = 0.2
 _LEAST_S = 60.0
 """Speed for the default time limit: one minute plus the time for the route at this speed."""
 
 
-class Made(NamedTuple):
+class BuiltScenario(NamedTuple):
     """Scenario of a file with its faults, such as "events[0]: ...", one message each.
 
     scenario: without the parts that do not fit; None if no route exists.
@@ -48,26 +48,26 @@ class Made(NamedTuple):
 
 
 class _Street(NamedTuple):
-    """Scenario without its crowd and its light, with its faults as in `Made`."""
+    """Scenario without its crowd and its light, with its faults as in `BuiltScenario`."""
 
     scenario: Scenario | None
     faults: tuple[str, ...]
 
 
-def made_of(file: OwnFile, progress: Progress = ignore) -> Iterator[Made]:
+def build_scenarios(file: OwnFile, progress: Progress = ignore) -> Iterator[BuiltScenario]:
     """Yield each scenario of a file with its faults.
 
     Raises MachineError if the machine lacks a requirement.
     """
     for number, variant in enumerate(file.variants):
         progress(f"{_MAKING} of {file.path.name}", number / len(file.variants))
-        yield made_one(variant, file.name)
+        yield build_scenario(variant, file.name)
 
 
-def made_one(variant: Variant, suite: str) -> Made:
+def build_scenario(variant: Variant, suite: str) -> BuiltScenario:
     """Build one scenario of a file, with its faults. suite: name of the suite of the file."""
     own = variant.own
-    alike = {
+    defaults = {
         "name": "own",
         "goal_protocol": None,
         "crowd": OwnCrowd(),
@@ -75,13 +75,13 @@ def made_one(variant: Variant, suite: str) -> Made:
         "weather": CLEAR,
         "limits": OwnLimits(),
     }
-    street, faults = _street(msgspec.structs.replace(own, **alike))
+    street, faults = _street(msgspec.structs.replace(own, **defaults))
     if street is None:
-        return Made(variant, None, faults)
+        return BuiltScenario(variant, None, faults)
     limits = own.limits
     time_s = limits.time_s or round(_LEAST_S + street.route_line.length_m / _SLOWEST_MPS, 1)
     try:
-        whole = msgspec.structs.replace(
+        scenario = msgspec.structs.replace(
             street,
             id=variant.id,
             suite=suite,
@@ -94,16 +94,16 @@ def made_one(variant: Variant, suite: str) -> Made:
             ends_at=limits.ends_at,
         )
     except SpecError as error:
-        return Made(variant, street, (*faults, str(error)))
-    return Made(variant, whole, faults)
+        return BuiltScenario(variant, street, (*faults, str(error)))
+    return BuiltScenario(variant, scenario, faults)
 
 
 def suite_of_own(file: OwnFile, progress: Progress = ignore) -> Suite:
     """Build the suite of all scenarios of a file. Raises SpecError with all faults."""
-    return suite_of(file, list(made_of(file, progress)))
+    return suite_of(file, list(build_scenarios(file, progress)))
 
 
-def suite_of(file: OwnFile, made: Sequence[Made]) -> Suite:
+def suite_of(file: OwnFile, made: Sequence[BuiltScenario]) -> Suite:
     """Join the scenarios of a file as a suite. Raises SpecError with all their faults."""
     if faults := dict.fromkeys(fault for one in made for fault in one.faults):
         raise SpecError(f"{file.path}: {join_faults(list(faults), len(faults))}")
@@ -144,7 +144,7 @@ def _street(own: OwnScenario) -> _Street:
     except MachineError:
         raise
     except CosimError as error:
-        return _Street(None, tuple(str(error).replace(_NOBODYS, "").split("\n")))
+        return _Street(None, tuple(str(error).replace(_UNNAMED, "").split("\n")))
     faults: list[str] = []
     events = []
     placed = []
@@ -158,13 +158,13 @@ def _street(own: OwnScenario) -> _Street:
             placed.append(obstacle_along(thing, bare.route_line))
         except SpecError as error:
             faults.append(f"obstacles.placed[{number}]: {error}")
-    there = {"events": tuple(events), "obstacles": tuple(placed)}
-    whole = msgspec.structs.replace(bare, **there, crowd=NO_CROWD, light=Light(), ends_at="goal")
+    parts = {"events": tuple(events), "obstacles": tuple(placed)}
+    scenario = msgspec.structs.replace(bare, **parts, crowd=NO_CROWD, light=Light(), ends_at="goal")
     if own.obstacles.per_100m and not faults:
-        whole = with_obstacles(
-            whole, street_map, per_100m=own.obstacles.per_100m, beside=own.obstacles.beside
+        scenario = with_obstacles(
+            scenario, street_map, per_100m=own.obstacles.per_100m, beside=own.obstacles.beside
         )
-    return _Street(whole, tuple(faults))
+    return _Street(scenario, tuple(faults))
 
 
 _place = lru_cache(maxsize=64)(place_of_own)

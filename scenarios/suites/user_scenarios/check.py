@@ -18,18 +18,18 @@ from scenarios.suites.fits import misfits
 from scenarios.suites.long_horizon import WAY_SPARE_M
 from scenarios.suites.obstacles import TO_SPARE_M, prove_gap
 from scenarios.suites.reactive import NO_CROWD
-from scenarios.suites.user_scenarios.build import made_of, suite_of_own
+from scenarios.suites.user_scenarios.build import build_scenarios, suite_of_own
 from scenarios.suites.user_scenarios.read import OwnFile
 
 
 def own_faults(file: OwnFile, progress: Progress = ignore) -> list[str]:
     """Return all faults of the scenarios of a file, each once, in the order of the scenarios."""
     found: dict[str, None] = {}
-    for made in made_of(file, progress):
-        faults = made.faults
-        if made.scenario is not None and not faults:
-            faults = tuple(_faults_on_the_street(made.scenario))
-        named = f"scenario '{made.variant.id}': "
+    for built in build_scenarios(file, progress):
+        faults = built.faults
+        if built.scenario is not None and not faults:
+            faults = tuple(_faults_on_the_street(built.scenario))
+        named = f"scenario '{built.variant.id}': "
         found |= dict.fromkeys(fault.replace(named, "").removeprefix(named) for fault in faults)
     return list(found)
 

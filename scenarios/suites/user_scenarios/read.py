@@ -223,7 +223,7 @@ def _found(tree: Any, field: str) -> Any:
 def _unknown_names(tree: dict[str, Any]) -> Iterator[str]:
     """Yield unknown names of robots, events, maps and styles."""
     events = tree.get("events")
-    asked: list[tuple[str, Any, Any]] = [
+    wanted: list[tuple[str, Any, Any]] = [
         ("robot", "robot", ROBOTS),
         ("place.style", "city style", STYLES),
         ("place.map", "map", known_maps()),
@@ -232,7 +232,7 @@ def _unknown_names(tree: dict[str, Any]) -> Iterator[str]:
             for n in range(len(events) if isinstance(events, list) else 0)
         ),
     ]
-    for field, what, valid in asked:
+    for field, what, valid in wanted:
         value = _found(tree, field)
         if isinstance(value, str) and value and value not in valid:
             yield f"{field}: {unknown(what, value, valid)}"

@@ -142,10 +142,10 @@ def cross(scenario: Scenario, policy: str) -> Crossed:
     outcome = run_episode(scenario, driver_of(policy), watches=[watch])
     if outcome.traceback:
         driver_of.cache_clear()
-    return told(scenario, outcome, tally)
+    return crossing_row(scenario, outcome, tally)
 
 
-def told(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
+def crossing_row(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
     """Return an episode and the counts around it as a row."""
     record, log = outcome.record, outcome.log
     nothing = Crossed(

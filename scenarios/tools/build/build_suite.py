@@ -135,7 +135,7 @@ def _open(folder: Path, name: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     note = folder / _MADE_BY
     if note.exists() and note.read_text() != made_by:
-        raise RunError(f"{folder}: begun by another version of the code: delete it and build anew")
+        raise RunError(f"{folder}: begun by another version of the code: delete it and build again")
     write_atomic(note, made_by.encode())
 
 

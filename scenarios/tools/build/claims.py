@@ -192,11 +192,11 @@ def _proofs(read: Read) -> Iterator[str]:
         elif proof.scenario_hash != content_hash(scenario):
             yield f"{scenario.id}: was changed since it was proved"
         elif not 0.0 < proof.time_s <= scenario.time_limit_s or not proof.state_hash:
-            yield f"{scenario.id}: its proof tells no time within the limit, or no state"
+            yield f"{scenario.id}: its proof has no time within the limit, or no state hash"
         elif any(
             room_m is not None and room_m < 0.0 for room_m in (proof.people_m, proof.obstacles_m)
         ):
-            yield f"{scenario.id}: its proof touches somebody or something"
+            yield f"{scenario.id}: its proof has a contact"
     yield from (f"{name}: a proof of no scenario" for name in proofs)
     if len({(proof.expert, proof.expert_version) for proof in read.proofs.proofs}) > 1:
         yield f"{read.suite.name}: is proved by several experts"

@@ -83,8 +83,8 @@ def accepted(scenario: Scenario) -> tuple[Scenario, Proof] | Dropped:
     found = proved(msgspec.structs.replace(scenario, **rule))
     if isinstance(found, Dropped):
         return found
-    whole = limited(scenario, found.time_s, found.passing_mps)
-    return whole, msgspec.structs.replace(found, scenario_hash=content_hash(whole))
+    scenario = limited(scenario, found.time_s, found.passing_mps)
+    return scenario, msgspec.structs.replace(found, scenario_hash=content_hash(scenario))
 
 
 def proved(scenario: Scenario, expert: str = EXPERT) -> Proof | Dropped:

@@ -69,10 +69,10 @@ def make_env(
         raise UsageError(
             "no episode of an environment is compared with its street: leave counterfactual out"
         )
-    whole = load_suite(suite) if isinstance(suite, str) else suite
-    selected = select_scenarios(whole, scenarios, None, events, split)
+    loaded = load_suite(suite) if isinstance(suite, str) else suite
+    selected = select_scenarios(loaded, scenarios, None, events, split)
     picked = [options.scenario(scenario) for scenario in selected]
     settled = with_goal(manifest, options.goal)
     for name in sorted({scenario.robot for scenario in picked}):
         check_camera(settled, robot_called(name), options.own_camera)
-    return SidewalkEnv(picked, settled, actions, reward, options, render_mode, whole.content_hash)
+    return SidewalkEnv(picked, settled, actions, reward, options, render_mode, loaded.content_hash)

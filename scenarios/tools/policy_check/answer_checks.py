@@ -45,10 +45,10 @@ def deterministic(asker: Asker) -> CheckOutcome:
     differ = max(map(apart, *answers))
     if differ > ROUNDING:
         return failed(
-            f"asked twice with one seed: {differ:.2g} of the answer differs: draw chance "
+            f"queried twice with one seed: {differ:.2g} of the answer differs: draw chance "
             f"from reset's seed"
         )
-    return passed("asked twice with one seed: the same")
+    return passed("queried twice with one seed: the same")
 
 
 def history_reset(asker: Asker) -> CheckOutcome:
@@ -84,7 +84,7 @@ def put_back(asker: Asker) -> CheckOutcome:
     if differ > ROUNDING:
         return doubted(
             f"put elsewhere, its answers still hang on what it saw before (by {differ:.2g}): right "
-            "for one with a map of its own; a history of pictures begins anew where an "
+            "for one with a map of its own; a history of pictures begins again where an "
             "observation says `reset`, or in on_reset()"
         )
     return passed("put elsewhere, answers do not hang on what was before")
@@ -157,7 +157,7 @@ def constant(asker: Asker) -> CheckOutcome:
     """Different observations give different answers."""
     manifest = asker.manifest
     if manifest.track == "blind" and manifest.goal == "none":
-        return inapplicable("it is told nothing that it could answer to")
+        return inapplicable("its observations have nothing to which it could respond")
     plain = asker.answer("straight")
     others = [asker.answer(scene) for scene in SCENES] + [
         asker.answer("straight", edit) for edit in asker.goals.values()
@@ -176,8 +176,8 @@ def example(asker: Asker) -> CheckOutcome:
         return inapplicable("it is no ONNX bundle")
     if not policy.example.exists():
         return doubted(
-            f"{policy.example.name} is missing: right, but nothing tells whether it is the "
-            f"right graph"
+            f"{policy.example.name} is missing: this is valid, but it is unknown whether the "
+            "graph is the right one"
         )
     try:
         found = example_differences(policy)
@@ -185,12 +185,12 @@ def example(asker: Asker) -> CheckOutcome:
         return failed(str(error))
     if not found:
         return doubted(
-            f"{policy.example.name} expects nothing: right, but nothing tells whether it is "
-            f"the right graph"
+            f"{policy.example.name} expects nothing: this is valid, but it is unknown whether "
+            "the graph is the right one"
         )
     off = {name: differ for name, differ in found.items() if not differ <= ROUNDING}
     if off:
         return failed(
             ", ".join(f"{name} is off by up to {differ:.2g}" for name, differ in off.items())
         )
-    return passed("the graph tells what the bundle's example expects")
+    return passed("the graph gives what the bundle's example expects")

@@ -208,7 +208,7 @@ def _blind(asker: Asker) -> CheckOutcome | None:
     if asker.manifest.camera is None:
         return inapplicable("it has no camera")
     if asker.manifest.privileged:
-        return inapplicable("it is told the street itself, and needs no picture")
+        return inapplicable("it has privileged state and needs no picture")
     return None
 
 
