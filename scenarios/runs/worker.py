@@ -242,7 +242,8 @@ def _checked(driver: PolicyCaller, expected: Hello, again: bool) -> PolicyCaller
     if driver.source_hash != expected.source_hash:
         raise UsageError(
             f"policy '{expected.policy}' was edited during the run: begin another run. Or it is a "
-            "network on another kind of processor than the run's, whose answers differ in the last bit"
+            "network on another kind of processor than the run's, whose answers differ in the last "
+            "bit"
         )
     if again:
         driver.manifest = expected.manifest

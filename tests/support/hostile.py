@@ -1,4 +1,4 @@
-"""Hostile policies: one behaviour for each episode, and what must come of it in each hosting.
+"""Hostile policies: one behaviour for each episode, with its expected outcome in each hosting.
 
 A test copies this file to a folder of its own. `names.json` there maps the names of a run's episodes
 to behaviours. In the simulator's process, each attempt is noted in `began.txt` outside.
@@ -75,18 +75,21 @@ class Hostile(Honest):
 
     def reset(self, episode_id: str, seed: int) -> None:
         self.name = json.loads(_HERE.with_name("names.json").read_text())[episode_id]
-        self.deed = DEEDS[self.name]
+        self.behaviour = BEHAVIOURS[self.name]
         self.count = 0
         self.undo: Callable[[], object] = lambda: None
-        with suppress(OSError), (_desk() / "began.txt").open("a") as began:  # not from a sandbox
+        with (
+            suppress(OSError),
+            (_test_folder() / "began.txt").open("a") as began,
+        ):  # not from a sandbox
             began.write(f"{self.name}\n")
-        if self.deed.call == "reset":
-            self.deed.does(self, None)
+        if self.behaviour.call == "reset":
+            self.behaviour.act(self, None)
 
     def ended(self, episode_id: str) -> None:
         self.undo()
-        if self.deed.call == "ended":
-            self.deed.does(self, None)
+        if self.behaviour.call == "ended":
+            self.behaviour.act(self, None)
 
     def act_batch(self, observations: Sequence[Observation]) -> list[object]:
         return [self.act(seen) for seen in observations]
@@ -94,8 +97,8 @@ class Hostile(Honest):
     def act(self, seen: Observation) -> Any:
         self.count += 1
         command = self.honest_command(seen)
-        if self.deed.call == "every act" or (self.count == 2 and self.deed.call == "act"):
-            answer = self.deed.does(self, seen)
+        if self.behaviour.call == "every act" or (self.count == 2 and self.behaviour.call == "act"):
+            answer = self.behaviour.act(self, seen)
             return command if answer is None else answer
         return command
 
@@ -117,7 +120,7 @@ class Leaves(Honest):
 
     def act(self, seen: Observation) -> Command:
         _leave_processes()
-        (_desk() / "left").touch()
+        (_test_folder() / "left").touch()
         time.sleep(3600)
         return super().act(seen)
 
@@ -164,12 +167,12 @@ class HostileFloat(float):
 _HERE = Path(__file__).resolve()
 
 
-def _desk() -> Path:
+def _test_folder() -> Path:
     return _HERE.parents[1]
 
 
 def _run_folder() -> Path:
-    return _desk() / "run"
+    return _test_folder() / "run"
 
 
 def _raise(error: BaseException) -> Any:
@@ -282,7 +285,7 @@ def _changes_its_surroundings(self: Hostile, seen: Any) -> None:
 def _renames_the_run(self: Hostile, seen: Any) -> None:
     with suppress(OSError):  # the sandbox has no run folder
         _run_folder().chmod(0)
-        _run_folder().rename(_desk() / "elsewhere")
+        _run_folder().rename(_test_folder() / "elsewhere")
 
 
 def _forges_its_results(self: Hostile, seen: Any) -> None:
@@ -450,12 +453,12 @@ def _dies_and_leaves_processes(self: Hostile, seen: Any) -> None:
     os._exit(0)
 
 
-def _sends(number: signal.Signals, whom: Callable[[], int]) -> Callable[[Hostile, Any], None]:
+def _sends(number: signal.Signals, process_of: Callable[[], int]) -> Callable[[Hostile, Any], None]:
     """Send a signal to a process, and wait for what comes of it. A sandbox may deny it."""
 
     def send(self: Hostile, seen: Any) -> None:
         with suppress(PermissionError):
-            os.kill(whom(), number)
+            os.kill(process_of(), number)
             time.sleep(0.5)
 
     return send
@@ -469,7 +472,7 @@ def _slower(self: Hostile, seen: Any) -> None:
     time.sleep(0.02 * self.count)
 
 
-def _does(what: Callable[[], object]) -> Callable[[Hostile, Any], Any]:
+def _calls(what: Callable[[], object]) -> Callable[[Hostile, Any], Any]:
     return lambda self, seen: what()
 
 
@@ -481,12 +484,12 @@ FORGED = "forged"
 BLAMED = "the policy is at fault, because the simulator survives its commands without it"
 
 
-class Deed(NamedTuple):
+class Behaviour(NamedTuple):
     """A behaviour.
 
-    does: what it does; an answer that is None is that of `honest`. What it patches is restored by
+    act: what it does; an answer that is None is that of `honest`. What it patches is restored by
         `undo` when the episode has ended, because a policy may harm its own later episodes.
-    here: DONE, FORGED or a part of the crash's reason in the simulator's process
+    in_process: DONE, FORGED or a part of the crash's reason in the simulator's process
     isolated: the same with --isolated
     call: the call of the policy in which it happens
     attempts: how often the episode is run in the simulator's process
@@ -495,8 +498,8 @@ class Deed(NamedTuple):
     hangs: whether a timeout ends it, so that its run has short ones
     """
 
-    does: Callable[[Hostile, Any], Any]
-    here: str
+    act: Callable[[Hostile, Any], Any]
+    in_process: str
     isolated: str
     call: str = "act"
     attempts: int = 1
@@ -517,152 +520,156 @@ _ACT = "act at 0.25 s"
 _TOO_MANY = f"100002 numbers; an answer holds at most 100000 ({_ACT})"
 _ENDED = "gave no answer: the policy process"
 _ITSELF = "the environment process"
-DEEDS = {
-    "honest": Deed(_does(lambda: None), DONE, DONE),
+BEHAVIOURS = {
+    "honest": Behaviour(_calls(lambda: None), DONE, DONE),
     # It raises.
-    "raises-an-error": Deed(
-        _does(lambda: _raise(KeyError("no such weight"))),
+    "raises-an-error": Behaviour(
+        _calls(lambda: _raise(KeyError("no such weight"))),
         *_both(f"policy 'honest' raised KeyError: 'no such weight' ({_ACT})"),
     ),
-    "exits": Deed(_does(lambda: sys.exit("enough")), *_both("raised SystemExit: enough")),
-    "raises-keyboard-interrupt": Deed(
-        _does(lambda: _raise(KeyboardInterrupt())), *_both("raised KeyboardInterrupt")
+    "exits": Behaviour(_calls(lambda: sys.exit("enough")), *_both("raised SystemExit: enough")),
+    "raises-keyboard-interrupt": Behaviour(
+        _calls(lambda: _raise(KeyboardInterrupt())), *_both("raised KeyboardInterrupt")
     ),
-    "raises-generator-exit": Deed(
-        _does(lambda: _raise(GeneratorExit())), *_both("raised GeneratorExit")
+    "raises-generator-exit": Behaviour(
+        _calls(lambda: _raise(GeneratorExit())), *_both("raised GeneratorExit")
     ),
-    "recurses": Deed(_recurses, *_both("raised RecursionError")),
-    "raises-engine-error": Deed(
-        _does(lambda: _raise(EngineError("SUMO failed"))), *_both("EngineError: SUMO failed")
+    "recurses": Behaviour(_recurses, *_both("raised RecursionError")),
+    "raises-engine-error": Behaviour(
+        _calls(lambda: _raise(EngineError("SUMO failed"))), *_both("EngineError: SUMO failed")
     ),
-    "raises-server-lost": Deed(
-        _does(lambda: _raise(PolicyServerLost("the server is gone"))),
+    "raises-server-lost": Behaviour(
+        _calls(lambda: _raise(PolicyServerLost("the server is gone"))),
         *_both(f"policy 'honest' raised PolicyServerLost: the server is gone ({_ACT})"),
     ),
-    "raises-unprintable": Deed(_does(lambda: _raise(Unprintable())), *_both("raised Unprintable")),
+    "raises-unprintable": Behaviour(
+        _calls(lambda: _raise(Unprintable())), *_both("raised Unprintable")
+    ),
     # It answers nonsense.
-    "answers-nan": Deed(
-        _does(lambda: Command(float("nan"), 0.0)), *_both("both must be finite numbers")
+    "answers-nan": Behaviour(
+        _calls(lambda: Command(float("nan"), 0.0)), *_both("both must be finite numbers")
     ),
-    "answers-without-end": Deed(_does(Endless), *_both("policy 'honest' ")),
-    "answers-too-many-numbers": Deed(_does(lambda: np.zeros((50_001, 2))), *_both(_TOO_MANY)),
-    "answers-hostile-array": Deed(_does(HostileArray), *_both("raised SystemExit: no array")),
-    "answers-hostile-float": Deed(
-        _does(lambda: Command(HostileFloat(1.0), 0.0)), *_both("raised KeyboardInterrupt")
+    "answers-without-end": Behaviour(_calls(Endless), *_both("policy 'honest' ")),
+    "answers-too-many-numbers": Behaviour(_calls(lambda: np.zeros((50_001, 2))), *_both(_TOO_MANY)),
+    "answers-hostile-array": Behaviour(_calls(HostileArray), *_both("raised SystemExit: no array")),
+    "answers-hostile-float": Behaviour(
+        _calls(lambda: Command(HostileFloat(1.0), 0.0)), *_both("raised KeyboardInterrupt")
     ),
-    "answers-twice": Deed(_answers_twice, DONE, DONE),
+    "answers-twice": Behaviour(_answers_twice, DONE, DONE),
     # It changes what is in its process.
-    "scribbles": Deed(_scribbles, DONE, DONE, sees=True),
-    "changes-its-manifest": Deed(_changes_its_manifest, DONE, DONE, sees=True),
-    "patches-the-referee": Deed(_patches_the_referee, FORGED, DONE),
-    "patches-the-director": Deed(_patches_the_director, BLAMED, DONE, attempts=2),
-    "patches-numpy": Deed(_patches_numpy, BLAMED, DONE, attempts=2),
-    "patches-time": Deed(_patches_time, BLAMED, DONE, attempts=2),
-    "empties-sys-modules": Deed(_empties_sys_modules, DONE, DONE),
-    "changes-its-surroundings": Deed(_changes_its_surroundings, DONE, DONE),
-    "peeks": Deed(_peeks, "raised LookupError: found ['pybullet'", DONE),
-    "traces-calls": Deed(_traces_calls, BLAMED, DONE, attempts=2),
-    "handles-alarms": Deed(_handles_alarms, BLAMED, _ENDED, attempts=2),
-    "interrupts-later": Deed(_interrupts_later, BLAMED, _ENDED, attempts=2),
-    "outlives-its-process": Deed(_outlives_its_process, DONE, DONE),
+    "scribbles": Behaviour(_scribbles, DONE, DONE, sees=True),
+    "changes-its-manifest": Behaviour(_changes_its_manifest, DONE, DONE, sees=True),
+    "patches-the-referee": Behaviour(_patches_the_referee, FORGED, DONE),
+    "patches-the-director": Behaviour(_patches_the_director, BLAMED, DONE, attempts=2),
+    "patches-numpy": Behaviour(_patches_numpy, BLAMED, DONE, attempts=2),
+    "patches-time": Behaviour(_patches_time, BLAMED, DONE, attempts=2),
+    "empties-sys-modules": Behaviour(_empties_sys_modules, DONE, DONE),
+    "changes-its-surroundings": Behaviour(_changes_its_surroundings, DONE, DONE),
+    "peeks": Behaviour(_peeks, "raised LookupError: found ['pybullet'", DONE),
+    "traces-calls": Behaviour(_traces_calls, BLAMED, DONE, attempts=2),
+    "handles-alarms": Behaviour(_handles_alarms, BLAMED, _ENDED, attempts=2),
+    "interrupts-later": Behaviour(_interrupts_later, BLAMED, _ENDED, attempts=2),
+    "outlives-its-process": Behaviour(_outlives_its_process, DONE, DONE),
     # It harms files.
-    "deletes-the-run": Deed(
-        _does(lambda: shutil.rmtree(_run_folder(), ignore_errors=True)),
+    "deletes-the-run": Behaviour(
+        _calls(lambda: shutil.rmtree(_run_folder(), ignore_errors=True)),
         DONE,
         DONE,
         harms_folder=True,
     ),
-    "renames-the-run": Deed(_renames_the_run, DONE, DONE, harms_folder=True),
-    "forges-its-results": Deed(_forges_its_results, DONE, DONE, harms_folder=True),
-    "exceeds-the-size-of-files": Deed(
+    "renames-the-run": Behaviour(_renames_the_run, DONE, DONE, harms_folder=True),
+    "forges-its-results": Behaviour(_forges_its_results, DONE, DONE, harms_folder=True),
+    "exceeds-the-size-of-files": Behaviour(
         _exceeds_the_size_of_files, *_both("raised OSError: [Errno 27] File too large")
     ),
     # It takes what the simulator needs.
-    "limits-descriptors": Deed(_limits((resource.RLIMIT_NOFILE, 4)), DONE, DONE),
-    "fills-its-descriptors": Deed(_fills_its_descriptors, DONE, DONE),
-    "takes-all-memory": Deed(_takes_all_memory, BLAMED, _ENDED, attempts=2),
-    "exhausts-memory": Deed(_exhausts_memory, *_both("raised MemoryError")),
+    "limits-descriptors": Behaviour(_limits((resource.RLIMIT_NOFILE, 4)), DONE, DONE),
+    "fills-its-descriptors": Behaviour(_fills_its_descriptors, DONE, DONE),
+    "takes-all-memory": Behaviour(_takes_all_memory, BLAMED, _ENDED, attempts=2),
+    "exhausts-memory": Behaviour(_exhausts_memory, *_both("raised MemoryError")),
     # It harms outputs and connections.
-    "floods": Deed(_floods, DONE, DONE),
-    "floods-and-dies": Deed(_floods_and_dies, f"{_ITSELF} ended with exit code 5", _ENDED),
-    "closes-its-output": Deed(_closes_its_output, DONE, DONE),
-    "writes-garbage": Deed(_writes_garbage, _ITSELF, _ENDED, attempts=2),
-    "overwrites-shared-memory": Deed(_overwrites_shared_memory, DONE, DONE, sees=True),
-    "closes-descriptors": Deed(_does(lambda: os.closerange(0, 1024)), _ITSELF, _ENDED, attempts=2),
+    "floods": Behaviour(_floods, DONE, DONE),
+    "floods-and-dies": Behaviour(_floods_and_dies, f"{_ITSELF} ended with exit code 5", _ENDED),
+    "closes-its-output": Behaviour(_closes_its_output, DONE, DONE),
+    "writes-garbage": Behaviour(_writes_garbage, _ITSELF, _ENDED, attempts=2),
+    "overwrites-shared-memory": Behaviour(_overwrites_shared_memory, DONE, DONE, sees=True),
+    "closes-descriptors": Behaviour(
+        _calls(lambda: os.closerange(0, 1024)), _ITSELF, _ENDED, attempts=2
+    ),
     # It ends, stops or multiplies processes.
-    "dies-and-leaves-processes": Deed(
+    "dies-and-leaves-processes": Behaviour(
         _dies_and_leaves_processes,
         f"{_ITSELF} ended with exit code 0 in the policy's {_ACT}",
         f"{_ENDED} ended with exit code 0 ({_ACT})",
     ),
-    "kills-itself": Deed(
+    "kills-itself": Behaviour(
         _sends(signal.SIGKILL, os.getpid),
         f"{_ITSELF} was killed by SIGKILL in the policy's {_ACT}, 2 times: {BLAMED}",
         f"{_ENDED} was killed by SIGKILL",
         attempts=2,
     ),
-    "segfaults": Deed(
-        _does(lambda: ctypes.string_at(0)),
+    "segfaults": Behaviour(
+        _calls(lambda: ctypes.string_at(0)),
         f"{_ITSELF} was killed by SIGSEGV in the policy's {_ACT}",
         f"{_ENDED} was killed by SIGSEGV",
     ),
-    "stops-itself": Deed(_sends(signal.SIGSTOP, os.getpid), DONE, DONE),
-    "stops-later": Deed(_stops_later, DONE, DONE),
-    "kills-its-parent": Deed(
+    "stops-itself": Behaviour(_sends(signal.SIGSTOP, os.getpid), DONE, DONE),
+    "stops-later": Behaviour(_stops_later, DONE, DONE),
+    "kills-its-parent": Behaviour(
         _sends(signal.SIGKILL, os.getppid),
         f"{_ITSELF} was killed by SIGKILL in the policy's {_ACT}, 2 times: {BLAMED}",
         DONE,
         attempts=2,
     ),
-    "ends-its-parent": Deed(
+    "ends-its-parent": Behaviour(
         _sends(signal.SIGTERM, os.getppid),
         f"{_ITSELF} was killed by SIGTERM in the policy's {_ACT}, 2 times: {BLAMED}",
         DONE,
         attempts=2,
     ),
-    "stops-its-parent": Deed(_sends(signal.SIGSTOP, os.getppid), DONE, DONE),
-    "kills-its-group": Deed(
-        _does(lambda: os.killpg(0, signal.SIGKILL)),
+    "stops-its-parent": Behaviour(_sends(signal.SIGSTOP, os.getppid), DONE, DONE),
+    "kills-its-group": Behaviour(
+        _calls(lambda: os.killpg(0, signal.SIGKILL)),
         f"{_ITSELF} was killed by SIGKILL in the policy's {_ACT}, 2 times: {BLAMED}",
         f"{_ENDED} was killed by SIGKILL",
         attempts=2,
     ),
-    "traces-its-parent": Deed(_traces_its_parent, DONE, DONE),
-    "forks-many": Deed(_forks_many, DONE, DONE),
+    "traces-its-parent": Behaviour(_traces_its_parent, DONE, DONE),
+    "forks-many": Behaviour(_forks_many, DONE, DONE),
     # It is slow, or gives no answer.
-    "hangs-in-reset": Deed(
-        _does(lambda: time.sleep(3600)),
+    "hangs-in-reset": Behaviour(
+        _calls(lambda: time.sleep(3600)),
         *_both(_no_answer("reset", "hangs-in-reset", START_S)),
         "reset",
         hangs=True,
     ),
-    "hangs-in-act": Deed(
-        _does(lambda: time.sleep(3600)), *_both(_no_answer(_ACT, "hangs-in-act")), hangs=True
+    "hangs-in-act": Behaviour(
+        _calls(lambda: time.sleep(3600)), *_both(_no_answer(_ACT, "hangs-in-act")), hangs=True
     ),
-    "holds-the-lock": Deed(
-        _does(lambda: ctypes.PyDLL(None).sleep(3600)),
+    "holds-the-lock": Behaviour(
+        _calls(lambda: ctypes.PyDLL(None).sleep(3600)),
         *_both(_no_answer(_ACT, "holds-the-lock")),
         hangs=True,
     ),
-    "freezes-later": Deed(
+    "freezes-later": Behaviour(
         _freezes_later,
         f"{_ITSELF} showed no sign of life, 2 times: {BLAMED}",
         _no_answer("act at 0.50 s", "freezes-later"),
         attempts=2,
         hangs=True,
     ),
-    "hangs-afterwards": Deed(
-        _does(lambda: time.sleep(3600)),
+    "hangs-afterwards": Behaviour(
+        _calls(lambda: time.sleep(3600)),
         *_both(_no_answer("ended", "hangs-afterwards")),
         "ended",
         hangs=True,
     ),
-    "dies-afterwards": Deed(
-        _does(lambda: os._exit(0)),
+    "dies-afterwards": Behaviour(
+        _calls(lambda: os._exit(0)),
         f"{_ITSELF} ended with exit code 0 in the policy's ended",
         DONE,
         "ended",
     ),
-    "grows-slower": Deed(_slower, DONE, DONE, "every act"),
+    "grows-slower": Behaviour(_slower, DONE, DONE, "every act"),
 }
-"""The behaviours: 58, besides the honest one."""
+"""The behaviours by name, with `honest`, which does nothing."""
