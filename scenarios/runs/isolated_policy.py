@@ -42,9 +42,9 @@ from cosim.spec.options import PolicyHost, PolicyProcess
 from cosim.spec.run_config import Isolation
 from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
+from scenarios.ipc.process_state import ProcessState, end_at_once
 from scenarios.ipc.sandbox import KINDS, Sandbox
 from scenarios.ipc.shared_memory import SharedMemory, observation_bytes
-from scenarios.ipc.surroundings import Surroundings, end_at_once
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 from scenarios.runs.policy_view import name_inside, sandbox_for
 
@@ -232,12 +232,12 @@ def _serve(socket_descriptor: int, memory_descriptor: int, *, boxed: bool) -> No
     desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
     info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
     wire.send(encode_message(info))
-    surroundings = Surroundings.now()
+    initial_state = ProcessState.now()
     with suppress(EOFError):
         while True:
             request = read_request(wire.receive())
             (reply,) = desk.replies([request], [memory.map])
-            if isinstance(request, EndRequest) and Surroundings.now() != surroundings:
+            if isinstance(request, EndRequest) and ProcessState.now() != initial_state:
                 end_at_once()  # without a reply, so that the next episode has a new process
             if isinstance(reply, Refusal):
                 reply = _with_remedy(reply, boxed)

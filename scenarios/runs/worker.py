@@ -51,8 +51,8 @@ from scenarios.ipc.messages import (
     decode_job,
     encode_message,
 )
+from scenarios.ipc.process_state import ProcessState, end_at_once
 from scenarios.ipc.render_link import link_to
-from scenarios.ipc.surroundings import Surroundings, end_at_once
 from scenarios.runs.policy_host import policy_driver, shared_driver
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
             send(repeat_job(hello, commands, send))
     home = _working_folder()
     drivers: WorkerDrivers | None = load_drivers(hello, timer, send)
-    surroundings = Surroundings.now()
+    initial_state = ProcessState.now()
     send(Ready())
     while True:
         try:
@@ -100,7 +100,7 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
             drivers = None  # loaded again for the next job
         send(done)
         engine_failed = failed and isinstance(done, Done) and done.status == "invalid"
-        if engine_failed or Surroundings.now() != surroundings:
+        if engine_failed or ProcessState.now() != initial_state:
             break  # a policy has changed the process; the run starts another one
     end_at_once()
 

@@ -1,4 +1,4 @@
-"""What a policy may change of its process for later episodes."""
+"""State of a process that a policy may change for later episodes."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ _LIMITS: Final = (
     resource.RLIMIT_STACK,
 )
 """Limits of a process that the simulator needs."""
-_MOST_TRIED: Final = 1 << 13
+_MAX_TRIED: Final = 1 << 13
 """Number of descriptors that are tried where /proc cannot be read."""
 
 
-class Surroundings(NamedTuple):
-    """State of this process outside of Python. A process in which it changes is replaced.
+class ProcessState(NamedTuple):
+    """State of this process outside of Python. A process whose state changes is replaced.
 
     limits: soft and hard limits of resources.
     outputs: device and inode of standard output and standard error, if they are open; a file that
         was opened since may have the descriptor of a closed one.
     umask: permissions that new files lack.
-    crowded: whether more than half of the permitted descriptors are open.
+    few_descriptors_left: whether more than half of the permitted descriptors are open.
     """
 
     limits: tuple[tuple[int, int], ...]
     outputs: tuple[tuple[int, int], ...]
     umask: int
-    crowded: bool
+    few_descriptors_left: bool
 
     @classmethod
-    def now(cls) -> Surroundings:
+    def now(cls) -> ProcessState:
         """Return the current state."""
         outputs = []
         for descriptor in (1, 2):
@@ -48,7 +48,7 @@ class Surroundings(NamedTuple):
                 outputs.append((status.st_dev, status.st_ino))
         os.umask(mask := os.umask(0o077))
         limits = tuple(resource.getrlimit(limit) for limit in _LIMITS)
-        return cls(limits, tuple(outputs), mask, _crowded())
+        return cls(limits, tuple(outputs), mask, _few_descriptors_left())
 
 
 def end_at_once() -> NoReturn:
@@ -59,14 +59,14 @@ def end_at_once() -> NoReturn:
     os._exit(0)
 
 
-def _crowded() -> bool:
+def _few_descriptors_left() -> bool:
     most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
         return len(os.listdir("/proc/self/fd")) > most / 2  # noqa: PTH208  only counted
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):  # not one more can be opened
             return True
-    numbers = range(min(most, _MOST_TRIED))  # a sandbox may have no /proc
+    numbers = range(min(most, _MAX_TRIED))  # a sandbox may have no /proc
     return sum(map(_is_open, numbers)) > len(numbers) / 2
 
 
