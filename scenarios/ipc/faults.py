@@ -51,7 +51,7 @@ RULES: Final[Mapping[Fault, Rule]] = {
 episode."""
 
 
-class Failure(NamedTuple):
+class AttemptFailure(NamedTuple):
     """A failed attempt at an episode.
 
     why: the reason in words.
@@ -73,6 +73,6 @@ def verdict_on(error: Exception) -> tuple[Status, bool]:
     return status, may_pass and not isinstance(error, DirectorLost)
 
 
-def failure_of_result(status: Status, why: str) -> Failure:
+def failure_of_result(status: Status, why: str) -> AttemptFailure:
     """Return the failure of an episode that its process reports as worth another attempt."""
-    return Failure("engine_failed" if status == "invalid" else "process_ended", why)
+    return AttemptFailure("engine_failed" if status == "invalid" else "process_ended", why)

@@ -62,7 +62,7 @@ _decode_ground = msgspec.msgpack.Decoder(
 ).decode
 
 
-def encoded_about(seen: Observation) -> EpisodeConstants:
+def encode_constants(seen: Observation) -> EpisodeConstants:
     """Encode the constants of an episode."""
     robot = {name: getattr(seen.robot, name) for name in _ROBOT_FIELDS}
     cameras = {name: one.camera for name, one in seen.pictures.items()}
@@ -85,7 +85,7 @@ def encoded_about(seen: Observation) -> EpisodeConstants:
     return EpisodeConstants(robot, calibrations, ground, lidar)
 
 
-def encoded_fields(seen: Observation) -> tuple[dict[str, Any], Arrays]:
+def encode_observation(seen: Observation) -> tuple[dict[str, Any], Arrays]:
     """Encode an observation: the fields of an `ActRequest`, and the arrays that belong to it."""
     arrays = {"rgb": seen.rgb, "depth": seen.depth, "labels": seen.labels}
     for name, one in seen.pictures.items():

@@ -29,7 +29,7 @@ from scenarios.ipc.child_process import (
     Watchdog,
 )
 from scenarios.ipc.command_log import Driven
-from scenarios.ipc.faults import RULES, Failure, failure_of_result
+from scenarios.ipc.faults import RULES, AttemptFailure, failure_of_result
 from scenarios.ipc.messages import (
     Done,
     Hello,
@@ -67,7 +67,7 @@ class _Suspect(NamedTuple):
     replays: number of replays so far.
     """
 
-    failure: Failure
+    failure: AttemptFailure
     driven: Driven
     replays: int = 1
 
@@ -134,7 +134,7 @@ class EnvironmentSlot:
             self._watchdog.process.give(job)
             self._given_s = self._watchdog.last_message_s = time.monotonic()
 
-    def poll(self, handle: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> AttemptFailure | None:
         """Pass on messages about the job, enforce deadlines, and return the failure of the job if
         it has failed."""
         watchdog = self._watchdog
@@ -191,7 +191,7 @@ class EnvironmentSlot:
         last = self.job is not None and self.job.last_attempt and self._suspect is None
         return last and done.again and done.status == "invalid"
 
-    def _reported_failure(self, watchdog: Watchdog, done: Done) -> Failure | None:
+    def _reported_failure(self, watchdog: Watchdog, done: Done) -> AttemptFailure | None:
         """Find the cause of an engine error that a process has reported."""
         self._watchdog = None
         driven = watchdog.process.driven
@@ -199,7 +199,7 @@ class EnvironmentSlot:
         why = msgspec.json.decode(done.record, type=_Reason).reason
         return self._failed(failure_of_result(done.status, why), driven)
 
-    def _failed(self, failure: Failure, driven: Driven | None) -> Failure | None:
+    def _failed(self, failure: AttemptFailure, driven: Driven | None) -> AttemptFailure | None:
         """Return a failure, or start its replay if it is the last one."""
         job = self.job
         last = RULES[failure.fault].attempts == 1 or (job is not None and job.last_attempt)
@@ -216,7 +216,7 @@ class EnvironmentSlot:
 
     def _judged(
         self, error: str, driven: Driven | None, *, record: bytes = b"", killed: bool = False
-    ) -> Failure | None:
+    ) -> AttemptFailure | None:
         """Return the failure of a job after its replay; None if another replay was started.
 
         error: why the replay has failed, "" if the simulator survived.
@@ -236,14 +236,14 @@ class EnvironmentSlot:
             self._replay(suspect._replace(replays=suspect.replays + 1), job)
             return None
         elif there:
-            failure = Failure("engine_failed", failure.why, FAILS_AGAIN, record)
+            failure = AttemptFailure("engine_failed", failure.why, FAILS_AGAIN, record)
         else:
             found = FAILS_ELSEWHERE if error else SURVIVES
-            failure = Failure("process_ended", failure.why, found, record)
+            failure = AttemptFailure("process_ended", failure.why, found, record)
         self.job = self._suspect = None
         return failure
 
-    def _ended(self, watchdog: Watchdog, end: ProcessEnd) -> Failure | None:
+    def _ended(self, watchdog: Watchdog, end: ProcessEnd) -> AttemptFailure | None:
         """Return the failure of a started job; give a job that was not started to a new process."""
         self._watchdog = None
         if self._suspect is not None:
@@ -264,18 +264,20 @@ class EnvironmentSlot:
             self.start()
         return None
 
-    def _failure(self, job: Job | None, end: ProcessEnd) -> Failure:
+    def _failure(self, job: Job | None, end: ProcessEnd) -> AttemptFailure:
         if end.allowed_s is None or end.pending_call is None:
             if end.in_policy:
-                return Failure("policy_ended", end.words)
-            return Failure("engine_failed" if end.in_engine else "process_ended", end.words)
+                return AttemptFailure("policy_ended", end.words)
+            return AttemptFailure("engine_failed" if end.in_engine else "process_ended", end.words)
         words = no_answer(self._hello, end.allowed_s)
         if end.pending_call.kind == "loading" or job is None:
             raise UsageError(
                 f"{words} while it was loaded in an environment process: give a longer "
                 f"--start-timeout"
             )
-        return Failure("policy_timeout", f"{words} in {end.pending_call.when} of {job.scenario.id}")
+        return AttemptFailure(
+            "policy_timeout", f"{words} in {end.pending_call.when} of {job.scenario.id}"
+        )
 
     def _count_failed_start(self, end: ProcessEnd) -> None:
         self._failed_starts += 1

@@ -34,7 +34,7 @@ from cosim.episode.interfaces import Observation
 from cosim.episode.policy_caller import PolicyCaller, Timer
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import PolicyProcess
-from scenarios.ipc.observation_codec import Arrays, encoded_about, encoded_fields
+from scenarios.ipc.observation_codec import Arrays, encode_constants, encode_observation
 
 
 class PolicyServerBusy(PolicyServerLost):
@@ -92,8 +92,8 @@ class HostedPolicy:
     def act(self, seen: Observation) -> Command | np.ndarray[Any, Any]:
         began_s = time.perf_counter()
         self._step += 1
-        fields, arrays = encoded_fields(seen)
-        about = encoded_about(seen) if self._step == 0 else None
+        fields, arrays = encode_observation(seen)
+        about = encode_constants(seen) if self._step == 0 else None
         locations = self._carrier.pack(arrays)
         answer = self._reply(
             ActRequest(*self._sign, self._step, **fields, arrays=locations, about=about)

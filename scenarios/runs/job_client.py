@@ -22,7 +22,7 @@ from cosim.core.log_event import log_event
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import CityMap
 from scenarios.ipc.child_process import ChildProcess
-from scenarios.ipc.faults import Failure
+from scenarios.ipc.faults import AttemptFailure
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Message, Progress, Waits
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
 from scenarios.runs.protocol import (
@@ -40,7 +40,7 @@ from scenarios.runs.protocol import (
 )
 
 if TYPE_CHECKING:
-    from scenarios.runs.net_transfer import Fetched
+    from scenarios.runs.net_transfer import MapDownload
 
 REPORT_S: Final = 1.0
 """Seconds between two reports, each of which renews the lease."""
@@ -57,7 +57,7 @@ _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 1.0
 
 
-def _driven_in(failure: Failure | None) -> bytes:
+def _driven_in(failure: AttemptFailure | None) -> bytes:
     """Return the record of what was driven, unless it is more than can be sent."""
     driven = b"" if failure is None else failure.driven
     return driven if len(driven) <= MOST_DRIVEN_BYTES else b""
@@ -67,7 +67,7 @@ class RunEnded(Exception):
     """The run is over."""
 
 
-class Request(NamedTuple):
+class CoordinatorRequest(NamedTuple):
     """A request to the coordinator: its kind, the key that it is sent to, and the seconds it may
     take."""
 
@@ -77,7 +77,7 @@ class Request(NamedTuple):
     timeout_s: float
 
 
-class Installation(NamedTuple):
+class WorkerIdentity(NamedTuple):
     """The worker of a client: its unique name, its host's name, and the installed versions."""
 
     worker: str
@@ -96,13 +96,13 @@ class JobClient:
         self,
         run: str,
         number: int,
-        here: Installation,
+        identity: WorkerIdentity,
         logs: Path,
         start: Callable[[Path, Hello], ChildProcess] = start_environment,
     ) -> None:
         self._run = run
         self._number = number
-        self._here = here
+        self._identity = identity
         self._start = start
         self._log = logs / f"{number}.log"
         self._log_sent = 0
@@ -112,14 +112,14 @@ class JobClient:
         self._claiming = False
         self._claim_at_s = 0.0
         self._pause_s = _FIRST_PAUSE_S
-        self._fetched: Fetched | None = None
+        self._download: MapDownload | None = None
         self._lease: Assignment | None = None
         self._reporting = False
         self._report_at_s = 0.0
         self._said: list[Progress | Waits | FrameDrawn] = []
         self._said_sent = 0
         self._done: Done | None = None
-        self._failure: Failure | None = None
+        self._failure: AttemptFailure | None = None
 
     @property
     def descriptor(self) -> int | None:
@@ -131,7 +131,7 @@ class JobClient:
         """Whether there is a result or a failure that the coordinator has not acknowledged."""
         return self._done is not None or self._failure is not None
 
-    def requests(self, now_s: float) -> list[Request]:
+    def requests(self, now_s: float) -> list[CoordinatorRequest]:
         """Return the requests that are due. Each is answered by `answered`."""
         found = []
         if (
@@ -146,7 +146,7 @@ class JobClient:
             self._report_at_s = now_s + REPORT_S
             timeout_s = 30.0 if self.has_unsent else 5.0
             found.append(
-                Request(
+                CoordinatorRequest(
                     "report",
                     keys.job(self._run, "report"),
                     encode(self._report(self._lease)),
@@ -155,7 +155,7 @@ class JobClient:
             )
         return found
 
-    def answered(self, request: Request, payload: bytes | None, error: str) -> None:
+    def answered(self, request: CoordinatorRequest, payload: bytes | None, error: str) -> None:
         """Take in the reply to a request, None if there was none.
 
         Raises RunEnded, UsageError if this worker cannot work for the run, MachineError if a map
@@ -166,7 +166,7 @@ class JobClient:
                 self._report_answered(decode_reply(payload))
             return
         self._claiming = False
-        if request.act == "net" and error and self._fetched is not None:
+        if request.act == "net" and error and self._download is not None:
             raise MachineError(f"a map of the run cannot be had: {error}")
         if payload is None:
             self._claim_at_s = time.monotonic() + self._pause_s
@@ -175,8 +175,8 @@ class JobClient:
         self._pause_s = _FIRST_PAUSE_S
         if request.act == "claim":
             self._claim_answered(decode_reply(payload))
-        elif self._fetched is not None and self._fetched.take(payload):
-            self._fetched = None
+        elif self._download is not None and self._download.take(payload):
+            self._download = None
             self._give()
 
     def poll(self) -> None:
@@ -192,27 +192,27 @@ class JobClient:
     def release(self) -> None:
         """Hand the job back, if it is not done: this worker leaves."""
         if self._lease is not None and not self.has_unsent:
-            self._fail(Failure("handed_back"))
+            self._fail(AttemptFailure("handed_back"))
         self._leaving = True
         self.close()
 
     def close(self) -> None:
         """End the process."""
-        self._fetched = None
+        self._download = None
         if self._slot is not None:
             self._slot.cancel()
 
-    def unable(self, why: str) -> Request:
+    def unable(self, why: str) -> CoordinatorRequest:
         """Return the request that reports, once, that nothing can be run here."""
-        self._failure = Failure("worker_unable", why)
+        self._failure = AttemptFailure("worker_unable", why)
         report = self._report(self._lease)
-        return Request("report", keys.job(self._run, "report"), encode(report), 5.0)
+        return CoordinatorRequest("report", keys.job(self._run, "report"), encode(report), 5.0)
 
-    def _claim(self) -> Request | None:
+    def _claim(self) -> CoordinatorRequest | None:
         """Return the next request of this slot: for a map, the policy's introduction, or a job."""
-        if self._fetched is not None:
-            return Request(
-                "net", keys.net(self._run, self._fetched.digest), self._fetched.request, 10.0
+        if self._download is not None:
+            return CoordinatorRequest(
+                "net", keys.net(self._run, self._download.digest), self._download.request, 10.0
             )
         if (
             self._leaving
@@ -221,18 +221,18 @@ class JobClient:
         ):
             return None
         claim = Claim(
-            worker=self._here.worker,
+            worker=self._identity.worker,
             slot=self._number,
-            host=self._here.host,
-            installed=dict(self._here.installed),
+            host=self._identity.host,
+            installed=dict(self._identity.installed),
             ready=self._slot is not None,
         )
-        return Request("claim", keys.job(self._run, "claim"), encode(claim), 10.0)
+        return CoordinatorRequest("claim", keys.job(self._run, "claim"), encode(claim), 10.0)
 
     def _claim_answered(self, reply: CoordinatorReply) -> None:
         match reply:
             case Hello():
-                host = reply.host.seen_by(self._here.connection)
+                host = reply.host.seen_by(self._identity.connection)
                 hello = msgspec.structs.replace(reply, host=host)
                 self._slot = EnvironmentSlot(partial(self._start, self._log), hello)
             case Assignment():
@@ -251,15 +251,15 @@ class JobClient:
         where = lease.job.scenario.place
         if isinstance(where, CityMap):
             # Imported only where needed: it loads the importer of maps.
-            from scenarios.runs.net_transfer import Fetched, lacks
+            from scenarios.runs.net_transfer import MapDownload, is_missing
 
-            if lacks(where):
-                self._fetched = Fetched(where, lease.job.net_hash)
+            if is_missing(where):
+                self._download = MapDownload(where, lease.job.net_hash)
         self._give()
 
     def _give(self) -> None:
         """Run the job once its map is here."""
-        if self._slot is not None and self._lease is not None and self._fetched is None:
+        if self._slot is not None and self._lease is not None and self._download is None:
             self._slot.give(self._lease.job)
 
     def _take(self, message: Message) -> None:
@@ -276,7 +276,7 @@ class JobClient:
             if isinstance(message, FrameDrawn):
                 self._report_at_s = 0.0
 
-    def _fail(self, failure: Failure) -> None:
+    def _fail(self, failure: AttemptFailure) -> None:
         assert self._lease is not None
         event = "handed back" if failure.fault == "handed_back" else "failed"
         log_event(event, WARNING, scenario=self._lease.job.scenario.id, why=failure.why)
@@ -293,14 +293,14 @@ class JobClient:
             if not self._said:
                 megabytes = (len(done.record) + len(done.log)) >> 20
                 words = f"its result of {megabytes} MB is more than can be sent"
-                self._fail(Failure("engine_failed", words))
+                self._fail(AttemptFailure("engine_failed", words))
             done = None
         failure = self._failure
         printed = b""
         if done is not None or failure is not None:
             printed, self._log_size = new_output(self._log, self._log_sent, _LAST_PRINTED)
         return Report(
-            worker=self._here.worker,
+            worker=self._identity.worker,
             slot=self._number,
             lease=0 if lease is None else lease.lease,
             scenario="" if lease is None else lease.job.scenario.id,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from cosim.core.progress import ignore
-from scenarios.ipc.faults import Failure
+from scenarios.ipc.faults import AttemptFailure
 from scenarios.ipc.messages import Done, Message, MessageHandler
 from scenarios.runs.protocol import Reply
 
@@ -19,7 +19,7 @@ class _Reported(NamedTuple):
     """A report that the run has not processed."""
 
     messages: Sequence[Message]
-    failure: Failure | None
+    failure: AttemptFailure | None
     answer: ReplyCallback
 
     @property
@@ -51,18 +51,21 @@ class Lease:
         self._lost = ""
 
     def take(
-        self, messages: Sequence[Message], failure: Failure | None, answer: ReplyCallback = ignore
+        self,
+        messages: Sequence[Message],
+        failure: AttemptFailure | None,
+        answer: ReplyCallback = ignore,
     ) -> None:
         """Take in a report. It is answered once the run has processed it, so that nothing unwritten
         is acknowledged."""
         self._reported_s = time.monotonic()
         self._reports.append(_Reported(messages, failure, answer))
 
-    def lose(self, why: str) -> None:
+    def lose(self, reason: str) -> None:
         """Note that the worker is lost, with all that runs on its machine."""
-        self._lost = self._lost or why
+        self._lost = self._lost or reason
 
-    def poll(self, handle: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> AttemptFailure | None:
         """Pass on reported messages. Returns the failure of the job if it has failed or its worker
         is lost."""
         while self._reports and not self.ended:
@@ -82,7 +85,7 @@ class Lease:
         if not self._lost:
             return None
         self.ended = True
-        return Failure("machine_lost", self._lost)
+        return AttemptFailure("machine_lost", self._lost)
 
     def revoke(self, *, silently: bool = False) -> None:
         """Take the job away. A result that was not processed is not answered: the worker sends it

@@ -41,7 +41,7 @@ _SCAN_FILE: Final = re.compile(SCAN_FOLDER + r"/[a-z0-9-]+\.[a-z0-9]+", re.ASCII
 """Pattern of the files of a scan, as they are sent."""
 
 
-def travels(where: Place) -> bool:
+def is_imported(where: Place) -> bool:
     """Return whether a place is an imported map."""
     if not isinstance(where, CityMap):
         return False
@@ -49,12 +49,12 @@ def travels(where: Place) -> bool:
     return known is None or known.origin == "imported"
 
 
-def lacks(where: Place) -> bool:
+def is_missing(where: Place) -> bool:
     """Return whether a place is a map that this machine lacks."""
     return isinstance(where, CityMap) and where.map not in known_maps()
 
 
-class Nets:
+class RunMaps:
     """The maps of a run, as the coordinator sends them."""
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Nets:
     def packed(self, digest: str) -> bytes:
         """Return a map as it is sent. Raises EngineError for one that is not of this run."""
         where = self._maps.get(digest)
-        if where is None or not travels(where):
+        if where is None or not is_imported(where):
             raise EngineError(f"this run has no map '{digest}' to hand out")
         if digest not in self._packed:
             folder = map_net(where).parent
@@ -96,7 +96,7 @@ def _files_in(folder: Path) -> list[str]:
     return [name for name in names if (folder / name).is_file()]
 
 
-class Fetched:
+class MapDownload:
     """Download of a map by a worker."""
 
     def __init__(self, where: CityMap, digest: str) -> None:

@@ -120,7 +120,7 @@ def planned_run(
 
 def check_folder(plan: PlannedRun, folder: Path) -> None:
     """Check that the run can continue in a folder. Raises RunError, UsageError."""
-    _folder(plan, folder)
+    _run_folder(plan, folder)
 
 
 @contextmanager
@@ -129,7 +129,7 @@ def locked_run(plan: PlannedRun, folder: Path) -> Iterator[LockedRun]:
 
     Raises RunError for a folder of another run.
     """
-    run_folder = _folder(plan, folder)
+    run_folder = _run_folder(plan, folder)
     hello = Hello(
         plan.policy,
         plan.driver.manifest,
@@ -143,7 +143,7 @@ def locked_run(plan: PlannedRun, folder: Path) -> Iterator[LockedRun]:
         yield LockedRun(run_folder, hello, plan.scenarios, todo)
 
 
-def _folder(plan: PlannedRun, folder: Path) -> RunFolder:
+def _run_folder(plan: PlannedRun, folder: Path) -> RunFolder:
     if plan.config.resume:
         return RunFolder.resume(folder, plan.spec, plan.suite)
     suite = msgspec.structs.replace(plan.suite, scenarios=tuple(plan.selected))

@@ -26,7 +26,7 @@ from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.episode_id import drives_second, episode_id_of
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.faults import RULES, Failure, failure_of_result
+from scenarios.ipc.faults import RULES, AttemptFailure, failure_of_result
 from scenarios.ipc.messages import (
     Done,
     FrameDrawn,
@@ -38,7 +38,7 @@ from scenarios.ipc.messages import (
 )
 from scenarios.runs.environment_slot import no_answer
 from scenarios.runs.shared_renderer import SharedRenderer
-from scenarios.runs.transport import LateResult, Reception, Transport, Worker
+from scenarios.runs.transport import LateResult, ResultOutcome, Transport, Worker
 
 POLL_S = 1.0
 """Longest time in seconds between two polls of the workers."""
@@ -125,7 +125,7 @@ class _Pool:
         self._transport.wait(POLL_S)
         self._folder.mend()
         if self._renderer is not None:
-            self._renderer.tend()
+            self._renderer.check()
         for worker in list(self._workers):
             failure = worker.poll(partial(self._take, worker))
             scenario = self._workers[worker]
@@ -185,7 +185,7 @@ class _Pool:
         record = self._record_of(scenario, done.record)
         if record is None:
             self._failed(
-                scenario, Failure("damaged_result", "its record was damaged when it arrived")
+                scenario, AttemptFailure("damaged_result", "its record was damaged when it arrived")
             )
         elif done.again:
             self._failed(scenario, failure_of_result(record.status, record.reason))
@@ -202,27 +202,27 @@ class _Pool:
             return None
         return record if record.scenario.id == scenario.id else None
 
-    def _failed(self, scenario: Scenario, failure: Failure) -> None:
+    def _failed(self, scenario: Scenario, failure: AttemptFailure) -> None:
         given_up = self._queue.failed(scenario, failure)
         if given_up is not None:
             self._give_up(scenario, given_up.reason, given_up.status, failure.driven)
 
-    def _failure_of(self, scenario: Scenario, lost: LostRenderer) -> Failure:
+    def _failure_of(self, scenario: Scenario, lost: LostRenderer) -> AttemptFailure:
         """Return the failure of an episode whose shared renderer has ended, the policy's if its
         call was pending."""
         assert self._renderer is not None
         end = self._renderer.end_of(lost.number)
         if end is None:
             words = "the environment process lost its connection to the shared renderer"
-            return Failure("process_ended", words)
+            return AttemptFailure("process_ended", words)
         if not lost.asked:
-            return Failure("handed_back")
+            return AttemptFailure("handed_back")
         if end.unanswered_s is None:
-            return Failure("process_ended", end.words)
+            return AttemptFailure("process_ended", end.words)
         words = no_answer(self._hello, end.unanswered_s)
-        return Failure("policy_timeout", f"{words} in {lost.asked} of {scenario.id}")
+        return AttemptFailure("policy_timeout", f"{words} in {lost.asked} of {scenario.id}")
 
-    def _late(self, done: Done) -> Reception:
+    def _late(self, done: Done) -> ResultOutcome:
         """Store a late result if there is none, and cancel the worker that runs the scenario."""
         busy = (
             worker
@@ -246,7 +246,7 @@ class _Pool:
         self._over(scenario, record.status)
         return "kept"
 
-    def _second(self, done: Done) -> Reception:
+    def _second(self, done: Done) -> ResultOutcome:
         """Compare a result with the one in the run folder: two episodes that ended must be
         equal."""
         if done.scenario not in self._folder.spec.scenarios:
@@ -329,7 +329,7 @@ class _AttemptQueue:
         attempts = RULES["process_ended"].attempts or 1
         return self._failed[FailedAttempt(scenario.id, away=False)] >= attempts - 1
 
-    def failed(self, scenario: Scenario, failure: Failure) -> _GivenUp | None:
+    def failed(self, scenario: Scenario, failure: AttemptFailure) -> _GivenUp | None:
         """Queue a scenario again after a failed attempt; after the last one, return its status and
         reason."""
         rule = RULES[failure.fault]

@@ -89,7 +89,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     said: messages of the environment process since the last report.
     done: the result, with the `digest` of its record and log.
     fault: the kind of failure, with its reason `why`.
-    found, driven: the result of its replay, as in `Failure`.
+    found, driven: the result of its replay, as in `AttemptFailure`.
     printed: the end of the output of the environment process.
     """
 

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 from cosim.core.errors import CosimError, UsageError
 from cosim.core.files import temp_folder
 from cosim.spec.scenario import CityMap, Place
-from scenarios.ipc.faults import Failure
+from scenarios.ipc.faults import AttemptFailure
 from scenarios.ipc.messages import Message, Unable, decode_hello, decode_job, encode_message
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
 from scenarios.runs.protocol import Installed, installed_here
@@ -36,7 +36,7 @@ class SlotReport(NamedTuple):
     output."""
 
     said: tuple[bytes, ...]
-    failure: Failure | None
+    failure: AttemptFailure | None
     printed: bytes
 
 
@@ -67,10 +67,10 @@ class EnvironmentActor:
         try:
             if packed is not None:
                 # Imported only where needed: it loads the importer of maps.
-                from scenarios.runs.net_transfer import Fetched, lacks
+                from scenarios.runs.net_transfer import MapDownload, is_missing
 
-                if isinstance(where, CityMap) and lacks(where):
-                    Fetched(where, digest).keep(packed)
+                if isinstance(where, CityMap) and is_missing(where):
+                    MapDownload(where, digest).keep(packed)
             with self._turn:
                 assert self._slot is not None
                 self._slot.give(decode_job(job))

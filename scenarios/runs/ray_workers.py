@@ -25,7 +25,7 @@ from cosim.policies.user_module import importable_name
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Place
 from scenarios.ipc.child_process import raise_unable
-from scenarios.ipc.faults import Failure
+from scenarios.ipc.faults import AttemptFailure
 from scenarios.ipc.messages import (
     Done,
     Hello,
@@ -36,7 +36,7 @@ from scenarios.ipc.messages import (
     encode_message,
 )
 from scenarios.runs.lease import Lease
-from scenarios.runs.net_transfer import Nets, travels
+from scenarios.runs.net_transfer import RunMaps, is_imported
 from scenarios.runs.protocol import difference, installed_for, other_renderer
 from scenarios.runs.ray_actor import EnvironmentActor, NodeFound, SlotReport
 from scenarios.runs.transport import LockedRun, Transport, TransportFactory
@@ -165,11 +165,11 @@ class RayWorkers:
         self._workers: list[_RayWorker] = []
         self._count = self._failed = 0
         self._noted_s = time.monotonic()
-        self._nets = Nets()
-        self._sent = cache(lambda digest: self._ray.put(self._nets.packed(digest)))
+        self._maps = RunMaps()
+        self._sent = cache(lambda digest: self._ray.put(self._maps.packed(digest)))
 
     def room(self, busy: int) -> int:
-        self._tend()
+        self._request_actors()
         return len(self._placed) + len(self._workers) - busy
 
     def unsolicited(self) -> tuple[()]:
@@ -189,9 +189,9 @@ class RayWorkers:
         """Return the arguments of an actor's `give`: a job, its place, the hash of its net, and a
         reference to an imported map."""
         where = job.scenario.place
-        digest = self._nets.hash_of(where)
+        digest = self._maps.hash_of(where)
         message = encode_message(msgspec.structs.replace(job, net_hash=digest))
-        return message, where, digest, self._sent(digest) if travels(where) else None
+        return message, where, digest, self._sent(digest) if is_imported(where) else None
 
     def wait(self, timeout_s: float) -> None:
         refs = [*self._coming, *(one.pending for one in self._workers if not one.ended)]
@@ -206,7 +206,7 @@ class RayWorkers:
                 f"stored, continue with --resume"
             ) from None
 
-    def _tend(self) -> None:
+    def _request_actors(self) -> None:
         """Request the missing actors from Ray, and take in those that it has placed."""
         self._workers = [one for one in self._workers if not one.ended]
         for _ in range(self.wanted - len(self._coming) - len(self._placed) - len(self._workers)):
@@ -268,7 +268,7 @@ class _RayWorker:
         self._lease = Lease(Path(self.log).stem, self._leases, LEASE_S, job.scenario.id)
         self._actor.give.remote(*self._packed(job))
 
-    def poll(self, handle: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> AttemptFailure | None:
         while not self.ended and self._ray.wait([self.pending], timeout=0)[0]:
             try:
                 report: SlotReport = self._ray.get(self.pending)

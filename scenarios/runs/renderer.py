@@ -102,32 +102,32 @@ def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
 class _Environment:
     """A connected environment process.
 
-    began: the request that began the current episode of the policy.
+    episode_reset: the request that began the current episode of the policy.
     seat: its place in the atlas.
-    wants: the pending request.
+    pending_request: the pending request.
     asks_next: whether its next request is to the policy, with the picture that it has.
     """
 
-    def __init__(self, end: socket.socket, memory_bytes: int) -> None:
-        self.wire = MessageSocket(end)
+    def __init__(self, connection: socket.socket, memory_bytes: int) -> None:
+        self.wire = MessageSocket(connection)
         self.memory = SharedMemory.new(memory_bytes)
-        self.began: ResetRequest | None = None
+        self.episode_reset: ResetRequest | None = None
         self.seat: SeatKey | None = None
-        self.wants: Draw | ResetRequest | ActRequest | None = None
+        self.pending_request: Draw | ResetRequest | ActRequest | None = None
         self.asks_next = False
-        socket.send_fds(end, [b"\0"], [self.memory.descriptor])
+        socket.send_fds(connection, [b"\0"], [self.memory.descriptor])
 
     @property
     def order(self) -> str:
         """Return the key by which environments are sorted: the name of the episode."""
-        return "" if self.began is None else self.began.episode
+        return "" if self.episode_reset is None else self.episode_reset.episode
 
     def reply(self, reply: Reply) -> None:
         """Send a reply. Errors are ignored: the end of the process is detected when reading.
 
         After an error its policy call stays pending, because the policy may have closed its socket.
         """
-        self.wants = None
+        self.pending_request = None
         with suppress(OSError):
             self.wire.post(encode_exchange(reply))
             self.memory.busy = False
@@ -178,12 +178,18 @@ class _Renderer:
 
     def _left_s(self) -> float:
         """Return the seconds to wait for further requests."""
-        wanted = [one.wants for one in self._environments if one.wants is not None]
+        wanted = [
+            environment.pending_request
+            for environment in self._environments
+            if environment.pending_request is not None
+        ]
         if not wanted:
             return _BEAT_S
-        if self._desk is None or not all(isinstance(wants, ActRequest) for wants in wanted):
+        if self._desk is None or not all(
+            isinstance(pending_request, ActRequest) for pending_request in wanted
+        ):
             return 0.0
-        expected = len(wanted) + sum(one.asks_next for one in self._environments)
+        expected = len(wanted) + sum(environment.asks_next for environment in self._environments)
         return self._desk.wait_s(len(wanted), expected, self._since_s)
 
     def _run_ended(self) -> None:
@@ -192,57 +198,61 @@ class _Renderer:
 
     def _accept(self, listening: socket.socket) -> None:
         """Accept an environment's connection; one of another user is closed."""
-        end, _ = listening.accept()
-        peer = end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+        connection, _ = listening.accept()
+        peer = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
         if _PEER.unpack(peer)[1] != os.getuid():
-            end.close()
+            connection.close()
             return
-        one = _Environment(end, self._memory_bytes)
-        self._environments.append(one)
-        self._selector.register(end, selectors.EVENT_READ, partial(self._hear, one))
+        environment = _Environment(connection, self._memory_bytes)
+        self._environments.append(environment)
+        self._selector.register(
+            connection, selectors.EVENT_READ, partial(self._read_requests, environment)
+        )
 
-    def _hear(self, one: _Environment) -> None:
+    def _read_requests(self, environment: _Environment) -> None:
         """Read the requests of an environment. It is disconnected when it ends, or after an invalid
         request."""
         try:
-            for message in one.wire.received():
-                if not self._take(one, decode_request(message)):
-                    self._disconnect(one)
+            for message in environment.wire.received():
+                if not self._take(environment, decode_request(message)):
+                    self._disconnect(environment)
                     return
         except (EOFError, OSError, msgspec.DecodeError, ValueError, TypeError):
-            self._disconnect(one)
+            self._disconnect(environment)
 
-    def _disconnect(self, one: _Environment) -> None:
-        self._leave(one)
-        self._end(one)
-        self._selector.unregister(one.wire)
-        self._environments.remove(one)
-        one.close()
+    def _disconnect(self, environment: _Environment) -> None:
+        self._leave(environment)
+        self._end(environment)
+        self._selector.unregister(environment.wire)
+        self._environments.remove(environment)
+        environment.close()
 
-    def _take(self, one: _Environment, request: Request) -> bool:
+    def _take(self, environment: _Environment, request: Request) -> bool:
         """Process or store a request. Returns False if it is out of order."""
-        if one.wants is not None:
+        if environment.pending_request is not None:
             return False
         if isinstance(request, Enter):
-            self._leave(one)
+            self._leave(environment)
             if request.scenario is not None:
-                one.reply(self._entered(one, request.scenario))
+                environment.reply(self._entered(environment, request.scenario))
         elif isinstance(request, EndRequest):
-            self._end(one)
+            self._end(environment)
         elif isinstance(request, Draw):
-            if one.seat is None:
+            if environment.seat is None:
                 return False
-            one.wants = request
+            environment.pending_request = request
         elif self._desk is None:
             return False
         else:
-            if not any(isinstance(other.wants, ActRequest) for other in self._environments):
+            if not any(
+                isinstance(other.pending_request, ActRequest) for other in self._environments
+            ):
                 self._since_s = time.monotonic()
-            one.wants = request
-            one.asks_next = False
+            environment.pending_request = request
+            environment.asks_next = False
         return True
 
-    def _entered(self, one: _Environment, scenario: Scenario) -> Reply:
+    def _entered(self, environment: _Environment, scenario: Scenario) -> Reply:
         """Add the scenario of an environment to the atlas, and return the reply."""
         try:
             if self._atlas is not None:
@@ -250,45 +260,60 @@ class _Renderer:
                 world = BulletWorld(
                     _surface(scenario.place), scenario.barriers, robot, scenario.obstacles
                 )
-                one.seat = self._atlas.join(world, scenario.light, scenario.conditions)
+                environment.seat = self._atlas.join(world, scenario.light, scenario.conditions)
         except Exception as error:  # noqa: BLE001  concerns one scenario only
             return _refused(error)
         return self._rendered
 
-    def _leave(self, one: _Environment) -> None:
+    def _leave(self, environment: _Environment) -> None:
         """Remove the scenario of an environment from the atlas."""
-        if one.seat is not None and self._atlas is not None:
-            self._atlas.leave(one.seat)
-        one.seat = one.wants = None
-        one.asks_next = False
+        if environment.seat is not None and self._atlas is not None:
+            self._atlas.leave(environment.seat)
+        environment.seat = environment.pending_request = None
+        environment.asks_next = False
 
-    def _end(self, one: _Environment) -> None:
+    def _end(self, environment: _Environment) -> None:
         """End the policy's episode of an environment."""
-        if one.began is not None and self._desk is not None:
-            self._desk.replies([EndRequest(*one.began.signature)])
-        one.began = None
+        if environment.episode_reset is not None and self._desk is not None:
+            self._desk.replies([EndRequest(*environment.episode_reset.signature)])
+        environment.episode_reset = None
 
     def _answer(self) -> None:
         """Answer pending pictures and resets; if there are none, the policy's observations."""
         waiting = sorted(
-            (one for one in self._environments if one.wants is not None), key=lambda one: one.order
+            (
+                environment
+                for environment in self._environments
+                if environment.pending_request is not None
+            ),
+            key=lambda environment: environment.order,
         )
-        acts = [one for one in waiting if isinstance(one.wants, ActRequest)]
+        acts = [
+            environment
+            for environment in waiting
+            if isinstance(environment.pending_request, ActRequest)
+        ]
         if len(acts) == len(waiting):
             self._ask(acts)
-        self._draw([one for one in waiting if isinstance(one.wants, Draw)])
-        for one in waiting:
-            if isinstance(one.wants, ResetRequest):
-                self._end(one)
-                one.began = one.wants
-                self._ask([one])
+        self._draw(
+            [
+                environment
+                for environment in waiting
+                if isinstance(environment.pending_request, Draw)
+            ]
+        )
+        for environment in waiting:
+            if isinstance(environment.pending_request, ResetRequest):
+                self._end(environment)
+                environment.episode_reset = environment.pending_request
+                self._ask([environment])
 
-    def _draw(self, which: list[_Environment]) -> None:
+    def _draw(self, environments: list[_Environment]) -> None:
         """Draw for environments together. After an error draw for each half, to isolate the
         environment that causes it."""
-        if not which or self._atlas is None:
+        if not environments or self._atlas is None:
             return
-        wanted = [(one.seat, one.wants) for one in which]
+        wanted = [(environment.seat, environment.pending_request) for environment in environments]
         looks = [
             (seat, look.robot, look.street)
             for seat, look in wanted
@@ -297,28 +322,34 @@ class _Renderer:
         try:
             frames = self._atlas.render(looks)
         except Exception as error:  # noqa: BLE001  sent to the environment that causes it
-            if len(which) == 1:
-                which[0].reply(_refused(error))
+            if len(environments) == 1:
+                environments[0].reply(_refused(error))
                 return
-            self._draw(which[: len(which) // 2])
-            self._draw(which[len(which) // 2 :])
+            self._draw(environments[: len(environments) // 2])
+            self._draw(environments[len(environments) // 2 :])
             return
-        for one, frame in zip(which, frames, strict=True):
+        for environment, frame in zip(environments, frames, strict=True):
             assert frame.labels is not None
-            locations = one.memory.write_arrays({"rgb": frame.rgb, "labels": frame.labels})
-            one.asks_next = self._desk is not None
-            one.reply(msgspec.structs.replace(self._rendered, arrays=locations))
+            locations = environment.memory.write_arrays({"rgb": frame.rgb, "labels": frame.labels})
+            environment.asks_next = self._desk is not None
+            environment.reply(msgspec.structs.replace(self._rendered, arrays=locations))
 
-    def _ask(self, which: list[_Environment]) -> None:
+    def _ask(self, environments: list[_Environment]) -> None:
         """Query the policy for environments together."""
-        if not which or self._desk is None:
+        if not environments or self._desk is None:
             return
-        for one in which:
-            one.memory.busy = True
-        requests = [one.wants for one in which if isinstance(one.wants, ResetRequest | ActRequest)]
-        replies = self._desk.replies(requests, [one.memory.map for one in which])
-        for one, reply in zip(which, replies, strict=True):
-            one.reply(reply)
+        for environment in environments:
+            environment.memory.busy = True
+        requests = [
+            environment.pending_request
+            for environment in environments
+            if isinstance(environment.pending_request, ResetRequest | ActRequest)
+        ]
+        replies = self._desk.replies(
+            requests, [environment.memory.map for environment in environments]
+        )
+        for environment, reply in zip(environments, replies, strict=True):
+            environment.reply(reply)
 
 
 def _refused(error: Exception) -> Refusal:

@@ -68,7 +68,7 @@ class SharedRenderer:
     def __enter__(self) -> Self:
         self._listening.bind(f"\0{self.at.address}")
         self._listening.listen(socket.SOMAXCONN)
-        self.tend()
+        self.check()
         return self
 
     def __exit__(
@@ -83,7 +83,7 @@ class SharedRenderer:
             self._watchdog = None
         self._listening.close()
 
-    def tend(self) -> None:
+    def check(self) -> None:
         """Check the renderer, and replace it if it has ended or hangs. Raises UsageError if it
         cannot load the policy, MachineError if none can be started."""
         if self._watchdog is None:
@@ -122,7 +122,7 @@ class SharedRenderer:
             and time.monotonic() < deadline_s
         ):
             select.select([self._watchdog.process.wire], [], [], 0.1)
-            self.tend()
+            self.check()
         return self._ends[number - 1] if number <= len(self._ends) else None
 
     def episode_ended(self) -> None:

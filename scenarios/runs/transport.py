@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple, Protocol
 
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.faults import Failure
+from scenarios.ipc.faults import AttemptFailure
 from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
 
 
@@ -30,7 +30,7 @@ class Worker(Protocol):
     def give(self, job: Job) -> None:
         """Send it a job."""
 
-    def poll(self, handle: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> AttemptFailure | None:
         """Pass on the messages that have arrived, without waiting; return the failure of its job if
         it has failed."""
 
@@ -44,7 +44,7 @@ class Worker(Protocol):
         """Wait until it has ended."""
 
 
-Reception = Literal["kept", "duplicate", "conflict", "refused"]
+ResultOutcome = Literal["kept", "duplicate", "conflict", "refused"]
 """Outcome of a result: it is stored, equals or contradicts the stored one, or is unusable."""
 
 
@@ -59,7 +59,7 @@ class LateResult(NamedTuple):
     """A result that arrives after the job was reassigned. `answer` is called with its outcome."""
 
     done: Done
-    answer: Callable[[Reception], None]
+    answer: Callable[[ResultOutcome], None]
 
 
 class Transport(Protocol):

@@ -19,10 +19,10 @@ from bridge.codec import decode
 from bridge.session import Query, Session
 from cosim.core.errors import EngineError
 from cosim.results.run_spec import RunSpec
-from scenarios.ipc.faults import Failure
+from scenarios.ipc.faults import AttemptFailure
 from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
 from scenarios.runs.lease import Lease
-from scenarios.runs.net_transfer import Nets
+from scenarios.runs.net_transfer import RunMaps
 from scenarios.runs.protocol import (
     MOST_SENT_BYTES,
     Assignment,
@@ -39,7 +39,7 @@ from scenarios.runs.protocol import (
     run_hash,
 )
 from scenarios.runs.status import WorkerRegistry
-from scenarios.runs.transport import AdoptedJob, LateResult, LockedRun, Reception
+from scenarios.runs.transport import AdoptedJob, LateResult, LockedRun, ResultOutcome
 
 LEASE_S: Final = 15.0
 """Seconds without a report after which a worker has lost its lease, whether or not Zenoh still
@@ -53,7 +53,7 @@ PARTING_S: Final = 3.0
 _OVERHEAD_BYTES: Final = 4096
 """Bytes that a message may have beyond `MOST_SENT_BYTES`."""
 
-_Seat = tuple[str, int]
+_SlotKey = tuple[str, int]
 """The name of a worker and the number of its slot."""
 
 
@@ -69,14 +69,14 @@ class _LeasedWorker(Lease):
     def __init__(
         self,
         server: ZenohWorkers,
-        seat: _Seat,
+        slot_key: _SlotKey,
         number: int,
         claim: Query | None,
         scenario: str = "",
     ) -> None:
-        super().__init__(seat[0], number, LEASE_S, scenario)
-        self.seat = seat
-        self.log = f"logs/{seat[0]}-{seat[1]}.log"
+        super().__init__(slot_key[0], number, LEASE_S, scenario)
+        self.slot_key = slot_key
+        self.log = f"logs/{slot_key[0]}-{slot_key[1]}.log"
         self.job: Job | None = None
         self._server = server
         self._claim = claim
@@ -86,7 +86,7 @@ class _LeasedWorker(Lease):
         self.job = self._server.with_net(job)
         if self._claim is not None:
             _answer(self._claim, Assignment(self.number, self.job))
-            self._server.registry.assigned(*self.seat, self.scenario)
+            self._server.registry.assigned(*self.slot_key, self.scenario)
 
     def take_report(self, report: Report, query: Query) -> None:
         """Take in a report, which is answered once it is processed."""
@@ -94,11 +94,11 @@ class _LeasedWorker(Lease):
         failure = _failure_in(report)
         self.take((*report.said, *done), failure, lambda reply: _answer(query, reply))
 
-    def poll(self, handle: MessageHandler) -> Failure | None:
+    def poll(self, handle: MessageHandler) -> AttemptFailure | None:
         failure = super().poll(handle)
         if self.expired:
             words = f"has not renewed its lease of {self.scenario} for {LEASE_S:g} s"
-            self._server.registry.note(f"{self.seat[0]}/{self.seat[1]} {words}")
+            self._server.registry.note(f"{self.slot_key[0]}/{self.slot_key[1]} {words}")
         if self.ended:
             self._server.forget(self)
         return failure
@@ -139,10 +139,10 @@ class ZenohWorkers:
         self._hello = hello
         self._installed = installed_for(spec)
         self._inbox: queue.SimpleQueue[tuple[str, Query] | _Disconnected] = queue.SimpleQueue()
-        self._claims: dict[_Seat, tuple[Query, float]] = {}
-        self._leases: dict[_Seat, _LeasedWorker] = {}
+        self._claims: dict[_SlotKey, tuple[Query, float]] = {}
+        self._leases: dict[_SlotKey, _LeasedWorker] = {}
         self._unsolicited: list[AdoptedJob | LateResult] = []
-        self._nets = Nets()
+        self._maps = RunMaps()
         self._number = secrets.randbits(48)
         self._opens_at = time.monotonic() + (SETTLING_S if resumed else 0.0)
         self._over = False
@@ -166,10 +166,10 @@ class ZenohWorkers:
 
     def start(self, hello: Hello) -> _LeasedWorker:
         """Return the worker that has waited longest. Its first job must be given at once."""
-        seat, (query, _) = next(iter(self._claims.items()))
-        del self._claims[seat]
+        slot_key, (query, _) = next(iter(self._claims.items()))
+        del self._claims[slot_key]
         self._number += 1
-        lease = self._leases[seat] = _LeasedWorker(self, seat, self._number, query)
+        lease = self._leases[slot_key] = _LeasedWorker(self, slot_key, self._number, query)
         return lease
 
     def unsolicited(self) -> Iterable[AdoptedJob | LateResult]:
@@ -187,10 +187,10 @@ class ZenohWorkers:
         except queue.Empty:
             pass
         now_s = time.monotonic()
-        for seat in [
-            seat for seat, (_, since_s) in self._claims.items() if now_s - since_s > HELD_S
+        for slot_key in [
+            slot_key for slot_key, (_, since_s) in self._claims.items() if now_s - since_s > HELD_S
         ]:
-            self._drop_claim(seat)
+            self._drop_claim(slot_key)
         self.registry.write()
 
     def close(self) -> None:
@@ -206,12 +206,12 @@ class ZenohWorkers:
 
     def forget(self, lease: _LeasedWorker) -> None:
         """Forget a lease that has ended."""
-        if self._leases.get(lease.seat) is lease:
-            del self._leases[lease.seat]
+        if self._leases.get(lease.slot_key) is lease:
+            del self._leases[lease.slot_key]
 
     def with_net(self, job: Job) -> Job:
         """Return a job with the hash of its street net."""
-        return msgspec.structs.replace(job, net_hash=self._nets.hash_of(job.scenario.place))
+        return msgspec.structs.replace(job, net_hash=self._maps.hash_of(job.scenario.place))
 
     def _queued(self, act: str) -> Callable[[Query], None]:
         return lambda query: self._inbox.put((act, query))
@@ -237,18 +237,18 @@ class ZenohWorkers:
         """Free the jobs of a worker that is lost or cut off. Its later reports are still
         accepted."""
         self.registry.disconnected(worker)
-        for seat in [seat for seat in self._claims if seat[0] == worker]:
-            self._drop_claim(seat)
-        for lease in [lease for seat, lease in self._leases.items() if seat[0] == worker]:
+        for slot_key in [slot_key for slot_key in self._claims if slot_key[0] == worker]:
+            self._drop_claim(slot_key)
+        for lease in [lease for slot_key, lease in self._leases.items() if slot_key[0] == worker]:
             lease.lose(f"worker {worker} was lost")
 
-    def _drop_claim(self, seat: _Seat) -> None:
-        if seat in self._claims:
-            _answer(self._claims.pop(seat)[0], Reply("idle"))
+    def _drop_claim(self, slot_key: _SlotKey) -> None:
+        if slot_key in self._claims:
+            _answer(self._claims.pop(slot_key)[0], Reply("idle"))
 
     def _claimed(self, query: Query) -> None:
         claim = decode(query.payload, Claim)
-        seat = (claim.worker, claim.slot)
+        slot_key = (claim.worker, claim.slot)
         if self._over:
             self.registry.left(claim.worker)
             _answer(query, Reply("over"))
@@ -265,14 +265,14 @@ class ZenohWorkers:
         if not claim.ready:
             _answer(query, self._hello)
             return
-        lease = self._leases.get(seat)
+        lease = self._leases.get(slot_key)
         if lease is not None and lease.job is not None and not lease.ended:
             _answer(query, Assignment(lease.number, lease.job))  # the first reply was lost
             return
         if lease is not None:
             lease.lose(f"worker {claim.worker} does not continue with it")
-        self._drop_claim(seat)
-        self._claims[seat] = (query, time.monotonic())
+        self._drop_claim(slot_key)
+        self._claims[slot_key] = (query, time.monotonic())
 
     def _reported(self, query: Query) -> None:
         report = decode(query.payload, Report)
@@ -299,24 +299,28 @@ class ZenohWorkers:
 
     def _adopt(self, report: Report, query: Query) -> None:
         """Renew a lease that is not known here, if the run can use its job."""
-        seat = (report.worker, report.slot)
-        lease = self._leases[seat] = _LeasedWorker(self, seat, report.lease, None, report.scenario)
+        slot_key = (report.worker, report.slot)
+        lease = self._leases[slot_key] = _LeasedWorker(
+            self, slot_key, report.lease, None, report.scenario
+        )
         lease.take_report(report, query)
         self._unsolicited.append(AdoptedJob(report.scenario, lease))
 
     def _late(self, report: Report, done: Done, query: Query) -> None:
         """Offer the run the result of a lease that has ended."""
 
-        def answer(how: Reception) -> None:
-            if how == "conflict":
+        def answer(outcome: ResultOutcome) -> None:
+            if outcome == "conflict":
                 self.registry.conflict(
                     f"{report.scenario} by {report.worker} came out otherwise than what is "
                     f"kept: the same scenario "
                     "must give the same result on every machine; the first one stays"
                 )
             else:
-                self.registry.note(f"late result of {report.scenario} by {report.worker}: {how}")
-            _answer(query, Reply(how))
+                self.registry.note(
+                    f"late result of {report.scenario} by {report.worker}: {outcome}"
+                )
+            _answer(query, Reply(outcome))
 
         if self._over:
             answer("duplicate")
@@ -352,17 +356,17 @@ class ZenohWorkers:
         return f"{other}: begin the run with --camera bullet" if other else ""
 
     def _net(self, query: Query) -> None:
-        query.answer(self._nets.part(query.key.rpartition("/")[2], query.payload))
+        query.answer(self._maps.part(query.key.rpartition("/")[2], query.payload))
 
     def _status(self, query: Query) -> None:
         query.answer(msgspec.json.encode(self.registry.status()))
 
 
-def _failure_in(report: Report) -> Failure | None:
+def _failure_in(report: Report) -> AttemptFailure | None:
     """Return the failure that a report has, if any."""
     if report.fault is None:
         return None
-    return Failure(report.fault, report.why, report.found, report.driven)
+    return AttemptFailure(report.fault, report.why, report.found, report.driven)
 
 
 def _answer(query: Query, reply: CoordinatorReply) -> None:

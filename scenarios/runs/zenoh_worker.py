@@ -25,7 +25,7 @@ from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.core.files import temp_folder
 from cosim.core.progress import Progress
 from cosim.spec.connection import Connection
-from scenarios.runs.job_client import Installation, JobClient, Request, RunEnded
+from scenarios.runs.job_client import CoordinatorRequest, JobClient, RunEnded, WorkerIdentity
 from scenarios.runs.protocol import installed_here
 
 _RETRY_S: Final = 0.5
@@ -192,11 +192,11 @@ class _Service:
         self._say = say
         host = socket.gethostname()
         self._name = keys.chunk(f"{host[:40]}-{os.getpid()}-{secrets.token_hex(3)}")
-        here = Installation(self._name, host, installed_here(), connection)
-        self._clients = [JobClient(run, number, here, logs) for number in range(jobs)]
-        self._replies: queue.SimpleQueue[tuple[JobClient | None, Request, bytes | None, str]] = (
-            queue.SimpleQueue()
-        )
+        identity = WorkerIdentity(self._name, host, installed_here(), connection)
+        self._clients = [JobClient(run, number, identity, logs) for number in range(jobs)]
+        self._replies: queue.SimpleQueue[
+            tuple[JobClient | None, CoordinatorRequest, bytes | None, str]
+        ] = queue.SimpleQueue()
         self._looks_s = time.monotonic() + _LOOKS_S
         self._refusal = ""
 
@@ -239,7 +239,7 @@ class _Service:
             for client in self._clients:
                 client.poll()
 
-    def _send(self, client: JobClient | None, request: Request) -> None:
+    def _send(self, client: JobClient | None, request: CoordinatorRequest) -> None:
         def replied(payload: bytes | None, error: str) -> None:
             self._replies.put((client, request, payload, error))
             self._leaving.ring()
@@ -247,7 +247,11 @@ class _Service:
         self._session.send(request.key, request.payload, replied, timeout_s=request.timeout_s)
 
     def _take(
-        self, client: JobClient | None, request: Request, payload: bytes | None, error: str
+        self,
+        client: JobClient | None,
+        request: CoordinatorRequest,
+        payload: bytes | None,
+        error: str,
     ) -> None:
         if payload is not None:
             self._contact.made("the coordinator answers again")

@@ -30,9 +30,9 @@ from cosim.spec.sensors import ScanSpec
 from scenarios.episodes.episode import Episode
 from scenarios.ipc.observation_codec import (
     ObservationDecoder,
+    encode_constants,
     encode_extra,
-    encoded_about,
-    encoded_fields,
+    encode_observation,
 )
 from scenarios.tools.verify.doctor import small_scenario
 from tests.support.documents import text_of
@@ -253,9 +253,9 @@ def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Obs
 
 def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
     """What a policy gets in another process with cosim, and in one without."""
-    fields, arrays = encoded_fields(dataclasses.replace(seen, privileged=None))
+    fields, arrays = encode_observation(dataclasses.replace(seen, privileged=None))
     laid = {name: pack_array(array) for name, array in arrays.items()}
-    about = encoded_about(seen)
+    about = encode_constants(seen)
     asked = ActRequest("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
     came = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=ActRequest)
     copies = {name: unpack_array(array) for name, array in came.arrays.items()}
@@ -270,9 +270,9 @@ def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
 def test_an_observation_that_is_sent_arrives_equal_to_the_bit(seen: dict[str, Observation]) -> None:
     """By every goal protocol: each array and number, what the simulator knows included."""
     for one in seen.values():
-        fields, arrays = encoded_fields(one)
+        fields, arrays = encode_observation(one)
         asked = ActRequest("r", one.episode, "a", 0, **fields)
-        came = ObservationDecoder(one.episode, encoded_about(one)).decoded(asked, arrays)
+        came = ObservationDecoder(one.episode, encode_constants(one)).decoded(asked, arrays)
         assert bytes_of(one) == bytes_of(came)
 
 

@@ -14,14 +14,14 @@ from cosim.policies.load import load_policy
 from cosim.spec.connection import Connection
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Message, Progress, Ready
 from scenarios.runs import job_client, zenoh_worker
-from scenarios.runs.job_client import Installation, JobClient, Request
+from scenarios.runs.job_client import CoordinatorRequest, JobClient, WorkerIdentity
 from scenarios.runs.protocol import Assignment, Claim, CoordinatorReply, Reply, Report, encode_reply
 from scenarios.runs.zenoh_worker import work
 from tests.conftest import wait_until
 from tests.scenarios.test_many_workers import Run
 from tests.scenarios.test_pool import SCENARIO, Fake
 
-HERE = Installation(
+IDENTITY = WorkerIdentity(
     "w", "here", {"source": "s"}, Connection(role="worker", connect="unixsock-stream/nowhere")
 )
 DRIVER = load_policy("stop")
@@ -41,25 +41,25 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.processes: list[Process] = []
-        self.client = JobClient("r", 0, HERE, folder, self._start)
+        self.client = JobClient("r", 0, IDENTITY, folder, self._start)
         self.now_s = 0.0
 
     def _start(self, log: Path, hello: Hello) -> Process:
         self.processes.append(Process(Ready()))
         return self.processes[-1]
 
-    def request(self) -> Request:
+    def request(self) -> CoordinatorRequest:
         """The one request that is due within a second."""
         self.client.poll()
         (request,) = self.client.requests(float("inf"))
         return request
 
-    def report(self) -> tuple[Request, Report]:
+    def report(self) -> tuple[CoordinatorRequest, Report]:
         request = self.request()
         assert request.act == "report"
         return request, msgspec.msgpack.decode(request.payload, type=Report)
 
-    def answer(self, request: Request, reply: CoordinatorReply | None) -> None:
+    def answer(self, request: CoordinatorRequest, reply: CoordinatorReply | None) -> None:
         self.client.answered(request, None if reply is None else encode_reply(reply), "")
 
     def assigned(self) -> Process:

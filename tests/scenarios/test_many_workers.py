@@ -24,11 +24,11 @@ from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import City, CityMap, Scenario, Suite
-from scenarios.ipc.faults import RULES, Failure
+from scenarios.ipc.faults import RULES, AttemptFailure
 from scenarios.ipc.messages import Done, Hello, Progress
 from scenarios.runs import status
 from scenarios.runs import zenoh_transport as remote
-from scenarios.runs.net_transfer import Fetched, Nets, lacks
+from scenarios.runs.net_transfer import MapDownload, RunMaps, is_missing
 from scenarios.runs.pool import run_all
 from scenarios.runs.protocol import (
     Assignment,
@@ -75,7 +75,7 @@ KEPT = Reply("kept")
 DUPLICATE = Reply("duplicate")
 CONFLICT = Reply("conflict")
 REFUSED = Reply("refused")
-KILLED = Failure("process_ended", "its process was killed by SIGKILL")
+KILLED = AttemptFailure("process_ended", "its process was killed by SIGKILL")
 ATTEMPTS, LOSSES = (RULES[fault].attempts for fault in ("process_ended", "machine_lost"))
 GARBAGE = (
     b"",
@@ -221,7 +221,7 @@ class Hand:
     def deliver(self, **named: object) -> CoordinatorReply:
         return self.report(**self.result(**named))
 
-    def fail(self, failure: Failure = KILLED) -> CoordinatorReply:
+    def fail(self, failure: AttemptFailure = KILLED) -> CoordinatorReply:
         return self.report(fault=failure.fault, why=failure.why)
 
     def me(self) -> dict[str, object]:
@@ -327,7 +327,7 @@ def test_attempts_are_bounded_and_leaving_is_none(
     with hands(run, 1) as (one,):
         poison = one.job()
         for _ in range(ATTEMPTS + 1):
-            assert one.fail(Failure("handed_back")) == KEPT
+            assert one.fail(AttemptFailure("handed_back")) == KEPT
             assert one.job() == poison
         for _ in range(ATTEMPTS):
             assert one.job() == poison
@@ -462,11 +462,11 @@ def test_a_map_reaches_workers_that_lack_it(
 
     def fetched(expected: str) -> None:
         monkeypatch.setenv("COSIM_CACHE", str(there))
-        nets = Nets()
+        nets = RunMaps()
         parts = 0
         last = False
         digest = nets.hash_of(where)
-        wanted = Fetched(where, expected)
+        wanted = MapDownload(where, expected)
         while not last:
             monkeypatch.setenv("COSIM_CACHE", str(there))
             part = nets.part(digest, wanted.request)
@@ -479,9 +479,9 @@ def test_a_map_reaches_workers_that_lack_it(
 
     with pytest.raises(EngineError, match=f"came with hash {where.net_hash} in place of wrong"):
         fetched("wrong")
-    assert lacks(where) and not (here / "maps" / "mine").exists()
+    assert is_missing(where) and not (here / "maps" / "mine").exists()
     fetched(where.net_hash)
-    assert not lacks(where) and (here / "maps" / "mine" / "net.xml").read_bytes() == net
+    assert not is_missing(where) and (here / "maps" / "mine" / "net.xml").read_bytes() == net
 
 
 def test_status_tells_of_a_lost_a_silent_and_a_working_worker(

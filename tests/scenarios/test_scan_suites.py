@@ -19,7 +19,7 @@ from scenarios.places.chosen_areas import replace_areas
 from scenarios.places.nets import place
 from scenarios.places.scan_import import import_scan
 from scenarios.places.scan_options import ScanOptions, read_options
-from scenarios.runs.net_transfer import Fetched, Nets
+from scenarios.runs.net_transfer import MapDownload, RunMaps
 from scenarios.suites.catalog import one_scenario
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.sample import drawn_on_map, suite_on_map
@@ -142,11 +142,11 @@ def test_scans_are_sent_to_workers_whole(
     """A worker that lacks a scan gets its net, its drawn ground and its files."""
     where = CityMap(map=scan)
     sent: StreetMap = read_map(where)
-    nets = Nets()
+    nets = RunMaps()
     packed = nets.packed(nets.hash_of(where))
     names = sorted(path.name for path in (maps_folder() / scan / "scan").iterdir())
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    Fetched(where, sent.net_hash).keep(packed)
+    MapDownload(where, sent.net_hash).keep(packed)
     got = read_map(where)
     assert got.net_hash == sent.net_hash and got.walkable.equals(sent.walkable)
     assert sorted(p.name for p in (maps_folder() / scan / "scan").iterdir()) == names

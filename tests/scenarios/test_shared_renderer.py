@@ -42,7 +42,7 @@ from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CityMap, Light, Scenario, Suite, write_suite
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, Progress
-from scenarios.ipc.observation_codec import encoded_about, encoded_fields
+from scenarios.ipc.observation_codec import encode_constants, encode_observation
 from scenarios.ipc.render_link import RendererLink
 from scenarios.ipc.render_protocol import Draw, Rendered, Request, encode_exchange
 from scenarios.ipc.shared_memory import SharedMemory
@@ -176,7 +176,7 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
         ):
             linked(renderer).enter(msgspec.structs.replace(one, place=CityMap(map="nowhere")))
         pid = renderer_pid()
-        renderer.tend()
+        renderer.check()
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(RendererLost) as lost:
             links[0].draw(busy.robot, busy.streets[0])
@@ -218,8 +218,10 @@ def knows(name: str, step: int) -> ActRequest:
         robot, route, 0.0, people, NO_VEHICLES, {}, (), shapely.box(0.0, -1.0, 30.0, 1.0)
     )
     seen = Observation(5 * step, 0.25 * step, None, 0.5, 0.0, COURIER, known)
-    fields, _ = encoded_fields(seen)
-    return ActRequest("r", name, "a", step, **fields, about=None if step else encoded_about(seen))
+    fields, _ = encode_observation(seen)
+    return ActRequest(
+        "r", name, "a", step, **fields, about=None if step else encode_constants(seen)
+    )
 
 
 @pytest.mark.engine
@@ -256,7 +258,7 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
             PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt.* \(reset\)"
         ):
             driver.reset("fails-in-reset", 0)
-        renderer.tend()
+        renderer.check()
         ends = {
             "hangs": RendererEnd("the renderer process was ended", 1.0),
             "exits": RendererEnd(
@@ -268,7 +270,7 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
             honest_one, other = begun("honest", name)
             other.send(knows(name, 2))
             while name == "hangs" and renderer.end_of(1) is None:
-                renderer.tend()
+                renderer.check()
             with pytest.raises(RendererLost) as lost:
                 other.received("act at 0.50 s")
             assert lost.value.asked == "act at 0.50 s"
