@@ -64,9 +64,14 @@ class LiveEpisode:
         self._injected.set_robot(RobotOnRoute(step.tick + 1, pose, route_s_m))
         if step.frame is not None:
             self._rgb = step.frame.rgb
-        tick = step.tick
-        street = step.street_after
-        robot = step.motion.robot
+        topics = _telemetry(step)
+        if news := self._news(step, verdict):
+            topics["events"] = news
+        for topic, content in topics.items():
+            self._session.tell(f"{self._prefix}/{topic}", msgspec.json.encode(content))
+
+    def _news(self, step: Step, verdict: Verdict) -> list[str]:
+        """Return the failures, begun events and the end of a tick in words, and log them."""
         news = [f"{failure.kind} {failure.other}".strip() for failure in verdict.failures]
         news += [f"{contact.suffered} by {contact.other}" for contact in verdict.walked_into]
         for event, state in zip(self._scenario.events, step.events.states, strict=True):
@@ -75,48 +80,8 @@ class LiveEpisode:
                 news.append(f"event {event.id} {event.kind}")
         if verdict.ended is not None:
             news.append(f"ended: {verdict.ended}")
-        self._happened += [(tick, words) for words in news]
-        x_m, y_m, heading_rad = robot.pose
-        crowd = [
-            {
-                "id": name,
-                "x_m": x,
-                "y_m": y,
-                "heading_rad": heading,
-                "speed_mps": speed,
-                "doing": doing,
-                "kind": PersonKind(kind).name.lower(),
-                "age": Age(age).name.lower(),
-            }
-            for name, (x, y), heading, speed, doing, kind, age in zip(
-                street.people.ids,
-                street.people.xy.tolist(),
-                street.people.heading.tolist(),
-                street.people.speed.tolist(),
-                street.people.doing,
-                street.people.kind.tolist(),
-                street.people.age.tolist(),
-                strict=True,
-            )
-        ]
-        topics: dict[str, object] = {
-            "clock": {"tick": tick, "time_s": Clock().time_s(tick)},
-            "robot": {
-                "x_m": x_m,
-                "y_m": y_m,
-                "heading_rad": heading_rad,
-                "v_mps": robot.v_mps,
-                "w_radps": robot.w_radps,
-                "z_m": robot.z_m,
-                "route_s_m": step.route_s_after_m,
-            },
-            "crowd": crowd,
-            "signals": {name: signal.walk for name, signal in street.signals.items()},
-        }
-        if news:
-            topics["events"] = news
-        for topic, content in topics.items():
-            self._session.tell(f"{self._prefix}/{topic}", msgspec.json.encode(content))
+        self._happened += [(step.tick, words) for words in news]
+        return news
 
     def _status(self) -> bytes:
         tick = -1 if self._step is None else self._step.tick
@@ -139,3 +104,46 @@ class LiveEpisode:
         done, data = cv2.imencode(".png", self._rgb[..., ::-1])
         assert done
         return bytes(data)
+
+
+def _telemetry(step: Step) -> dict[str, object]:
+    """Return the contents of the topics of a tick, as JSON values."""
+    street = step.street_after
+    robot = step.motion.robot
+    x_m, y_m, heading_rad = robot.pose
+    crowd = [
+        {
+            "id": name,
+            "x_m": x,
+            "y_m": y,
+            "heading_rad": heading,
+            "speed_mps": speed,
+            "doing": doing,
+            "kind": PersonKind(kind).name.lower(),
+            "age": Age(age).name.lower(),
+        }
+        for name, (x, y), heading, speed, doing, kind, age in zip(
+            street.people.ids,
+            street.people.xy.tolist(),
+            street.people.heading.tolist(),
+            street.people.speed.tolist(),
+            street.people.doing,
+            street.people.kind.tolist(),
+            street.people.age.tolist(),
+            strict=True,
+        )
+    ]
+    return {
+        "clock": {"tick": step.tick, "time_s": Clock().time_s(step.tick)},
+        "robot": {
+            "x_m": x_m,
+            "y_m": y_m,
+            "heading_rad": heading_rad,
+            "v_mps": robot.v_mps,
+            "w_radps": robot.w_radps,
+            "z_m": robot.z_m,
+            "route_s_m": step.route_s_after_m,
+        },
+        "crowd": crowd,
+        "signals": {name: signal.walk for name, signal in street.signals.items()},
+    }

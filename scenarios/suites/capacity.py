@@ -19,7 +19,7 @@ from cosim.core.errors import CosimError
 from cosim.place.route_line import START_M
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import EventKind, EventKinds
+from cosim.spec.events import EventKind
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CityMap, Place, Scenario
 from scenarios.events import EVENT_KINDS
@@ -111,16 +111,18 @@ class Capacity(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-def capacity_of(
-    street_map: StreetMap, graph: WalkGraph, kinds: EventKinds = EVENT_KINDS, robot: Robot = COURIER
-) -> Capacity:
-    """Count where each kind of scenario fits a robot on a place. Equal maps give equal counts."""
+def capacity_of(street_map: StreetMap, graph: WalkGraph) -> Capacity:
+    """Count where each kind of scenario fits the courier on a place.
+
+    Equal maps give equal counts.
+    """
+    robot = COURIER
     rng = np.random.default_rng(0x0FFE)
     whole = _Whole(street_map, graph, rng, robot) if street_map.scanned else None
     least = 1 if whole is None else SCAN_TRIES
     events: dict[str, FitCount] = {}
     structures: dict[str, FitCount] = {}
-    for name, kind in kinds.items():
+    for name, kind in EVENT_KINDS.items():
         strips = strips_of(kind, street_map, graph)
         slow = kind.layout is None
         spot: Callable[[Strip], object] = (

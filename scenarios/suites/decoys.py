@@ -62,14 +62,14 @@ def differing_fields(scenario: Scenario, decoy: Scenario) -> list[str]:
     ]
 
 
-def people_in_obstacles(scenario: Scenario, kinds: EventKinds = EVENT_KINDS) -> Iterator[str]:
+def people_in_obstacles(scenario: Scenario) -> Iterator[str]:
     """Yield the people of a short scenario who may stay inside an obstacle after the trigger."""
     if not scenario.ends_on_failure or not scenario.obstacles:
         return
     obstacles = shapely.union_all([footprint(one) for one in scenario.obstacles])
     for event in scenario.events:
         for number in range(event.people):
-            places = kinds[event.kind].stays_of(event, number)
+            places = EVENT_KINDS[event.kind].stays_of(event, number)
             inside_m = PERSON_RADIUS_M - obstacles.distance(shapely.MultiPoint(places).convex_hull)
             if places and inside_m > 0.0:
                 yield f"person '{event.names[number]}' stays {inside_m:.2f} m inside an obstacle"

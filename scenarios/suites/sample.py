@@ -75,14 +75,12 @@ def suite_on_map(
     )
 
 
-def drawn_on_map(
-    scenario_id: str, called: str, robot: Robot = COURIER, roughness: float = 0.0
-) -> Suite:
+def drawn_on_map(scenario_id: str, called: str, robot: Robot = COURIER) -> Suite:
     """Draw the scenario with an id of `suite_on_map` again: the suite with it alone.
 
     Raises UsageError for an id that is not drawn on this place, and the errors of `suite_on_map`.
     """
-    where = resolve_place(called, roughness)
+    where = resolve_place(called)
     name = where.map if isinstance(where, CityMap) else where.name
     of_place = re.fullmatch(rf"(?:(\w+)-)?{re.escape(name)}-(\d{{3,}})", scenario_id)
     what, seed = of_place.groups() if of_place else ("", "0")
@@ -93,10 +91,10 @@ def drawn_on_map(
             f"straight-{name}-000"
         )
     if what in EVENT_KINDS:
-        return suite_on_map("reactive", called, int(seed), 1, roughness, (what,), robot=robot)
+        return suite_on_map("reactive", called, int(seed), 1, events=(what,), robot=robot)
     if what is None:
-        return suite_on_map("long-horizon", called, int(seed), 1, roughness, robot=robot)
-    drawn = suite_on_map("unit", called, int(seed), None, roughness, robot=robot)
+        return suite_on_map("long-horizon", called, int(seed), 1, robot=robot)
+    drawn = suite_on_map("unit", called, int(seed), None, robot=robot)
     return msgspec.structs.replace(drawn, scenarios=select_scenarios(drawn, [scenario_id]))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -33,8 +33,6 @@ TOGETHER: Final = 10
 MANY: Final = 100
 PERIOD_S: Final = 0.05
 """Time from frame to frame."""
-PAPER_FPS: Final = 226.8
-"""People alone, 50 of them, on an L40S: the paper's figure."""
 _NEAREST_M: Final = 2.5
 _FARTHEST_M: Final = 32.0
 _STANDING: Final[tuple[Doing, ...]] = ("stand", "look", "talk", "stop")
@@ -272,14 +270,12 @@ class _Found(NamedTuple):
     why: str = ""
 
 
-def time_cameras(
-    rounds: int, progress: Progress, figures: Sequence[Drawing] = FIGURES
-) -> dict[str, _Found]:
+def time_cameras(rounds: int, progress: Progress) -> dict[str, _Found]:
     """Measure every figure `rounds` times, each in a fresh process. A figure that fails is not
     repeated."""
-    found = {figure.name: _Found([]) for figure in figures}
+    found = {figure.name: _Found([]) for figure in FIGURES}
     for i in range(rounds):
-        for figure in figures:
+        for figure in FIGURES:
             if found[figure.name].why:
                 continue
             progress(f"measuring: round {i + 1} of {rounds}: {figure.name}")
@@ -287,6 +283,6 @@ def time_cameras(
                 found[figure.name].fps.append(1.0 / alone(figure.work, figure.size_m))
             except CosimError as error:
                 found[figure.name] = _Found([], str(error))
-            except Exception as error:  # noqa: BLE001  a library or a driver may fail in any way; it is told
+            except Exception as error:  # noqa: BLE001  a library or a driver may fail in any way; reported
                 found[figure.name] = _Found([], f"{type(error).__name__}: {error}")
     return found

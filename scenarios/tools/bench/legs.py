@@ -28,6 +28,8 @@ from physics.street.surface import Chunk, Patch, Surface
 COMMAND_S: Final = 2.0
 """Duration of a random command, seconds."""
 _CLOCK: Final = Clock()
+_TIMED_S: Final = 20.0
+"""Simulated seconds of the measured CPU time."""
 _EMPTY: Final = Street(0)
 _FRICTION: Final = 0.9
 _COLOUR: Final = (0.6, 0.6, 0.6)
@@ -358,10 +360,10 @@ def _curbs(robot: Robot, v_mps: float, drive: MakeDrive) -> Iterator[LegFigure]:
             yield LegFigure(f"up {100 * height_m:.0f} cm at {v:.2g} m/s", said)
 
 
-def cpu_ms_per_s(robot: Robot, drive: Drive | None = None, seconds: float = 20.0) -> float:
+def cpu_ms_per_s(robot: Robot, drive: Drive | None = None) -> float:
     """Return the CPU time in ms of a simulated second of walking or driving at its pace."""
     with walking(robot, FLAT, Pose(-40.0, 0.0, 0.0), drive) as walk:
         walk.drive(Command(robot.cruise_mps, 0.2), 1.0)
-        began = time.process_time()
-        walk.drive(Command(robot.cruise_mps, 0.2), seconds)
-        return 1000.0 * (time.process_time() - began) / seconds
+        began_s = time.process_time()
+        walk.drive(Command(robot.cruise_mps, 0.2), _TIMED_S)
+        return 1000.0 * (time.process_time() - began_s) / _TIMED_S

@@ -44,7 +44,6 @@ from cosim.results.referee import Verdict
 from cosim.results.waypoint_replay import WaypointReplay
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import robot_called
-from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario
 from physics.cameras.posture import posture_of
 from physics.robots import urdf_path
@@ -96,7 +95,6 @@ def record_for_rerun(
     folder: Path,
     scenario_id: str,
     output: Path,
-    camera: CameraChoice = "auto",
     progress: Progress = ignore,
 ) -> None:
     """Write the recording of a finished episode of a run.
@@ -121,7 +119,7 @@ def record_for_rerun(
                 recording.save(str(part), default_blueprint=_blueprint(rrb))
                 recording.set_log_time_enabled(False)
                 recording.set_log_tick_enabled(False)
-                _replay_into(_Tape(rr, recording, recorded), folder, recorded, camera, progress)
+                _replay_into(_Tape(rr, recording, recorded), folder, recorded, progress)
                 recording.flush()
             finally:
                 recording.disconnect()
@@ -154,11 +152,9 @@ def _blueprint(rrb: Any) -> Any:
     )
 
 
-def _replay_into(
-    tape: _Tape, folder: Path, recorded: RecordedEpisode, camera: CameraChoice, progress: Progress
-) -> None:
+def _replay_into(tape: _Tape, folder: Path, recorded: RecordedEpisode, progress: Progress) -> None:
     spec = replace(recorded.record.manifest.camera or _SPEC, depth=True, labels=True)
-    episode, policy = replay_episode(recorded, camera)
+    episode, policy = replay_episode(recorded)
     with episode, episode.eyes(spec) as eyes, sensor_replay(recorded) as sensors:
         surface = surface_of_place(recorded.scenario.place)
         tape.begin(surface, spec)
