@@ -67,9 +67,9 @@ def export(
     with doing("reading the scenario") as progress:
         if run is None:
             from cosim.spec.selection import select_scenarios
-            from scenarios.suites.catalog import holding, load_suite
+            from scenarios.suites.catalog import load_suite, suite_with_scenario
 
-            found = holding(scenario) if suite is None else load_suite(suite)
+            found = suite_with_scenario(scenario) if suite is None else load_suite(suite)
             (one,), robot = select_scenarios(found, [scenario]), None
         else:
             one, robot = recorded_robot(run, scenario, at)

@@ -95,7 +95,7 @@ def check_policy(
             found = checked_policy(driver, manifest, drives, progress, only or ())
             if picture is not None:
                 progress("drawing")
-                write_png(check_sheet(found.asker), picture)
+                write_png(check_sheet(found.query), picture)
     finally:
         driver.close()
     if as_json:

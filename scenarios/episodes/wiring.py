@@ -18,7 +18,7 @@ from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, SpecError
 from cosim.core.geometry import Pose
 from cosim.core.progress import Progress
-from cosim.core.state import RobotState, Street
+from cosim.core.state import People, RobotState, Street
 from cosim.episode.interfaces import Camera, Director, Privileged, ViewCamera
 from cosim.episode.loop import EpisodeEngines, Moment
 from cosim.episode.observer import Observer
@@ -46,7 +46,7 @@ from physics.dynamics.legs.gait_file import user_gait
 from physics.dynamics.world import BulletWorld
 from physics.sensors.caster import RayCaster
 from physics.street.furniture import Prop, footprints
-from physics.street.surface import Surface
+from physics.street.surface import PlaceSurface, Surface
 from scenarios.episodes.director import ObstacleAwareDirector, director_of
 from scenarios.episodes.injected import InjectedPeople
 from scenarios.episodes.scorer import Scorer
@@ -141,16 +141,7 @@ def staged(
                 appearance=options.appearance,
             )
 
-        camera: Camera | None = None
-        renderer = NO_RENDERER
-        if shared is not None:
-            shared_camera = stack.enter_context(SharedCamera(shared, scenario))
-            if manifest.camera is not None:
-                camera = shared_camera
-                renderer = shared_camera.renderer
-        elif manifest.camera is not None:
-            camera = stack.enter_context(eyes(manifest.camera))
-            renderer = renderer_of(camera_of_choice(options.camera), options.appearance)
+        camera, renderer = _policy_camera(stack, scenario, manifest, options, shared, eyes)
         cameras = {name: stack.enter_context(eyes(spec)) for name, spec in manifest.cameras.items()}
         rays: RayCaster | None = None
         if range_m := sensing_range_m(manifest):
@@ -159,38 +150,15 @@ def staged(
             )
         look = None if camera is None else partial(draw_empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
-        if scenario.weathered_crowd.residents:
-            # Imported only where needed: it loads scipy.
-            from scenarios.events.resident_director import with_residents
-
-            director = with_residents(
-                director, scenario, street_map, street, lambda: crowd.street.people
-            )
-        injected = InjectedPeople(
-            director,
-            clock.tick_ms,
-            partial(is_on_map, street_map),
-            scenario.route_line,
-            scenario.start_pose,
-            options.injections,
+        injected, directed = _with_people(
+            director, scenario, options, street_map, street, clock, lambda: crowd.street.people
         )
-        directed: Director = injected
-        if scenario.obstacles:
-            directed = ObstacleAwareDirector(
-                injected, pedestrian_obstacles(scenario, street_map), lambda: crowd.street.people
-            )
 
         @cache
         def free() -> Polygon | MultiPolygon:
             """Compute the free ground, only for policies that get it: placing all props is slow."""
-            ground = without_obstacles(
-                without_barriers(walkable, scenario.barriers),
-                street.standing(around),
-                scenario.obstacles,
-            )
-            room = shapely.buffer(ground, -robot.width_m / 2)
-            shapely.prepare(room)
-            return room
+            props = street.standing(around)
+            return _free_ground(walkable, scenario, props, robot)
 
         @cache
         def waits_m() -> tuple[float, ...]:
@@ -218,6 +186,74 @@ def staged(
             injected=injected,
             entrances=crowd.entrances,
         )
+
+
+def _policy_camera(
+    stack: ExitStack,
+    scenario: Scenario,
+    manifest: Manifest,
+    options: EpisodeOptions,
+    shared: RendererAddress | None,
+    eyes: Callable[[CameraSpec], AbstractContextManager[ViewCamera]],
+) -> tuple[Camera | None, str]:
+    """Start the policy's camera, or connect to the shared renderer, until `stack` is closed.
+
+    Returns the camera, None for a policy without one, and the name of its renderer in records.
+    """
+    if shared is not None:
+        shared_camera = stack.enter_context(SharedCamera(shared, scenario))
+        if manifest.camera is not None:
+            return shared_camera, shared_camera.renderer
+    elif manifest.camera is not None:
+        camera = stack.enter_context(eyes(manifest.camera))
+        return camera, renderer_of(camera_of_choice(options.camera), options.appearance)
+    return None, NO_RENDERER
+
+
+def _with_people(
+    director: Director,
+    scenario: Scenario,
+    options: EpisodeOptions,
+    street_map: StreetMap,
+    street: PlaceSurface,
+    clock: Clock,
+    people: Callable[[], People],
+) -> tuple[InjectedPeople, Director]:
+    """Add residents and injected people to a director, and obstacles to its queries.
+
+    people: returns the people on the street now.
+    Returns the wrapper for injections, and the outermost director.
+    """
+    if scenario.weathered_crowd.residents:
+        # Imported only where needed: it loads scipy.
+        from scenarios.events.resident_director import with_residents
+
+        director = with_residents(director, scenario, street_map, street, people)
+    injected = InjectedPeople(
+        director,
+        clock.tick_ms,
+        partial(is_on_map, street_map),
+        scenario.route_line,
+        scenario.start_pose,
+        options.injections,
+    )
+    if not scenario.obstacles:
+        return injected, injected
+    obstacles = pedestrian_obstacles(scenario, street_map)
+    return injected, ObstacleAwareDirector(injected, obstacles, people)
+
+
+def _free_ground(
+    walkable: Polygon | MultiPolygon, scenario: Scenario, props: Sequence[Prop], robot: Robot
+) -> Polygon | MultiPolygon:
+    """Return where the robot's middle may be: the walkable area without barriers, props and
+    obstacles, narrowed by half the robot's width."""
+    ground = without_obstacles(
+        without_barriers(walkable, scenario.barriers), props, scenario.obstacles
+    )
+    free = shapely.buffer(ground, -robot.width_m / 2)
+    shapely.prepare(free)
+    return free
 
 
 def _look_of(surface: Surface, renderer: str, options: EpisodeOptions) -> ScanLook | None:

@@ -27,8 +27,8 @@ from scenarios.suites.drawing import SCAN_TRIES, Refusals, first_of
 from scenarios.suites.long_horizon import (
     avoided_strips,
     draw_way,
+    fenced_route,
     fences_along,
-    lone_route,
     search_way,
     starts,
 )
@@ -118,8 +118,8 @@ def capacity_of(street_map: StreetMap, graph: WalkGraph) -> Capacity:
     """
     robot = COURIER
     rng = np.random.default_rng(0x0FFE)
-    whole = _Whole(street_map, graph, rng, robot) if street_map.scanned else None
-    least = 1 if whole is None else SCAN_TRIES
+    scan_draws = _ScanDraws(street_map, graph, rng, robot) if street_map.scanned else None
+    least = 1 if scan_draws is None else SCAN_TRIES
     events: dict[str, FitCount] = {}
     structures: dict[str, FitCount] = {}
     for name, kind in EVENT_KINDS.items():
@@ -127,8 +127,8 @@ def capacity_of(street_map: StreetMap, graph: WalkGraph) -> Capacity:
         slow = kind.layout is None
         spot: Callable[[Strip], object] = (
             partial(event_spot, kind, street_map=street_map, rng=rng, robot=robot)
-            if whole is None
-            else partial(whole.event, kind)
+            if scan_draws is None
+            else partial(scan_draws.event, kind)
         )
         what = "crosswalks" if slow else _sidewalks(street_map)
         events[name] = _fit_count(strips, what, _SLOW if slow else _SIDEWALKS, spot, least=least)
@@ -138,8 +138,8 @@ def capacity_of(street_map: StreetMap, graph: WalkGraph) -> Capacity:
             partial(
                 drawn_along, structure, street_map=street_map, graph=graph, rng=rng, robot=robot
             )
-            if whole is None
-            else partial(whole.unit, structure)
+            if scan_draws is None
+            else partial(scan_draws.unit, structure)
         )
         kind_of_strip = lies_on(structure)
         what = "crosswalks" if kind_of_strip == "crossing" else "sidewalks"
@@ -152,8 +152,8 @@ def capacity_of(street_map: StreetMap, graph: WalkGraph) -> Capacity:
     )
 
 
-class _Whole(NamedTuple):
-    """Inputs from which whole scenarios are drawn on a scan."""
+class _ScanDraws(NamedTuple):
+    """Draws of scenarios on a scan, to count where they fit."""
 
     street_map: StreetMap
     graph: WalkGraph
@@ -233,7 +233,7 @@ def _routes(
             ways = list(islice(_drawn(draw, refusals), most))
             looked_at += len(ways)
             found = sum(
-                _fits(partial(lone_route, street_map, way, fences_along, robot), refusals)
+                _fits(partial(fenced_route, street_map, way, fences_along, robot), refusals)
                 for way in ways
             )
     reason = "" if found else refusals.most_frequent or f"no sidewalk is {START_M:g} m long"

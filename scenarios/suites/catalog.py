@@ -69,7 +69,7 @@ def _own(path: Path) -> Suite:
     return suite_of_own(own)
 
 
-def holding(scenario_id: str) -> Suite:
+def suite_with_scenario(scenario_id: str) -> Suite:
     """Return the shipped suite with a scenario of this id. Raises UsageError with the valid
     names.
     """
@@ -103,7 +103,7 @@ def one_scenario(
                 f"--scenario chooses from a suite or a file, and '{name}' is not a suite's name; "
                 f"for a scenario's id, leave --scenario out. Suites: {', '.join(SUITES)}"
             )
-        found = holding(name) if suite is None else load_suite(suite)
+        found = suite_with_scenario(name) if suite is None else load_suite(suite)
         return msgspec.structs.replace(found, scenarios=select_scenarios(found, [name])), 1
     if suite is not None:
         raise UsageError(

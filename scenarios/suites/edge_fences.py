@@ -33,7 +33,7 @@ MOST = 150
 """Largest number of fences of a route."""
 
 
-def hem(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
+def edge_fences(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
     """Return fences wherever the ground of a route borders on other walkable ground.
 
     Each fence names a port that it closes. These are the ports that lead off the route, and both

@@ -50,7 +50,7 @@ def check_places(
     there: dict[Place, list[Scenario]] = {}
     for scenario in scenarios:
         there.setdefault(scenario.place, []).append(scenario)
-    faults = [*_not_here(scenarios), *_odd_events(scenarios)]
+    faults = [*_missing_robots_and_skies(scenarios), *_invalid_events(scenarios)]
     jobs = min(jobs, len(there) // _PLACES_A_PROCESS)
     for found in parallel_map(_misfits_at, list(there.items()), jobs, progress, LOOKING):
         faults += found
@@ -84,16 +84,16 @@ def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[st
         return
     for scenario in scenarios:
         faults = (
-            *_off(scenario, area),
-            *_odd_crossings(scenario, street_map),
-            *_odd_barriers(scenario, street_map),
-            *_odd_obstacles(scenario, area),
-            *_crowded(scenario, street_map),
+            *_outside_area(scenario, area),
+            *_invalid_crossings(scenario, street_map),
+            *_invalid_barriers(scenario, street_map),
+            *_invalid_obstacles(scenario, area),
+            *_excessive_crowd(scenario, street_map),
         )
         yield from (f"scenario '{scenario.id}': {fault}" for fault in faults)
 
 
-def _off(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
+def _outside_area(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
     """Yield where the route first leaves the walkable area, and the events outside it."""
     line = scenario.route_line.resampled(_SAMPLE_M)
     off = np.flatnonzero(area.signed_distance(line.points) < -_EDGE_M)
@@ -112,7 +112,7 @@ def _off(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
             )
 
 
-def _odd_crossings(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+def _invalid_crossings(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
     """Yield crossings that the map lacks, or has elsewhere."""
     for crossing in scenario.crossings:
         strip = street_map.strips.get(crossing.id)
@@ -132,7 +132,7 @@ def _on(scenario: Scenario, crossing: RouteCrossing) -> Point:
     return Point(scenario.route_line.at((crossing.enter_s_m + crossing.leave_s_m) / 2).xy)
 
 
-def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+def _invalid_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
     """Yield barriers that close missing ports, are misplaced, or block the robot."""
     route = LineString(scenario.route)
     robot = ROBOTS.get(scenario.robot)
@@ -151,7 +151,7 @@ def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
             yield f"barriers[{number}] on strip '{barrier.strip}' stands across the route"
 
 
-def _odd_obstacles(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
+def _invalid_obstacles(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
     """Yield obstacles that are off the walkable area, at the start of the robot, or on the goal."""
     start = Point(scenario.start[:2])
     goal = Point(scenario.goal)
@@ -168,7 +168,7 @@ def _odd_obstacles(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
             yield f"{at} stands on the goal"
 
 
-def _odd_events(scenarios: Iterable[Scenario]) -> Iterator[str]:
+def _invalid_events(scenarios: Iterable[Scenario]) -> Iterator[str]:
     """Yield events of unknown kinds, and those that contradict the row of their kind."""
     for scenario in scenarios:
         yield from (
@@ -176,7 +176,7 @@ def _odd_events(scenarios: Iterable[Scenario]) -> Iterator[str]:
         )
 
 
-def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+def _excessive_crowd(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
     """Yield crowds whose density means more people than the limit for numbers."""
     crowd = scenario.crowd
     if crowd.density is not None:
@@ -189,7 +189,7 @@ def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
             )
 
 
-def _not_here(scenarios: Iterable[Scenario]) -> Iterator[str]:
+def _missing_robots_and_skies(scenarios: Iterable[Scenario]) -> Iterator[str]:
     """Yield each unknown robot and each missing picture of a sky once."""
     robots, skies = ({getattr(s, name): s.id for s in scenarios} for name in ("robot", "light"))
     for robot, scenario_id in robots.items():

@@ -34,7 +34,7 @@ from scenarios.suites.drawing import (
     first_of,
     passing_width_m,
 )
-from scenarios.suites.edge_fences import hem
+from scenarios.suites.edge_fences import edge_fences
 from scenarios.suites.obstacles import TO_SPARE_M, with_obstacles
 from scenarios.suites.way_events import draw_events
 
@@ -208,7 +208,9 @@ def _along(
     """Build the scenario along a way of `draw_way`. Raises SpecError if the way is unsuitable."""
     way = drawn[0]
     street_map = draft.street_map
-    route, crossings, barriers = lone_route(street_map, drawn, fences, draft.robot, draft.length_m)
+    route, crossings, barriers = fenced_route(
+        street_map, drawn, fences, draft.robot, draft.length_m
+    )
     bare = bare_scenario(
         route,
         crossings,
@@ -232,7 +234,7 @@ def _along(
     )
 
 
-def lone_route(
+def fenced_route(
     street_map: StreetMap,
     drawn: tuple[Sequence[Port], float, float],
     fences: _Fences,
@@ -314,7 +316,7 @@ def fences_along(
     try:
         return _barriers(street_map, route, way, half_width_m)
     except SpecError:
-        fences = hem(street_map, way)
+        fences = edge_fences(street_map, way)
         prove_single_path(street_map, route, fences, way, half_width_m)
         return fences
 

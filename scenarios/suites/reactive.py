@@ -309,7 +309,7 @@ def _along(
     sin, cos = math.sin(pose.heading_rad), math.cos(pose.heading_rad)
     aside = pose.x_m - found.left_m * sin, pose.y_m + found.left_m * cos
     return EventSpot(
-        stepped(line, wanted.length_m, _STEP_M),
+        route_points(line, wanted.length_m, _STEP_M),
         Pose(*aside, pose.heading_rad),
         event_m,
         found.half_m,
@@ -353,7 +353,7 @@ def event_share(scenario: Scenario, kind: EventKind) -> float:
     return (event.route_s_m - low_m) / (high_m - low_m)
 
 
-def stepped(line: Polyline, length_m: float, step_m: float = 1.0) -> Floats:
+def route_points(line: Polyline, length_m: float, step_m: float = 1.0) -> Floats:
     """Return points of a straight line up to a length, (N, 2), at most step_m apart, in whole
     millimetres.
     """
@@ -379,7 +379,9 @@ def _over(
     near = (one for one in street_map.near("strip", line) if isinstance(one, Strip))
     if any(one.kind == "crossing" and one.polygon.intersects(line) for one in near if one != strip):
         raise SpecError("the way leads over two crossings")
-    return _spot_over(street_map, strip, leave, Polyline(stepped(route, route.length_m, _STEP_M)))
+    return _spot_over(
+        street_map, strip, leave, Polyline(route_points(route, route.length_m, _STEP_M))
+    )
 
 
 def _crossed(strip: Strip, rng: np.random.Generator) -> tuple[Literal[0, 1], Floats]:

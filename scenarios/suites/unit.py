@@ -27,7 +27,7 @@ from scenarios.suites.reactive import (
     LIMIT_S,
     NO_CROWD,
     over_crossing,
-    stepped,
+    route_points,
 )
 from scenarios.suites.stretches import sidewalks_of, straight_along
 
@@ -187,7 +187,7 @@ def _straight(
     line, half_m = straight_along(strip, length_m, rng)
     if 2.0 * half_m < _least_width_m(robot):
         raise SpecError(f"the sidewalk is narrower than {_least_width_m(robot):.2g} m")
-    return Polyline(stepped(line, length_m)), ()
+    return Polyline(route_points(line, length_m)), ()
 
 
 def _crosswalk(

@@ -17,7 +17,7 @@ from cosim.spec.scenario import City, Scenario
 from scenarios.suites.user_scenarios.along_route import event_along
 from scenarios.suites.user_scenarios.format import OwnEvent, OwnScenario, OwnWay
 from scenarios.suites.user_scenarios.read import read_own
-from scenarios.suites.user_scenarios.routes import laid_way
+from scenarios.suites.user_scenarios.routes import build_way
 from tests.conftest import ROOT, Cosim
 from tests.support.documents import blocks
 from tests.support.tiny_street import tiny_map
@@ -238,7 +238,7 @@ def test_the_file_in_the_documents_can_be_read(tmp_path: Path) -> None:
 
 
 def on_tiny(**way: Any) -> Scenario:
-    return laid_way(OwnWay(**way), City(seed=1), tiny_map(), 0, COURIER)
+    return build_way(OwnWay(**way), City(seed=1), tiny_map(), 0, COURIER)
 
 
 def test_the_way_between_two_points_leads_over_the_crossing() -> None:

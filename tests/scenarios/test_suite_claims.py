@@ -33,7 +33,7 @@ from scenarios.places.nets import place
 from scenarios.suites.catalog import SUITES, load_suite, with_crowd
 from scenarios.suites.daylight import drawn_daylight
 from scenarios.suites.decoys import DECOY, decoy_of, least_pace_mps, limited, must_give_way
-from scenarios.suites.exploits import ALL, Exploit, Found, Share
+from scenarios.suites.exploits import ALL, Exploit, FoundSchedule, Share
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
 from scenarios.suites.reactive import Wanted, event_range_m
@@ -508,7 +508,7 @@ def exploit_for(suite_hash: str) -> Exploit:
     """An exploitability with a schedule that was driven nowhere."""
     schedule = Schedule(name="blind-all")
     shares = {"val_sr": Share(0, 0), "val_d": None, "sr": Share(0, 0), "d": None}
-    found = Found(
+    found = FoundSchedule(
         kind=ALL,
         objective="sr",
         goal="final_point",

@@ -24,7 +24,7 @@ from scenarios.suites.reactive import NO_CROWD
 from scenarios.suites.user_scenarios.along_route import event_along, obstacle_along
 from scenarios.suites.user_scenarios.format import OwnCrowd, OwnLimits, OwnPlace, OwnScenario
 from scenarios.suites.user_scenarios.read import OwnFile, Variant
-from scenarios.suites.user_scenarios.routes import laid_way
+from scenarios.suites.user_scenarios.routes import build_way
 from sumo_nets.maps.place_names import imported_place, resolve_place
 
 _MAKING: Final = "making the scenarios"
@@ -140,7 +140,7 @@ def _street(own: OwnScenario) -> _Street:
     try:
         where, robot = _place(own.place), robot_called(own.robot)
         _, street_map = place(where)
-        bare = laid_way(own.way, where, street_map, own.seed, robot)
+        bare = build_way(own.way, where, street_map, own.seed, robot)
     except MachineError:
         raise
     except CosimError as error:

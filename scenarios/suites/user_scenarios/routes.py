@@ -51,7 +51,9 @@ class _Spot(NamedTuple):
         return self.s_m if port.end == 0 else self.strip.length_m - self.s_m
 
 
-def laid_way(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: Robot) -> Scenario:
+def build_way(
+    way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: Robot
+) -> Scenario:
     """Build a scenario along the way with only its fences. Raises CosimError if no such way
     exists.
     """
@@ -63,8 +65,10 @@ def laid_way(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot:
         crossings = _crossed(street_map, route)
     else:
         route, crossings, barriers = _between(way, street_map, robot)
-    if not _as_asked(way, crossings):
-        raise SpecError(f"way signals '{way.signals}': it leads over {_told(crossings)}")
+    if not _has_wanted_signals(way, crossings):
+        raise SpecError(
+            f"way signals '{way.signals}': it leads over {_crossings_in_words(crossings)}"
+        )
     bare = _bare(route, crossings, where, street_map, seed, robot)
     return msgspec.structs.replace(bare, barriers=barriers)
 
@@ -119,7 +123,7 @@ def _drawn(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: R
         long = build_long_horizon(
             where, street_map, graph, drawn, "own", robot, length_m=way.length_m
         )
-        if _as_asked(way, long.crossings):
+        if _has_wanted_signals(way, long.crossings):
             return msgspec.structs.replace(long, obstacles=(), events=(), seed=seed)
     raise SpecError(
         f"way signals '{way.signals}': {_REDRAWN} ways that were drawn are not so: give "
@@ -127,12 +131,12 @@ def _drawn(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: R
     )
 
 
-def _as_asked(way: OwnWay, crossings: tuple[RouteCrossing, ...]) -> bool:
+def _has_wanted_signals(way: OwnWay, crossings: tuple[RouteCrossing, ...]) -> bool:
     signals = any(crossing.signalised for crossing in crossings)
     return way.signals == "any" or signals == (way.signals == "with")
 
 
-def _told(crossings: tuple[RouteCrossing, ...]) -> str:
+def _crossings_in_words(crossings: tuple[RouteCrossing, ...]) -> str:
     with_signals = sum(crossing.signalised for crossing in crossings)
     return f"{len(crossings)} crossings, {with_signals} of them with signals"
 

@@ -47,7 +47,7 @@ own fault.
 _POLL_S: Final = 0.1
 
 
-class Kept(msgspec.Struct, frozen=True):
+class AcceptedScenario(msgspec.Struct, frozen=True):
     """Accepted scenario with its proof."""
 
     scenario: Scenario
@@ -101,22 +101,22 @@ def build_suite(
     _open(folder, f"{name} {redraw}" if redraw else name)
     for line, done in _run(_pieces(slots), folder, jobs, tries):
         progress(f"{done}/{len(slots)} {line}", done / len(slots))
-    kept = [_kept(folder, slot) for slot in slots]
-    if lacking := [slot.name for slot, one in zip(slots, kept, strict=True) if one is None]:
+    found = [_read_accepted(folder, slot) for slot in slots]
+    if lacking := [slot.name for slot, one in zip(slots, found, strict=True) if one is None]:
         reasons = [f"{name}: {_in_words(_tried(folder, name).dropped)}" for name in lacking]
         raise SpecError(
             f"no candidate of {len(lacking)} scenarios is solved: {'; '.join(reasons)}. "
             f"Build again with more --tries"
         )
-    whole = [one for one in kept if one is not None]
+    stored = [one for one in found if one is not None]
     suite = Suite(
         name=name,
         version=recipe.version,
         description=recipe.description,
-        scenarios=tuple(one.scenario for one in whole),
+        scenarios=tuple(one.scenario for one in stored),
     )
     write_suite(suite, out)
-    return suite, write_proofs(out, name, suite.content_hash, [one.proof for one in whole])
+    return suite, write_proofs(out, name, suite.content_hash, [one.proof for one in stored])
 
 
 def _with_needed(recipe: SuiteRecipe, only: Sequence[str]) -> list[Slot]:
@@ -128,8 +128,8 @@ def _with_needed(recipe: SuiteRecipe, only: Sequence[str]) -> list[Slot]:
 
 
 def _open(folder: Path, name: str) -> None:
-    """Make the folder of the parts, or go on in it. Raises RunError where another version made what
-    is in it."""
+    """Create the folder of the parts, or continue in it. Raises RunError if another version of the
+    code made its contents."""
     rooms = [Path(room.__file__ or "").parent for room in (cosim, physics, scenarios, sumo_nets)]
     made_by = f"{name} {sources_hash(*rooms)}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -152,14 +152,17 @@ def _pieces(slots: Sequence[Slot]) -> list[_Piece]:
 class _Worker:
     piece: _Piece
     process: BaseProcess
-    heard_s: float
+    last_done_s: float
     restarts: int = 0
 
 
 def _run(
     pieces: Sequence[_Piece], folder: Path, jobs: int, tries: int
 ) -> Iterator[tuple[str, int]]:
-    """Work on all pieces; a line for each scenario that is over, and how many are."""
+    """Work on all pieces.
+
+    Yields a line for each finished scenario, and the number of finished ones.
+    """
     waiting = [(piece, 0) for piece in pieces]
     working = list[_Worker]()
     open_slots = {slot.name: slot for piece in pieces for slot in piece.slots}
@@ -181,10 +184,10 @@ def _run(
                 for slot in over:
                     del open_slots[slot.name]
                     done += 1
-                    worker.heard_s = time.monotonic()
+                    worker.last_done_s = time.monotonic()
                     yield _line(folder, slot), done
                 if worker.process.is_alive():
-                    _look_after(worker, folder)
+                    _kill_if_hung(worker, folder)
                     continue
                 working.remove(worker)
                 worker.process.join()
@@ -203,8 +206,8 @@ def _run(
                     _note(folder, slot, _Tried(tried.dropped, tried.begun - 1))
 
 
-def _look_after(worker: _Worker, folder: Path) -> None:
-    """End a process whose candidate takes too long; its place is taken by another, with the next
+def _kill_if_hung(worker: _Worker, folder: Path) -> None:
+    """Kill a process whose candidate takes too long. Another process continues with the next
     candidate."""
     marks = [
         path.stat().st_mtime
@@ -213,7 +216,7 @@ def _look_after(worker: _Worker, folder: Path) -> None:
     ]
     since_s = time.time() - max(marks, default=0.0)
     limit_s = _HANGS_S.get(worker.piece.suite, _HANGS_SHORT_S)
-    if min(since_s, time.monotonic() - worker.heard_s) > limit_s:
+    if min(since_s, time.monotonic() - worker.last_done_s) > limit_s:
         worker.process.kill()
         worker.process.join()
         for slot in worker.piece.slots:
@@ -233,7 +236,7 @@ def _work(piece: _Piece, folder: Path, tries: int) -> None:
     """Prove the open slots of a piece, in a worker process."""
     for number, slot in enumerate(piece.slots):
         if not _over(folder, slot, tries):
-            there = (_kept(folder, one) for one in piece.slots[:number])
+            there = (_read_accepted(folder, one) for one in piece.slots[:number])
             _fill(slot, folder, tries, [one.scenario for one in there if one is not None])
 
 
@@ -269,8 +272,10 @@ def _fill(slot: Slot, folder: Path, tries: int, there: Sequence[Scenario] = ()) 
             continue
         for one, proof in reversed(found):  # the decoy first: the scenario's file ends the slot
             before = () if one.decoy_of else tuple(dropped)
-            kept = Kept(one, msgspec.structs.replace(proof, dropped=before))
-            write_atomic(folder / f"{one.id}.json", msgspec.json.encode(kept))
+            accepted_scenario = AcceptedScenario(
+                one, msgspec.structs.replace(proof, dropped=before)
+            )
+            write_atomic(folder / f"{one.id}.json", msgspec.json.encode(accepted_scenario))
         _trying(folder, slot.name).unlink()
         return
 
@@ -316,7 +321,7 @@ def _drawn(slot: Slot, folder: Path, seed: int) -> Scenario:
     path = folder / f"{slot.like}.json"
     if not path.exists():
         raise SpecError(f"'{slot.like}', which it repeats, was not solved")
-    return repeated(slot, msgspec.json.decode(path.read_bytes(), type=Kept).scenario)
+    return repeated(slot, msgspec.json.decode(path.read_bytes(), type=AcceptedScenario).scenario)
 
 
 def _trying(folder: Path, name: str) -> Path:
@@ -340,19 +345,19 @@ def _over(folder: Path, slot: Slot, tries: int) -> bool:
     return not tried.begun and len(tried.dropped) >= tries
 
 
-def _kept(folder: Path, slot: Slot) -> Kept | None:
+def _read_accepted(folder: Path, slot: Slot) -> AcceptedScenario | None:
     path = folder / f"{slot.name}.json"
-    return msgspec.json.decode(path.read_bytes(), type=Kept) if path.exists() else None
+    return msgspec.json.decode(path.read_bytes(), type=AcceptedScenario) if path.exists() else None
 
 
 def _line(folder: Path, slot: Slot) -> str:
     """Describe the result of a slot."""
-    kept = _kept(folder, slot)
-    if kept is None:
+    stored = _read_accepted(folder, slot)
+    if stored is None:
         return f"{slot.name}: NOT SOLVED; {_in_words(_tried(folder, slot.name).dropped)}"
-    length_m = kept.scenario.route_line.length_m
-    line = f"{slot.name}: {length_m:.0f} m, {kept.proof.time_s:.0f} s"
-    return f"{line}; dropped: {_in_words(kept.proof.dropped)}" if kept.proof.dropped else line
+    length_m = stored.scenario.route_line.length_m
+    line = f"{slot.name}: {length_m:.0f} m, {stored.proof.time_s:.0f} s"
+    return f"{line}; dropped: {_in_words(stored.proof.dropped)}" if stored.proof.dropped else line
 
 
 def _in_words(dropped: Sequence[Dropped]) -> str:

@@ -35,7 +35,7 @@ from scenarios.tools.gym.spaces import (
 )
 from scenarios.tools.viewing.look import eye_behind
 
-_Told = dict[str, Any]
+_Info = dict[str, Any]
 """Info of a step."""
 
 _RENDER_MODES: Final = ["rgb_array"]
@@ -91,7 +91,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[SeenParts, _Told]:
+    ) -> tuple[SeenParts, _Info]:
         super().reset(seed=seed)
         drawn, run_seed = self.np_random.integers((len(self.scenarios), 2**53)).tolist()
         scenario = self._named(options) or self.scenarios[drawn]
@@ -104,9 +104,9 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         self._period = Period(scenario, episode.clock.tick_s)
         episode.watch(self._period.watch)
         self.transition = None
-        return seen_by(episode.reset(), self._seen_space), self._told(episode, False)
+        return seen_by(episode.reset(), self._seen_space), self._info(episode, False)
 
-    def step(self, action: NDArray[Any]) -> tuple[SeenParts, float, bool, bool, _Told]:
+    def step(self, action: NDArray[Any]) -> tuple[SeenParts, float, bool, bool, _Info]:
         episode, period = self._episode, self._period
         if episode is None or period is None:
             raise UsageError(
@@ -120,7 +120,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
             raise
         self.transition = happened = period.transition()
         reward = float(self._reward(happened))
-        info = self._told(episode, observation.reset)
+        info = self._info(episode, observation.reset)
         if episode.over:
             info |= _outcome(episode.result()[0])
         truncated = happened.ended == "timeout"
@@ -169,7 +169,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
             raise unknown("scenario", name, by_id)
         return by_id[name]
 
-    def _told(self, episode: Episode, put_back: bool) -> _Told:
+    def _info(self, episode: Episode, put_back: bool) -> _Info:
         failures = 0 if self.transition is None else len(self.transition.failures)
         return {
             "scenario": episode.scenario.id,
@@ -179,7 +179,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         }
 
 
-def _outcome(record: Record) -> _Told:
+def _outcome(record: Record) -> _Info:
     """Return the final info of an episode."""
     metrics = {name: value for name, value in record.measures.items() if value is not None}
     published = msgspec.structs.replace(record, clock={})

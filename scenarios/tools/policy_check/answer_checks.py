@@ -11,7 +11,7 @@ from cosim.spec.robot import COURIER
 from scenarios.tools.policy_check.drives import SCENES
 from scenarios.tools.policy_check.edits import ALL_BLACK, ALL_WHITE, AT_REST, LATER, then
 from scenarios.tools.policy_check.outcome import CheckOutcome, doubted, failed, inapplicable, passed
-from scenarios.tools.policy_check.query import ROUNDING, Asker, apart
+from scenarios.tools.policy_check.query import ROUNDING, PolicyQuery, apart
 
 _FAST: Final = 1.5
 """Ratio to the top speed of the robot above which a speed is certainly a mistake."""
@@ -20,7 +20,7 @@ _SPIN_RADPS: Final = 5.0
 _ASIDE_RAD: Final = math.radians(60.0)
 
 
-def finite(asker: Asker) -> CheckOutcome:
+def finite(query: PolicyQuery) -> CheckOutcome:
     """Answers are numbers that can be driven, also for a black or white picture and a robot at
     rest.
     """
@@ -29,19 +29,19 @@ def finite(asker: Asker) -> CheckOutcome:
     edits = {"black": ALL_BLACK, "white": ALL_WHITE, "standing": AT_REST}
     for scene, name in asked:
         try:
-            asker.answer(scene, *([edits[name]] if name else []))
+            query.answer(scene, *([edits[name]] if name else []))
         except PolicyError as error:
             return failed(f"{name or scene}: {error}")
     return passed(f"{len(asked)} drives answered")
 
 
-def deterministic(asker: Asker) -> CheckOutcome:
-    """Equal observations with the same seed give the same answer."""
-    straight, left = asker.drives["straight"].seen, asker.drives["left"].seen
+def deterministic(query: PolicyQuery) -> CheckOutcome:
+    """Check that equal observations with the same seed give the same answer."""
+    straight, left = query.drives["straight"].seen, query.drives["left"].seen
     answers = []
     for _ in range(2):
-        asker.episode(left)
-        answers.append(asker.episode(straight))
+        query.episode(left)
+        answers.append(query.episode(straight))
     differ = max(map(apart, *answers))
     if differ > ROUNDING:
         return failed(
@@ -51,13 +51,13 @@ def deterministic(asker: Asker) -> CheckOutcome:
     return passed("queried twice with one seed: the same")
 
 
-def history_reset(asker: Asker) -> CheckOutcome:
-    """An episode leaves no state for the next one."""
-    drives = asker.drives
+def history_reset(query: PolicyQuery) -> CheckOutcome:
+    """Check that an episode leaves no state for the next one."""
+    drives = query.drives
     after = []
     for before in ("left", "right", "person"):
-        asker.episode(drives[before].seen)
-        after.append(asker.episode(drives["straight"].seen))
+        query.episode(drives[before].seen)
+        after.append(query.episode(drives["straight"].seen))
     pairs = [enumerate(zip(after[0], answers, strict=True)) for answers in after[1:]]
     differ, number = max((apart(one, two), number) for each in pairs for number, (one, two) in each)
     if differ > ROUNDING:
@@ -68,14 +68,14 @@ def history_reset(asker: Asker) -> CheckOutcome:
     return passed("answers do not hang on the episode before")
 
 
-def put_back(asker: Asker) -> CheckOutcome:
-    """After the robot is put back, no state of the way before is left."""
-    drives = asker.drives
-    clock = Clock.for_rate(asker.manifest.rate_hz)
-    rate_hz = asker.manifest.rate_hz
+def put_back(query: PolicyQuery) -> CheckOutcome:
+    """Check that no state of the earlier way is left after the robot is put back."""
+    drives = query.drives
+    clock = Clock.for_rate(query.manifest.rate_hz)
+    rate_hz = query.manifest.rate_hz
     second = drives["straight"].seen
     after = [
-        asker.episode(then(drives[first].seen, second, clock, rate_hz))[-len(second) :]
+        query.episode(then(drives[first].seen, second, clock, rate_hz))[-len(second) :]
         for first in ("left", "right", "person")
     ]
     differ = max(
@@ -90,9 +90,9 @@ def put_back(asker: Asker) -> CheckOutcome:
     return passed("put elsewhere, answers do not hang on what was before")
 
 
-def time_step(asker: Asker) -> CheckOutcome:
-    """The absolute time changes nothing: only the steps between observations can."""
-    differ = apart(asker.answer("left"), asker.answer("left", LATER))
+def time_step(query: PolicyQuery) -> CheckOutcome:
+    """Check that the absolute time does not change the answer."""
+    differ = apart(query.answer("left"), query.answer("left", LATER))
     if differ > ROUNDING:
         return failed(
             f"the same drive an hour later is answered otherwise (by {differ:.2g}): take steps of "
@@ -101,14 +101,14 @@ def time_step(asker: Asker) -> CheckOutcome:
     return passed("the same drive an hour later: the same answers")
 
 
-def speed_unit(asker: Asker) -> CheckOutcome:
+def speed_unit(query: PolicyQuery) -> CheckOutcome:
     """Speeds are plausible on a sidewalk: a unit or time step that is wrong by ten is found."""
-    answers = [asker.answer(scene, asker.plain) for scene in ("straight", "left", "right")]
+    answers = [query.answer(scene, query.plain) for scene in ("straight", "left", "right")]
     fastest = max(one.v_mps for one in answers)
     most = COURIER.v_max_mps
     slowest = min(one.v_mps for one in answers)
     turn = max(abs(one.turn_rad) for one in answers)
-    way = "" if answers[0].waypoints is None else f" ({asker.manifest.waypoints.in_words})"
+    way = "" if answers[0].waypoints is None else f" ({query.manifest.waypoints.in_words})"
     if slowest > _FAST * most:
         return failed(
             f"wants {slowest:.1f} m/s of a robot that drives {most:g}{way}: unit_m or dt_s is off"
@@ -130,9 +130,9 @@ def speed_unit(asker: Asker) -> CheckOutcome:
     return passed(f"{slowest:.2f} to {fastest:.2f} m/s on an empty sidewalk{way}")
 
 
-def behind(asker: Asker) -> CheckOutcome:
-    """On an empty straight sidewalk the way leads ahead, neither back nor to the side."""
-    one = asker.answer("straight", asker.plain)
+def behind(query: PolicyQuery) -> CheckOutcome:
+    """Check that it drives ahead on an empty straight sidewalk, neither back nor to the side."""
+    one = query.answer("straight", query.plain)
     if one.v_mps < -1e-3:
         return failed(
             f"wants to go back ({one.v_mps:.2f} m/s) on an empty straight sidewalk: x is "
@@ -143,7 +143,7 @@ def behind(asker: Asker) -> CheckOutcome:
             f"goes {one.degrees} on an empty straight sidewalk: x is ahead and y left, not "
             f"the other way"
         )
-    others = [scene for scene in SCENES if asker.answer(scene).v_mps < -1e-3]
+    others = [scene for scene in SCENES if query.answer(scene).v_mps < -1e-3]
     if others:
         return doubted(f"wants to go back at {', '.join(others)}: the robot stands then")
     return passed(
@@ -153,25 +153,25 @@ def behind(asker: Asker) -> CheckOutcome:
     )
 
 
-def constant(asker: Asker) -> CheckOutcome:
-    """Different observations give different answers."""
-    manifest = asker.manifest
+def constant(query: PolicyQuery) -> CheckOutcome:
+    """Check that different observations give different answers."""
+    manifest = query.manifest
     if manifest.track == "blind" and manifest.goal == "none":
         return inapplicable("its observations have nothing to which it could respond")
-    plain = asker.answer("straight")
-    others = [asker.answer(scene) for scene in SCENES] + [
-        asker.answer("straight", edit) for edit in asker.goals.values()
+    plain = query.answer("straight")
+    others = [query.answer(scene) for scene in SCENES] + [
+        query.answer("straight", edit) for edit in query.goals.values()
     ]
     if max(apart(plain, other) for other in others) <= ROUNDING:
         return failed("the same answer to every street and every goal")
     return passed("answers differ with what it is given")
 
 
-def example(asker: Asker) -> CheckOutcome:
-    """The graph of a bundle reproduces the example of its authors."""
+def example(query: PolicyQuery) -> CheckOutcome:
+    """Check that the graph of a bundle reproduces the example of its authors."""
     from cosim.policies.onnx.policy import OnnxPolicy, example_differences
 
-    policy = asker.policy
+    policy = query.policy
     if not isinstance(policy, OnnxPolicy):
         return inapplicable("it is no ONNX bundle")
     if not policy.example.exists():

@@ -38,10 +38,10 @@ from scenarios.tools.policy_check.picture_checks import (
     side,
     street_mirrored,
 )
-from scenarios.tools.policy_check.query import Asker
+from scenarios.tools.policy_check.query import PolicyQuery
 from scenarios.tools.policy_check.sensor_checks import lidar_ignored, people_ignored
 
-POLICY_CHECKS: Final[Mapping[str, Callable[[Asker], CheckOutcome]]] = MappingProxyType(
+POLICY_CHECKS: Final[Mapping[str, Callable[[PolicyQuery], CheckOutcome]]] = MappingProxyType(
     {
         "finite": finite,
         "example": example,
@@ -77,11 +77,11 @@ _BY_CHANCE: Final = ("finite", "example", "determinism", "unit", "behind")
 class CheckedPolicy(NamedTuple):
     """Outcomes by the names of the checks.
 
-    asker: for further queries.
+    query: for further queries.
     answer_ms: median duration of the answers, without first ones, in milliseconds.
     """
 
-    asker: Asker
+    query: PolicyQuery
     outcomes: Mapping[str, CheckOutcome]
     answer_ms: float
     answers: int
@@ -98,7 +98,7 @@ def checked_policy(
     only: Collection[str] = (),
 ) -> CheckedPolicy:
     """Run all checks of a policy, or these. manifest: with the goals of the run."""
-    asker = Asker(driver, manifest, drives, progress)
+    query = PolicyQuery(driver, manifest, drives, progress)
     outcomes: dict[str, CheckOutcome] = {}
     for name, check in POLICY_CHECKS.items():
         if only and name not in only:
@@ -111,11 +111,11 @@ def checked_policy(
             outcomes[name] = inapplicable("its answers change by chance: see `determinism`")
             continue
         try:
-            outcomes[name] = check(asker)
+            outcomes[name] = check(query)
         except PolicyError as error:
             crashes = "finite" in outcomes and outcomes["finite"].outcome == "failed"
             outcomes[name] = (
                 inapplicable("it crashes: see `finite`") if crashes else failed(str(error))
             )
-    took = asker.took_ms
-    return CheckedPolicy(asker, outcomes, statistics.median(took) if took else 0.0, len(took))
+    took = query.took_ms
+    return CheckedPolicy(query, outcomes, statistics.median(took) if took else 0.0, len(took))

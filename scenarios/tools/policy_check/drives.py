@@ -123,6 +123,7 @@ def _pose(route: Polyline, scene: SceneName, back_m: float) -> Pose:
 def _drive(
     scene: SceneName, scenario: Scenario, manifest: Manifest, count: int, camera: CameraName
 ) -> Drive:
+    """Compute the observations of a drive along a scene, without simulating it."""
     robot = robot_called(scenario.robot)
     route = scenario.route_line
     surface = surface_of_place(scenario.place)

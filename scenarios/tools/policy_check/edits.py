@@ -70,7 +70,7 @@ def in_mirror(seen: Observation) -> Observation:
     )
 
 
-def with_goal_told(name: str, goal: Goal | None) -> Edit:
+def with_goal(name: str, goal: Goal | None) -> Edit:
     """Return an edit that replaces the goal of all observations."""
     return of_each(f"goal {name}", lambda seen: replace(seen, goal=goal))
 

@@ -7,17 +7,17 @@ from typing import Final
 
 from cosim.spec.goal import GOALS
 from scenarios.tools.policy_check.outcome import CheckOutcome, doubted, failed, inapplicable, passed
-from scenarios.tools.policy_check.query import ROUNDING, Answered, Asker, apart
+from scenarios.tools.policy_check.query import ROUNDING, Answered, PolicyQuery, apart
 
 _CLEAR_RAD: Final = 0.03
 _HARDLY: Final = 0.01
 
 
-def goal_zero(asker: Asker) -> CheckOutcome:
-    """A goal of nothing (a point at the robot's place, a black picture, no words) does no harm."""
-    if none := _without(asker):
+def goal_zero(query: PolicyQuery) -> CheckOutcome:
+    """Check that an empty goal does no harm: a point at its place, a black picture, no words."""
+    if none := _without(query):
         return none
-    ahead, zero = _told(asker, "ahead"), _told(asker, "zero")
+    ahead, zero = _answer_with_goal(query, "ahead"), _answer_with_goal(query, "zero")
     if zero.v_mps < -1e-3 or abs(zero.turn_rad) > math.pi / 2 + 1e-6:
         return doubted(
             f"turns back ({zero.v_mps:.2f} m/s, {zero.degrees}) when the goal is reached"
@@ -33,13 +33,13 @@ def goal_zero(asker: Asker) -> CheckOutcome:
     )
 
 
-def goal_scaled(asker: Asker) -> CheckOutcome:
+def goal_scaled(query: PolicyQuery) -> CheckOutcome:
     """A point twice as far in the same direction: it drives no slower, and turns no farther."""
-    if none := _without(asker):
+    if none := _without(query):
         return none
-    if "near" not in asker.goals:
-        return inapplicable(f"a goal of {asker.manifest.goal} has no scale")
-    near, far = _told(asker, "near"), _told(asker, "left")
+    if "near" not in query.goals:
+        return inapplicable(f"a goal of {query.manifest.goal} has no scale")
+    near, far = _answer_with_goal(query, "near"), _answer_with_goal(query, "left")
     said = (
         f"at 5.6 m {near.v_mps:.2f} m/s, {near.degrees}; at 11.2 m, there, {far.v_mps:.2f} m/s, "
         f"{far.degrees}"
@@ -58,15 +58,15 @@ def goal_scaled(asker: Asker) -> CheckOutcome:
     return passed(said)
 
 
-def goal_mirrored(asker: Asker) -> CheckOutcome:
-    """A goal to the left turns it farther to the left than one to the right."""
-    if none := _without(asker):
+def goal_mirrored(query: PolicyQuery) -> CheckOutcome:
+    """Check that a goal to the left turns it farther to the left than one to the right."""
+    if none := _without(query):
         return none
-    if "right" not in asker.goals:
+    if "right" not in query.goals:
         return inapplicable(
             "whether a picture lies to the left cannot be known without knowing the place"
         )
-    left, right = _told(asker, "left"), _told(asker, "right")
+    left, right = _answer_with_goal(query, "left"), _answer_with_goal(query, "right")
     turns = left.turn_rad - right.turn_rad
     said = f"goal left: {left.degrees}; goal right: {right.degrees}"
     if turns < -_CLEAR_RAD:
@@ -83,16 +83,16 @@ def goal_mirrored(asker: Asker) -> CheckOutcome:
     return passed(said)
 
 
-def goal_ignored(asker: Asker) -> CheckOutcome:
-    """Another goal, another answer."""
-    if none := _without(asker):
+def goal_ignored(query: PolicyQuery) -> CheckOutcome:
+    """Check that another goal changes the answer."""
+    if none := _without(query):
         return none
-    ahead = _told(asker, "ahead")
-    most, name = max((apart(ahead, _told(asker, name)), name) for name in asker.goals)
+    ahead = _answer_with_goal(query, "ahead")
+    most, name = max((apart(ahead, _answer_with_goal(query, name)), name) for name in query.goals)
     if most <= ROUNDING:
         return failed(
             f"no goal changes the answer: give the manifest goal 'none', or pass "
-            f"{asker.manifest.goal} on"
+            f"{query.manifest.goal} on"
         )
     if most < _HARDLY:
         return doubted(
@@ -101,13 +101,13 @@ def goal_ignored(asker: Asker) -> CheckOutcome:
     return passed(f"goal '{name}' changes {100.0 * most:.0f} % of the answer")
 
 
-def _told(asker: Asker, goal: str) -> Answered:
-    return asker.answer("straight", asker.goals[goal])
+def _answer_with_goal(query: PolicyQuery, goal: str) -> Answered:
+    return query.answer("straight", query.goals[goal])
 
 
-def _without(asker: Asker) -> CheckOutcome | None:
+def _without(query: PolicyQuery) -> CheckOutcome | None:
     """Return the outcome of a goal check that does not apply, else None."""
-    kind = GOALS[asker.manifest.goal]
+    kind = GOALS[query.manifest.goal]
     return (
         inapplicable(f"its goal says nothing of where to go: {kind.summary}")
         if kind.noise

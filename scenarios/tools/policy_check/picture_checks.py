@@ -10,7 +10,7 @@ import numpy as np
 from scenarios.tools.policy_check.drives import SCENES, SceneName
 from scenarios.tools.policy_check.edits import ALL_BLACK, IN_MIRROR, SWAPPED, Edit, showing
 from scenarios.tools.policy_check.outcome import CheckOutcome, doubted, failed, inapplicable, passed
-from scenarios.tools.policy_check.query import ROUNDING, Answered, Asker, apart
+from scenarios.tools.policy_check.query import ROUNDING, Answered, PolicyQuery, apart
 
 _OLDER: Final = 3.0
 """Ratio to the weight of the newest picture above which an older one is taken for the newest."""
@@ -25,18 +25,18 @@ _ASKEW: Final[tuple[SceneName, ...]] = ("left", "right")
 _MET: Final[tuple[SceneName, ...]] = ("straight", "person")
 
 
-def picture_ignored(asker: Asker) -> CheckOutcome:
-    """Another picture, another answer."""
-    if none := _blind(asker):
+def picture_ignored(query: PolicyQuery) -> CheckOutcome:
+    """Check that another picture changes the answer."""
+    if none := _blind(query):
         return none
-    plain = asker.answer("straight", asker.plain)
+    plain = query.answer("straight", query.plain)
     others = [
-        asker.answer("straight", asker.plain, _of(asker, scene))
+        query.answer("straight", query.plain, _of(query, scene))
         for scene in SCENES
         if scene != "straight"
     ]
     most = max(
-        apart(plain, other) for other in [*others, asker.answer("straight", asker.plain, ALL_BLACK)]
+        apart(plain, other) for other in [*others, query.answer("straight", query.plain, ALL_BLACK)]
     )
     if most <= ROUNDING:
         return failed(
@@ -51,15 +51,15 @@ def picture_ignored(asker: Asker) -> CheckOutcome:
     return passed(f"another picture changes {100.0 * most:.0f} % of the answer")
 
 
-def frame_order(asker: Asker) -> CheckOutcome:
-    """The newest picture counts: it is not confused with an older one."""
-    if none := _blind(asker):
+def frame_order(query: PolicyQuery) -> CheckOutcome:
+    """Check that the newest picture has more effect than older ones."""
+    if none := _blind(query):
         return none
-    drive = asker.drives["left"]
-    other = asker.drives["right"].seen
-    plain = asker.answer("left", asker.plain)
+    drive = query.drives["left"]
+    other = query.drives["right"].seen
+    plain = query.answer("left", query.plain)
     shown = [showing("right", other, (age,)) for age in range(len(drive.seen))]
-    weights = np.array([apart(plain, asker.answer("left", asker.plain, edit)) for edit in shown])
+    weights = np.array([apart(plain, query.answer("left", query.plain, edit)) for edit in shown])
     newest = float(weights[0])
     oldest = int(np.argmax(weights))
     matter = np.flatnonzero(weights > ROUNDING)
@@ -83,13 +83,13 @@ def frame_order(asker: Asker) -> CheckOutcome:
     return passed(f"the newest picture counts, older ones up to {matter[-1]} answers ago as well")
 
 
-def colour_order(asker: Asker) -> CheckOutcome:
+def colour_order(query: PolicyQuery) -> CheckOutcome:
     """The policy reads the street in its own colours, not better with red and blue exchanged."""
-    if none := _blind(asker):
+    if none := _blind(query):
         return none
     if (
         max(
-            apart(asker.answer(s, asker.plain), asker.answer(s, asker.plain, SWAPPED))
+            apart(query.answer(s, query.plain), query.answer(s, query.plain, SWAPPED))
             for s in SCENES
         )
         <= ROUNDING
@@ -101,8 +101,8 @@ def colour_order(asker: Asker) -> CheckOutcome:
         ("turns", _READS_RAD, " rad", _steers),
         ("brakes", _BRAKES, "", _brakes),
     ):
-        own = read(asker)
-        swapped = read(asker, SWAPPED)
+        own = read(query)
+        swapped = read(query, SWAPPED)
         if min(swapped) > least and max(own) < min(swapped) / 3.0:
             return failed(
                 f"{name} where it should with red and blue exchanged ({min(swapped):.2f}{unit}) "
@@ -118,12 +118,12 @@ def colour_order(asker: Asker) -> CheckOutcome:
     )
 
 
-def street_mirrored(asker: Asker) -> CheckOutcome:
-    """In a mirrored street it turns to the mirrored side."""
-    if none := _blind(asker) or _aside(asker):
+def street_mirrored(query: PolicyQuery) -> CheckOutcome:
+    """Check that it turns to the mirrored side in a mirrored street."""
+    if none := _blind(query) or _aside(query):
         return none
     turns = np.array(
-        [[asker.answer(s, asker.plain, *e).turn_rad for e in ((), (IN_MIRROR,))] for s in SCENES]
+        [[query.answer(s, query.plain, *e).turn_rad for e in ((), (IN_MIRROR,))] for s in SCENES]
     )
     kept = float(np.sqrt(np.mean(turns.sum(axis=1) ** 2))) / 2.0
     follows = float(np.sqrt(np.mean((turns[:, 0] - turns[:, 1]) ** 2))) / 2.0
@@ -140,12 +140,12 @@ def street_mirrored(asker: Asker) -> CheckOutcome:
     return passed(said)
 
 
-def side(asker: Asker) -> CheckOutcome:
-    """The policy turns farther to the left if the sidewalk leads left than if it leads right."""
-    if none := _blind(asker) or _aside(asker):
+def side(query: PolicyQuery) -> CheckOutcome:
+    """Check that it turns farther to the left if the sidewalk leads left than if it leads right."""
+    if none := _blind(query) or _aside(query):
         return none
-    reads = _steers(asker)
-    left, right = (asker.answer(scene, asker.plain) for scene in ("left", "right"))
+    reads = _steers(query)
+    left, right = (query.answer(scene, query.plain) for scene in ("left", "right"))
     said = f"the way leads left: {left.degrees}; right: {right.degrees}"
     if max(reads) < -_CLEAR_RAD and min(reads) > _AGREE * max(reads):
         return failed(
@@ -159,62 +159,62 @@ def side(asker: Asker) -> CheckOutcome:
     return passed(said)
 
 
-def person(asker: Asker) -> CheckOutcome:
-    """People in the way change the answer."""
-    if none := _blind(asker):
+def person(query: PolicyQuery) -> CheckOutcome:
+    """Check that people in the way change the answer."""
+    if none := _blind(query):
         return none
-    clear, stands = asker.answer("straight", asker.plain), asker.answer("person", asker.plain)
+    clear, stands = query.answer("straight", query.plain), query.answer("person", query.plain)
     said = f"empty way: {_words(clear)}; people 3 m ahead: {_words(stands)}"
     if apart(clear, stands) < _HARDLY:
         return doubted(f"{said}: right for a policy that was never shown people")
     return passed(said)
 
 
-def _steers(asker: Asker, *edits: Edit) -> tuple[float, float]:
+def _steers(query: PolicyQuery, *edits: Edit) -> tuple[float, float]:
     """Return how much farther left the policy turns on a left way than on a right way.
 
     The second value is the same in a mirror.
     """
     turns = [
-        [asker.answer(s, asker.plain, *more, *edits).turn_rad for s in _ASKEW]
-        for more in _both(asker)
+        [query.answer(s, query.plain, *more, *edits).turn_rad for s in _ASKEW]
+        for more in _both(query)
     ]
-    return turns[0][0] - turns[0][1], (turns[1][1] - turns[1][0]) * (1 if _both(asker)[1] else -1)
+    return turns[0][0] - turns[0][1], (turns[1][1] - turns[1][0]) * (1 if _both(query)[1] else -1)
 
 
-def _brakes(asker: Asker, *edits: Edit) -> tuple[float, float]:
+def _brakes(query: PolicyQuery, *edits: Edit) -> tuple[float, float]:
     """Return the share of its speed by which the policy brakes for people, also in a mirror."""
     speeds = [
-        [asker.answer(s, asker.plain, *more, *edits).v_mps for s in _MET] for more in _both(asker)
+        [query.answer(s, query.plain, *more, *edits).v_mps for s in _MET] for more in _both(query)
     ]
     first, second = ((clear - stands) / max(abs(clear), 0.1) for clear, stands in speeds)
     return first, second
 
 
-def _both(asker: Asker) -> tuple[tuple[Edit, ...], tuple[Edit, ...]]:
+def _both(query: PolicyQuery) -> tuple[tuple[Edit, ...], tuple[Edit, ...]]:
     """Return the street and its mirror; twice the street if a camera looks aside."""
-    return (), () if _aside(asker) else (IN_MIRROR,)
+    return (), () if _aside(query) else (IN_MIRROR,)
 
 
-def _of(asker: Asker, scene: SceneName) -> Edit:
-    return showing(scene, asker.drives[scene].seen)
+def _of(query: PolicyQuery, scene: SceneName) -> Edit:
+    return showing(scene, query.drives[scene].seen)
 
 
 def _words(one: Answered) -> str:
     return f"{one.v_mps:.2f} m/s, {one.degrees}"
 
 
-def _blind(asker: Asker) -> CheckOutcome | None:
-    if asker.manifest.camera is None:
+def _blind(query: PolicyQuery) -> CheckOutcome | None:
+    if query.manifest.camera is None:
         return inapplicable("it has no camera")
-    if asker.manifest.privileged:
+    if query.manifest.privileged:
         return inapplicable("it has privileged state and needs no picture")
     return None
 
 
-def _aside(asker: Asker) -> CheckOutcome | None:
+def _aside(query: PolicyQuery) -> CheckOutcome | None:
     """Return an outcome if a camera looks aside: in a mirror it sees another street."""
-    for seen in asker.drives["straight"].seen[-1:]:
+    for seen in query.drives["straight"].seen[-1:]:
         for camera in [seen.camera, *(one.camera for one in seen.pictures.values())]:
             if camera is not None and (
                 abs(camera.on_robot[1, 3]) > 0.05 or abs(camera.on_robot[1, 2]) > 0.05

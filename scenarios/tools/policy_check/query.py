@@ -18,7 +18,7 @@ from cosim.episode.interfaces import Observation, Policy
 from cosim.episode.policy_caller import PolicyCaller
 from cosim.spec.manifest import Manifest, WaypointRule
 from scenarios.tools.policy_check.drives import Drive, SceneName
-from scenarios.tools.policy_check.edits import Edit, with_goal_told
+from scenarios.tools.policy_check.edits import Edit, with_goal
 
 _SEED: Final = 1
 _LEAST: Final = 0.1
@@ -48,10 +48,10 @@ class Answered:
         return f"{abs(turn)} deg {'left' if turn > 0 else 'right'}" if turn else "straight on"
 
 
-def answered(said: object, command: Command, rule: WaypointRule) -> Answered:
+def answered(raw_answer: object, command: Command, rule: WaypointRule) -> Answered:
     """Convert a raw answer, which became this command."""
-    if isinstance(said, Command) or not isinstance(command, WaypointCommand):
-        raw = said if isinstance(said, Command) else command
+    if isinstance(raw_answer, Command) or not isinstance(command, WaypointCommand):
+        raw = raw_answer if isinstance(raw_answer, Command) else command
         return Answered(float(raw.v_mps), float(raw.w_radps), None)
     waypoints = command.waypoints.astype(float)
     x_m, y_m = waypoints[command.index, :2].tolist()
@@ -75,7 +75,7 @@ def _numbers(one: Answered) -> Floats:
     return np.array([[one.v_mps, one.turn_rad]]) if one.waypoints is None else one.waypoints[:, :2]
 
 
-class Asker:
+class PolicyQuery:
     """Policy with the drives of its queries. Answers are cached."""
 
     def __init__(
@@ -91,10 +91,10 @@ class Asker:
         self.took_ms: list[float] = []
         self._driver = driver
         self._progress = progress
-        self._said: object = None
+        self._raw_answer: object = None
         self._known: dict[tuple[SceneName, tuple[str, ...]], Answered] = {}
         self._episodes = 0
-        driver.on_answer(self._hear)
+        driver.on_answer(self._store_answer)
 
     def answer(self, scene: SceneName, *edits: Edit) -> Answered:
         """Return the answer to the last observation of a drive with these edits. Raises
@@ -112,7 +112,7 @@ class Asker:
         """Return the answers to observations in a new episode. Raises PolicyError."""
         self._episodes += 1
         name = f"check-{self._episodes:04d}"
-        self._progress("asking the policy")
+        self._progress("querying the policy")
         driver = self._driver
         rule = self._driver.manifest.waypoints
         answers: list[Answered] = []
@@ -123,7 +123,7 @@ class Asker:
                 command = driver.act(replace(one, episode=name))
                 if answers:
                     self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
-                answers.append(answered(self._said, command, rule))
+                answers.append(answered(self._raw_answer, command, rule))
         finally:
             driver.ended()
         return answers
@@ -143,7 +143,7 @@ class Asker:
         """Edits of the goal by name, from `AnyGoal.probes`."""
         own = self.drives["straight"].seen[-1].goal
         probes = {"ahead": None} if own is None else own.probes()
-        return {name: with_goal_told(name, goal) for name, goal in probes.items()}
+        return {name: with_goal(name, goal) for name, goal in probes.items()}
 
-    def _hear(self, said: object) -> None:
-        self._said = said
+    def _store_answer(self, raw_answer: object) -> None:
+        self._raw_answer = raw_answer

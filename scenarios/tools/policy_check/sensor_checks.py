@@ -5,32 +5,32 @@ from __future__ import annotations
 from scenarios.tools.policy_check.drives import SCENES
 from scenarios.tools.policy_check.edits import NO_RETURNS, sensing
 from scenarios.tools.policy_check.outcome import CheckOutcome, doubted, failed, inapplicable, passed
-from scenarios.tools.policy_check.query import ROUNDING, Asker, apart
+from scenarios.tools.policy_check.query import ROUNDING, PolicyQuery, apart
 
 
-def lidar_ignored(asker: Asker) -> CheckOutcome:
-    """Another scan, another answer."""
-    if asker.manifest.scan is None:
+def lidar_ignored(query: PolicyQuery) -> CheckOutcome:
+    """Check that another scan changes the answer."""
+    if query.manifest.scan is None:
         return inapplicable("it has no lidar")
-    plain = asker.answer("straight", asker.plain)
+    plain = query.answer("straight", query.plain)
     others = [
-        sensing(scene, asker.drives[scene].seen, "scan") for scene in SCENES if scene != "straight"
+        sensing(scene, query.drives[scene].seen, "scan") for scene in SCENES if scene != "straight"
     ]
     most = max(
-        apart(plain, asker.answer("straight", asker.plain, edit)) for edit in [*others, NO_RETURNS]
+        apart(plain, query.answer("straight", query.plain, edit)) for edit in [*others, NO_RETURNS]
     )
     if most <= ROUNDING:
         return failed("no scan changes the answer, not even one without returns")
     return passed(f"another scan changes {100.0 * most:.0f} % of the answer")
 
 
-def people_ignored(asker: Asker) -> CheckOutcome:
-    """A tracked person in the way changes the answer."""
-    if asker.manifest.people == "none":
+def people_ignored(query: PolicyQuery) -> CheckOutcome:
+    """Check that a tracked person in the way changes the answer."""
+    if query.manifest.people == "none":
         return inapplicable("it has no tracked people")
-    plain = asker.answer("straight", asker.plain)
-    met = sensing("person", asker.drives["person"].seen, "people")
-    change = apart(plain, asker.answer("straight", asker.plain, met))
+    plain = query.answer("straight", query.plain)
+    met = sensing("person", query.drives["person"].seen, "people")
+    change = apart(plain, query.answer("straight", query.plain, met))
     if change <= ROUNDING:
         return doubted(
             "a tracked person 3 m ahead changes nothing: right for a policy that only looks "

@@ -17,7 +17,7 @@ from cosim.report.legend import Image
 from cosim.spec.camera import Calibration
 from scenarios.tools.policy_check.drives import SCENES, SceneName
 from scenarios.tools.policy_check.edits import IN_MIRROR, Edit
-from scenarios.tools.policy_check.query import Answered, Asker
+from scenarios.tools.policy_check.query import Answered, PolicyQuery
 
 _WIDE_PX: Final = 480
 _BAR_PX: Final = 26
@@ -30,14 +30,14 @@ _FOLLOWED: Final = (255, 70, 60)
 _MOST: Final = 64
 
 
-def check_sheet(asker: Asker) -> Image:
+def check_sheet(query: PolicyQuery) -> Image:
     """Draw a row for each scene, as it is and in a mirror, (H, W, 3) uint8 RGB."""
     rows = []
     for scene in SCENES:
-        seen = asker.drives[scene].seen
+        seen = query.drives[scene].seen
         row = [(seen, scene, ()), (IN_MIRROR.change(seen), f"{scene}, in a mirror", (IN_MIRROR,))]
         rows.append(
-            np.hstack([_panel(asker, scene, shown[-1], name, edits) for shown, name, edits in row])
+            np.hstack([_panel(query, scene, shown[-1], name, edits) for shown, name, edits in row])
         )
     return np.vstack(rows)
 
@@ -57,17 +57,17 @@ def path_of(answer: Answered) -> Floats:
 
 
 def _panel(
-    asker: Asker, scene: SceneName, seen: Observation, name: str, edits: Sequence[Edit]
+    query: PolicyQuery, scene: SceneName, seen: Observation, name: str, edits: Sequence[Edit]
 ) -> Image:
     answer = None
     try:
-        answer = asker.answer(scene, *edits)
+        answer = query.answer(scene, *edits)
         label = f"{name}: {answer.v_mps:.2f} m/s, {answer.degrees}"
         path = path_of(answer)
     except PolicyError as error:
         label = f"{name}: {error}"
         path = np.zeros((0, 2))
-    index = asker.manifest.waypoints.index
+    index = query.manifest.waypoints.index
     followed = (
         index if answer is not None and answer.waypoints is not None and index < len(path) else None
     )

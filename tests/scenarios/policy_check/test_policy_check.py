@@ -18,7 +18,7 @@ from physics.cameras.choice import camera_of_choice
 from scenarios.tools.policy_check.answer_checks import example
 from scenarios.tools.policy_check.checks import POLICY_CHECKS, CheckedPolicy, checked_policy
 from scenarios.tools.policy_check.drives import Drive, SceneName, drives_for
-from scenarios.tools.policy_check.query import Asker
+from scenarios.tools.policy_check.query import PolicyQuery
 from tests.conftest import Cosim
 from tests.support import planted
 from tests.support.graphs import bundle, tiny_graph
@@ -120,7 +120,7 @@ def test_an_example_is_right_only_where_it_says_what_is_to_come_out(tmp_path: Pa
             **inputs,
             **{f"expected.{name}": one for name, one in expected.items()},
         )
-        assert example(Asker(driver, driver.manifest, {})).outcome == outcome
+        assert example(PolicyQuery(driver, driver.manifest, {})).outcome == outcome
 
 
 @pytest.mark.parametrize(

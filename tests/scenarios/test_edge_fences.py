@@ -19,7 +19,7 @@ from cosim.spec.scenario import City, content_hash
 from scenarios.places.nets import place
 from scenarios.suites import long_horizon
 from scenarios.suites.catalog import load_suite
-from scenarios.suites.edge_fences import MOST, hem
+from scenarios.suites.edge_fences import MOST, edge_fences
 from scenarios.suites.recipes import RECIPES, candidate
 from tests.scenarios.test_scenarios import cross_map
 
@@ -44,7 +44,7 @@ def test_a_footway_across_a_sidewalk_is_fenced_off() -> None:
     fences = [barrier_at(street_map, port) for port in ports_to_close(street_map, WAY)]
     with pytest.raises(SpecError, match="a branch is left open"):
         prove_single_path(street_map, ROUTE, fences, WAY, 0.3)
-    hemmed = hem(street_map, WAY)
+    hemmed = edge_fences(street_map, WAY)
     part = prove_single_path(street_map, ROUTE, hemmed, WAY, 0.3)
     assert not part.intersects(
         street_map.strips["path"].polygon.difference(shapely.box(-50, -2, 50, 2))
@@ -59,7 +59,7 @@ def test_a_footway_across_a_sidewalk_is_fenced_off() -> None:
 def test_a_footway_along_a_sidewalk_is_fenced_off() -> None:
     """Half on the sidewalk and half beside it: the hem runs along it."""
     street_map = laid_over(cross_map(), "beside", (-35.0, 2.0), (-5.0, 2.0), (60.0, 60.0))
-    part = prove_single_path(street_map, ROUTE, hem(street_map, WAY), WAY, 0.3)
+    part = prove_single_path(street_map, ROUTE, edge_fences(street_map, WAY), WAY, 0.3)
     assert part.bounds[3] < 2.5
 
 
@@ -73,13 +73,13 @@ def test_a_way_on_its_own_needs_no_hem() -> None:
     ports = tuple(port for port in alone.corners["middle"].ports if port.strip in alone.strips)
     corner = dataclasses.replace(alone.corners["middle"], ports=ports)
     alone = dataclasses.replace(alone, corners={"middle": corner})
-    assert hem(alone, WAY) == ()
+    assert edge_fences(alone, WAY) == ()
     crowded = cross_map()
     for number in range(MOST):
         x_m = -40.0 + 0.5 * number
         crowded = laid_over(crowded, f"path{number}", (x_m, -9.0), (x_m, 9.0), width_m=0.3)
     with pytest.raises(SpecError, match=f"more than {MOST} fences"):
-        hem(crowded, WAY)
+        edge_fences(crowded, WAY)
 
 
 @pytest.fixture(scope="module")
