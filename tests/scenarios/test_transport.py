@@ -22,6 +22,7 @@ from scenarios.ipc.messages import Done, Hello, Job, Message, MessageHandler
 from scenarios.runs import run as suite_run
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.tools.verify.doctor import small_scenario
+from tests.support.equality import thirty
 
 
 class Ahead:
@@ -121,3 +122,9 @@ def test_a_suite_has_the_same_results_over_every_transport(
         for name in ("here", "there")
     ]
     assert logs[0].pose.tobytes() == logs[1].pose.tobytes() and len(logs[0]) == 20
+
+
+def test_equality_runs_thirty_scenarios() -> None:
+    """The script that compares all mechanisms takes thirty scenarios, without decoys."""
+    chosen = thirty().scenarios
+    assert len(chosen) == 30 and not any(one.decoy_of for one in chosen)
