@@ -42,7 +42,7 @@ SILENCE_S: Final = 300.0
 """Timeout in seconds of a process's heartbeats while no policy call is pending: an engine hangs."""
 TICK_S: Final = 120.0
 """Timeout in seconds of a tick, which takes milliseconds; longer than that of a policy's answer."""
-_LOOKS_S: Final = 1.0
+_CHECK_PERIOD_S: Final = 1.0
 """Seconds between two checks whether a supervisor was stopped by a signal."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import supervise_worker; "
@@ -257,7 +257,7 @@ class Watchdog:
         self._silence_s = silence_s
         self._tick_s = tick_s or silence_s
         self._progress = (0, False)
-        self._looks_at_s = 0.0
+        self._next_check_s = 0.0
 
     def poll(self, handle: MessageHandler, *, idle: bool = False) -> ProcessEnd | None:
         """Pass on its messages. Returns its end, if it has ended or was killed because it hangs.
@@ -265,15 +265,15 @@ class Watchdog:
         idle: whether it may be silent.
         Raises UsageError if it cannot load the policy, MachineError if the machine lacks something.
         """
-        if not self.process.listen(partial(self._take, handle)):
+        if not self.process.listen(partial(self._handle_message, handle)):
             words = self.process.end()
             return self._ended(words, self.process.pending_call, self.process.in_engine)
         pending_call = self.process.pending_call
         now_s = time.monotonic()
         if idle:
             return None
-        if now_s >= self._looks_at_s:
-            self._looks_at_s = now_s + _LOOKS_S
+        if now_s >= self._next_check_s:
+            self._next_check_s = now_s + _CHECK_PERIOD_S
             self.process.wake()
         if pending_call is None:
             allowed_s = self._allowed_s()
@@ -310,7 +310,7 @@ class Watchdog:
         driven, in_policy = self.process.driven, self.process.in_policy
         return ProcessEnd(words, pending_call, in_engine, hung, allowed_s, driven, in_policy)
 
-    def _take(self, handle: MessageHandler, message: Message) -> None:
+    def _handle_message(self, handle: MessageHandler, message: Message) -> None:
         self.last_message_s = time.monotonic()
         if isinstance(message, Unable):
             raise_unable(message)

@@ -91,7 +91,7 @@ class EnvironmentSlot:
         self._failed_starts = 0
         self._ran = False
         self._given_s = 0.0
-        self._second: bool | None = None
+        self._second_half: bool | None = None
         self._suspect: _Suspect | None = None
         self._reported: Done | Repeated | None = None
 
@@ -123,10 +123,10 @@ class EnvironmentSlot:
     def give(self, job: Job) -> None:
         """Run a job, in a new process if there is none, or if the job is of the other half of its
         run."""
-        if self._second is not None and self._second != job.second:
+        if self._second_half is not None and self._second_half != job.second:
             self.stop()
             self.end()
-        self._second = job.second
+        self._second_half = job.second
         self.job = job
         if self._watchdog is None:
             self.start()
@@ -140,17 +140,19 @@ class EnvironmentSlot:
         watchdog = self._watchdog
         if watchdog is None:
             return None
-        end = watchdog.poll(partial(self._take, handle), idle=watchdog.ready and self.job is None)
+        end = watchdog.poll(
+            partial(self._handle_message, handle), idle=watchdog.ready and self.job is None
+        )
         if watchdog.ready:
             self._failed_starts = 0
         reported, self._reported = self._reported, None
         if isinstance(reported, Repeated):
             if end is not None:
                 self._watchdog = None
-            return self._judged(reported.error, watchdog.process.driven, record=reported.record)
+            return self._attribute(reported.error, watchdog.process.driven, record=reported.record)
         if isinstance(reported, Done):
-            return self._reported_failure(watchdog, reported)
-        return None if end is None else self._ended(watchdog, end)
+            return self._replay_reported_error(watchdog, reported)
+        return None if end is None else self._handle_end(watchdog, end)
 
     def cancel(self) -> None:
         """Kill the process, and forget the job."""
@@ -174,10 +176,12 @@ class EnvironmentSlot:
         if watchdog is not None:
             watchdog.process.end()
 
-    def _take(self, handle: MessageHandler, message: Message) -> None:
+    def _handle_message(self, handle: MessageHandler, message: Message) -> None:
         if self.job is None:
             return
-        if isinstance(message, Repeated) or (isinstance(message, Done) and self._must_ask(message)):
+        if isinstance(message, Repeated) or (
+            isinstance(message, Done) and self._needs_replay(message)
+        ):
             self._reported = message
             return
         if isinstance(message, Done | LostRenderer):
@@ -185,13 +189,13 @@ class EnvironmentSlot:
             self._ran = True
         handle(message)
 
-    def _must_ask(self, done: Done) -> bool:
+    def _needs_replay(self, done: Done) -> bool:
         """Return whether a result is the last attempt's engine error, so that its cause must be
         found."""
         last = self.job is not None and self.job.last_attempt and self._suspect is None
         return last and done.again and done.status == "invalid"
 
-    def _reported_failure(self, watchdog: Watchdog, done: Done) -> AttemptFailure | None:
+    def _replay_reported_error(self, watchdog: Watchdog, done: Done) -> AttemptFailure | None:
         """Find the cause of an engine error that a process has reported."""
         self._watchdog = None
         driven = watchdog.process.driven
@@ -214,7 +218,7 @@ class EnvironmentSlot:
         repeat = Repeat(job, suspect.driven.commands)
         self._start(msgspec.structs.replace(self._hello, repeat=repeat))
 
-    def _judged(
+    def _attribute(
         self, error: str, driven: Driven | None, *, record: bytes = b"", killed: bool = False
     ) -> AttemptFailure | None:
         """Return the failure of a job after its replay; None if another replay was started.
@@ -228,14 +232,14 @@ class EnvironmentSlot:
         if suspect is None or job is None:
             return None
         failure = suspect.failure
-        there = bool(error) and driven is not None and driven.ticks == suspect.driven.ticks
-        another = suspect.replays < REPLAYS and self._watchdog is None
+        at_same_tick = bool(error) and driven is not None and driven.ticks == suspect.driven.ticks
+        may_repeat = suspect.replays < REPLAYS and self._watchdog is None
         if RULES[failure.fault].attempts == 1:
             failure = failure._replace(driven=record)
-        elif error and another and (killed or not there):
+        elif error and may_repeat and (killed or not at_same_tick):
             self._replay(suspect._replace(replays=suspect.replays + 1), job)
             return None
-        elif there:
+        elif at_same_tick:
             failure = AttemptFailure("engine_failed", failure.why, FAILS_AGAIN, record)
         else:
             found = FAILS_ELSEWHERE if error else SURVIVES
@@ -243,12 +247,12 @@ class EnvironmentSlot:
         self.job = self._suspect = None
         return failure
 
-    def _ended(self, watchdog: Watchdog, end: ProcessEnd) -> AttemptFailure | None:
+    def _handle_end(self, watchdog: Watchdog, end: ProcessEnd) -> AttemptFailure | None:
         """Return the failure of a started job; give a job that was not started to a new process."""
         self._watchdog = None
         if self._suspect is not None:
             log_event("replay ended", WARNING, log=Path(self.log).name, why=end.words)
-            return self._judged(end.words, end.driven, killed=not end.in_engine)
+            return self._attribute(end.words, end.driven, killed=not end.in_engine)
         idle = (
             self._ran
             and watchdog.last_message_s <= self._given_s

@@ -46,10 +46,10 @@ from scenarios.ipc.process_state import ProcessState, end_at_once
 from scenarios.ipc.sandbox import KINDS, Sandbox
 from scenarios.ipc.shared_memory import SharedMemory, observation_bytes
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
-from scenarios.runs.policy_view import name_inside, sandbox_for
+from scenarios.runs.policy_view import name_in_sandbox, sandbox_for
 
-_ENTRY_POINT: Final = "scenarios.runs.isolated_policy:serve_alone"
-_ENTRY_POINT_IN_SANDBOX: Final = "scenarios.runs.isolated_policy:serve_inside"
+_ENTRY_POINT: Final = "scenarios.runs.isolated_policy:serve_without_sandbox"
+_ENTRY_POINT_IN_SANDBOX: Final = "scenarios.runs.isolated_policy:serve_in_sandbox"
 """The functions of the policy's process, without and with a sandbox."""
 _RUNS: Final[dict[Isolation, PolicyProcess]] = {
     "namespaces": "isolated: namespaces",
@@ -93,7 +93,7 @@ class _PolicyProcess:
         except UNREADABLE as error:
             raise PolicyFault(f"sent what is no answer: {error}") from None
         except (EOFError, OSError):
-            raise self._dead() from None
+            raise self._end_as_fault() from None
 
     def pack(self, arrays: Arrays) -> dict[str, PackedArray]:
         return self._memory.write_arrays(arrays)
@@ -105,7 +105,7 @@ class _PolicyProcess:
             self._process.wire.send(encode_message(request))
             return self._process.wire.receive()
         except (EOFError, OSError):
-            raise self._dead() from None
+            raise self._end_as_fault() from None
 
     def report_ended(self, request: EndRequest) -> None:
         self.exchange(request)
@@ -117,7 +117,7 @@ class _PolicyProcess:
             self._memory.close()
         self._open = False
 
-    def _dead(self) -> PolicyFault:
+    def _end_as_fault(self) -> PolicyFault:
         return PolicyFault(f"gave no answer: {self._process.end()}")
 
 
@@ -182,7 +182,7 @@ def _driver(
     """Load a policy with one kind of sandbox. Raises _NoSandbox, UsageError."""
     sandbox = None if kind == "weak" else sandbox_for(name, kind, host)
     with ExitStack() as stack, policy_call("loading", timer=timer, passes=(BaseException,)):
-        process = _PolicyProcess(name_inside(name), observation_bytes(expected), sandbox)
+        process = _PolicyProcess(name_in_sandbox(name), observation_bytes(expected), sandbox)
         stack.callback(process.close)
         try:
             info = process.info(start_s if timer is None else None)
@@ -201,22 +201,24 @@ def _driver(
     return HostedDriver(policy, _RUNS[kind], info.source[:64], timer)
 
 
-def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor: int) -> None:
+def serve_without_sandbox(
+    socket_descriptor: int, call_descriptor: int, memory_descriptor: int
+) -> None:
     """Answer requests, without a sandbox.
 
     call_descriptor: not used, because the environment's process enforces the timeouts.
     """
     os.close(call_descriptor)
-    _serve(socket_descriptor, memory_descriptor, boxed=False)
+    _serve(socket_descriptor, memory_descriptor, in_sandbox=False)
 
 
-def serve_inside(socket_descriptor: int, memory_descriptor: int) -> None:
+def serve_in_sandbox(socket_descriptor: int, memory_descriptor: int) -> None:
     """Answer requests, in a sandbox."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-    _serve(socket_descriptor, memory_descriptor, boxed=True)
+    _serve(socket_descriptor, memory_descriptor, in_sandbox=True)
 
 
-def _serve(socket_descriptor: int, memory_descriptor: int, *, boxed: bool) -> None:
+def _serve(socket_descriptor: int, memory_descriptor: int, *, in_sandbox: bool) -> None:
     """Answer requests until the socket closes. The first message is the policy's name, replied to
     with its info."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -227,7 +229,7 @@ def _serve(socket_descriptor: int, memory_descriptor: int, *, boxed: bool) -> No
     try:
         driver = load_policy(name, NoTimer())
     except UsageError as error:
-        wire.send(encode_message(_with_remedy(Refusal("policy", str(error)), boxed)))
+        wire.send(encode_message(_with_remedy(Refusal("policy", str(error)), in_sandbox)))
         return
     desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
     info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
@@ -240,13 +242,13 @@ def _serve(socket_descriptor: int, memory_descriptor: int, *, boxed: bool) -> No
             if isinstance(request, EndRequest) and ProcessState.now() != initial_state:
                 end_at_once()  # without a reply, so that the next episode has a new process
             if isinstance(reply, Refusal):
-                reply = _with_remedy(reply, boxed)
+                reply = _with_remedy(reply, in_sandbox)
             wire.send(encode_message(reply))
 
 
-def _with_remedy(refusal: Refusal, boxed: bool) -> Refusal:
+def _with_remedy(refusal: Refusal, in_sandbox: bool) -> Refusal:
     """Say how a policy in a sandbox gets the file that it may lack."""
-    if not boxed or not _LACKS_A_FILE.search(refusal.words):
+    if not in_sandbox or not _LACKS_A_FILE.search(refusal.words):
         return refusal
     remedy = (
         "; an isolated policy begins in an empty folder and reads only its own: name other files "

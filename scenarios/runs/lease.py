@@ -50,7 +50,7 @@ class Lease:
         self._reports: deque[_Reported] = deque()
         self._lost = ""
 
-    def take(
+    def add_report(
         self,
         messages: Sequence[Message],
         failure: AttemptFailure | None,
@@ -61,7 +61,7 @@ class Lease:
         self._reported_s = time.monotonic()
         self._reports.append(_Reported(messages, failure, answer))
 
-    def lose(self, reason: str) -> None:
+    def mark_lost(self, reason: str) -> None:
         """Note that the worker is lost, with all that runs on its machine."""
         self._lost = self._lost or reason
 

@@ -54,7 +54,7 @@ def sandbox_for(name: str, kind: str, host: PolicyHost) -> Sandbox:
     reads = [(path, hidden) for path in (*_of_python(), *_OF_SYSTEM, *host.data)]
     for folder in _own_folders(name):
         real = os.path.realpath(folder)
-        # Other runs lie beside the run: they are hidden, too, unless the policy itself does.
+        # Other runs in the same folder are hidden too, unless the policy itself is there.
         others = [path for path in around if not Path(real).is_relative_to(path)]
         reads.append((str(folder), (*hidden, *others)))
     imports = dict.fromkeys(str(Path(entry).absolute()) for entry in ("", *sys.path))
@@ -62,10 +62,10 @@ def sandbox_for(name: str, kind: str, host: PolicyHost) -> Sandbox:
     return Sandbox(kind, tuple(reads), tuple(imports), tuple(_environment()), memory_bytes)
 
 
-def name_inside(name: str) -> str:
+def name_in_sandbox(name: str) -> str:
     """Return a policy's name as it loads from any working folder.
 
-    >>> name_inside("onnx:/net")
+    >>> name_in_sandbox("onnx:/net")
     'onnx:/net'
     """
     if not name.startswith(ONNX_SCHEME):
@@ -97,7 +97,10 @@ def _own_folders(name: str) -> list[Path]:
     Raises UsageError.
     """
     if name.startswith(ONNX_SCHEME):
-        return [_narrow(name, Path(name_inside(name).removeprefix(ONNX_SCHEME))), *weight_folders()]
+        return [
+            _checked_folder(name, Path(name_in_sandbox(name).removeprefix(ONNX_SCHEME))),
+            *weight_folders(),
+        ]
     if ":" not in name:
         return weight_folders() if name in {*WEIGHTED_POLICIES, *shipped_bundles()} else []
     top = name.partition(":")[0].partition(".")[0]
@@ -105,7 +108,7 @@ def _own_folders(name: str) -> list[Path]:
     folders = _folders(found)
     if not folders and found is not None and found.origin is not None:
         folders = [str(Path(found.origin).parent)]
-    return [_narrow(name, Path(folder)) for folder in folders]
+    return [_checked_folder(name, Path(folder)) for folder in folders]
 
 
 def _folders(spec: ModuleSpec | None) -> list[str]:
@@ -113,7 +116,7 @@ def _folders(spec: ModuleSpec | None) -> list[str]:
     return [] if spec is None else list(spec.submodule_search_locations or ())
 
 
-def _narrow(name: str, folder: Path) -> Path:
+def _checked_folder(name: str, folder: Path) -> Path:
     """Return a policy's folder. Raises UsageError if it holds what is none of a policy's."""
     real = folder.resolve()
     shared = [Path(tempfile.gettempdir()), Path("/tmp"), Path("/var/tmp"), Path("/dev/shm")]

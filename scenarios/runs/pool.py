@@ -116,8 +116,13 @@ class _Pool:
         worker = next(idle, None) or self._transport.start(self._hello)
         self._workers[worker] = scenario
         self._folder.forget(scenario.id)
-        last, second = self._queue.on_last_attempt(scenario), self._queue.is_second(scenario)
-        worker.give(Job(scenario, self._options, self._setup, last_attempt=last, second=second))
+        last, second_half = (
+            self._queue.on_last_attempt(scenario),
+            self._queue.in_second_half(scenario),
+        )
+        worker.give(
+            Job(scenario, self._options, self._setup, last_attempt=last, second=second_half)
+        )
         log_event("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
@@ -150,7 +155,7 @@ class _Pool:
         """Adopt workers that run a scenario which waits, and keep late results."""
         for one in self._transport.unsolicited():
             if isinstance(one, LateResult):
-                one.answer(self._late(one.done))
+                one.answer(self._take_late_result(one.done))
             elif (scenario := self._queue.named(one.scenario)) is None:
                 one.worker.cancel()
             else:
@@ -222,7 +227,7 @@ class _Pool:
         words = no_answer(self._hello, end.unanswered_s)
         return AttemptFailure("policy_timeout", f"{words} in {lost.asked} of {scenario.id}")
 
-    def _late(self, done: Done) -> ResultOutcome:
+    def _take_late_result(self, done: Done) -> ResultOutcome:
         """Store a late result if there is none, and cancel the worker that runs the scenario."""
         busy = (
             worker
@@ -232,7 +237,7 @@ class _Pool:
         worker = next(busy, None)
         scenario = self._queue.named(done.scenario) if worker is None else self._workers[worker]
         if scenario is None:
-            return self._second(done)
+            return self._compare_with_stored(done)
         record = self._record_of(scenario, done.record)
         frames_may_be_lost = self._options.frames_every_s > 0.0
         if record is None or done.again or frames_may_be_lost:
@@ -246,19 +251,21 @@ class _Pool:
         self._over(scenario, record.status)
         return "kept"
 
-    def _second(self, done: Done) -> ResultOutcome:
+    def _compare_with_stored(self, done: Done) -> ResultOutcome:
         """Compare a result with the one in the run folder: two episodes that ended must be
         equal."""
         if done.scenario not in self._folder.spec.scenarios:
             return "refused"
         try:
-            kept = Record.load(self._folder.episode_folder(done.scenario) / "record.json")
-            came = Record.decoded(done.record, self._folder.path)
+            stored = Record.load(self._folder.episode_folder(done.scenario) / "record.json")
+            received = Record.decoded(done.record, self._folder.path)
         except RunError:
             return "refused"
-        alike = msgspec.structs.replace(kept, clock={}) == msgspec.structs.replace(came, clock={})
-        comparable = None not in (kept.ended, came.ended) and not kept.setup.real_time
-        return "conflict" if comparable and not alike else "duplicate"
+        equal = msgspec.structs.replace(stored, clock={}) == msgspec.structs.replace(
+            received, clock={}
+        )
+        comparable = None not in (stored.ended, received.ended) and not stored.setup.real_time
+        return "conflict" if comparable and not equal else "duplicate"
 
     def _give_up(self, scenario: Scenario, reason: str, status: Status, driven: bytes) -> None:
         """Record a scenario after its last failed attempt. driven: record of what was driven."""
@@ -302,7 +309,7 @@ class _AttemptQueue:
         self._seed = folder.spec.setup.seed
         self._has_decoys = any(one.decoy_of for one in scenarios)
         by_pseudonym = sorted(scenarios, key=partial(episode_id_of, self._seed))
-        self._waiting = deque(sorted(by_pseudonym, key=self.is_second))
+        self._waiting = deque(sorted(by_pseudonym, key=self.in_second_half))
         self._failed = folder.failed_attempts()
 
     def __len__(self) -> int:
@@ -320,7 +327,7 @@ class _AttemptQueue:
         """Remove a scenario that waits."""
         self._waiting.remove(scenario)
 
-    def is_second(self, scenario: Scenario) -> bool:
+    def in_second_half(self, scenario: Scenario) -> bool:
         """Return whether a scenario belongs to the second half."""
         return self._has_decoys and drives_second(self._seed, scenario)
 

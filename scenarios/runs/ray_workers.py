@@ -275,7 +275,7 @@ class _RayWorker:
             except self._ray.exceptions.RayError as error:
                 self.ended = True
                 if self._lease is not None:
-                    self._lease.lose(f"its Ray worker was lost ({type(error).__name__})")
+                    self._lease.mark_lost(f"its Ray worker was lost ({type(error).__name__})")
                 break
             self.pending = self._actor.report.remote(_POLL_S)
             self._take(report)
@@ -297,7 +297,7 @@ class _RayWorker:
             if isinstance(message, Done) and (other := other_renderer(message, self._renderer)):
                 raise UsageError(f"{other}: take nodes alike, or --camera bullet")
         if self._lease is not None:
-            self._lease.take(messages, report.failure)
+            self._lease.add_report(messages, report.failure)
 
     def _keep_output(self, printed: bytes) -> None:
         if printed:

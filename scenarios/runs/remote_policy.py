@@ -78,7 +78,7 @@ class PolicyServers:
         self._server: _Server | None = None
         self._jpeg = False
 
-    def know(self, within_s: float) -> list[PolicyInfo]:
+    def find_policy(self, within_s: float) -> list[PolicyInfo]:
         """Find servers, and use only those of the same policy from now on. Raises UsageError if
         their policies differ, MachineError if there is none in time."""
         infos = [one.info for one in self._found(within_s)]
@@ -93,7 +93,7 @@ class PolicyServers:
         self._jpeg = first.jpeg
         return infos
 
-    def choose(self) -> None:
+    def choose_server(self) -> None:
         """Choose the server with the fewest episodes for the next episode. Raises MachineError if
         there is none."""
         found = self._found(self.times.found_s)
@@ -117,11 +117,11 @@ class PolicyServers:
     def exchange(self, request: ResetRequest | ActRequest) -> bytes:
         unreached_since_s = None
         while True:
-            how, payload = self._send(request, self.times.try_s)
-            if how in ("answered", "refused"):
+            outcome, payload = self._send(request, self.times.try_s)
+            if outcome in ("answered", "refused"):
                 return payload
             now_s = time.monotonic()
-            if how == "late":
+            if outcome == "late":
                 unreached_since_s = None
                 continue
             unreached_since_s = now_s if unreached_since_s is None else unreached_since_s
@@ -204,7 +204,7 @@ class RemoteDriver(HostedDriver):
         """Reset the policy on a free server. The search does not count as time of the policy."""
         until_s = time.monotonic() + self._servers.times.found_s
         while True:
-            self._servers.choose()
+            self._servers.choose_server()
             try:
                 return super().reset(episode_id, seed)
             except PolicyServerBusy:
@@ -226,7 +226,7 @@ def remote_driver(
         raise UsageError(f"policy '{name}' needs --policy-at ENDPOINT: where `cosim serve` listens")
     servers = PolicyServers(called, host, times)
     try:
-        infos = servers.know(times.first_found_s)
+        infos = servers.find_policy(times.first_found_s)
         info = infos[0]
         if info.protocol != POLICY_PROTOCOL:
             raise UsageError(

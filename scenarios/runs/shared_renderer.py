@@ -63,7 +63,7 @@ class SharedRenderer:
         self._listening = socket.socket(socket.AF_UNIX)
         self._watchdog: Watchdog | None = None
         self._ends: list[RendererEnd] = []
-        self._in_a_row = 0
+        self._failures_in_a_row = 0
 
     def __enter__(self) -> Self:
         self._listening.bind(f"\0{self.at.address}")
@@ -127,7 +127,7 @@ class SharedRenderer:
 
     def episode_ended(self) -> None:
         """Reset the count of failed renderers."""
-        self._in_a_row = 0
+        self._failures_in_a_row = 0
 
     def _start(self) -> None:
         log = self._logs / f"renderer-{len(self._ends)}.log"
@@ -143,8 +143,8 @@ class SharedRenderer:
         if watchdog.ready and blames_policy:  # counted as a failed attempt of its episodes
             self._start()
             return
-        self._in_a_row += 1
-        if self._in_a_row >= RENDERERS:
+        self._failures_in_a_row += 1
+        if self._failures_in_a_row >= RENDERERS:
             words = (
                 f"{end.words}, {RENDERERS} times, and no episode ended in between: see "
                 f"{watchdog.process.log}"

@@ -168,14 +168,14 @@ def repeat_job(hello: Hello, commands: CommandLog, send: MessageHandler) -> Repe
         setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
         renderer=hello.renderer,
         log=commands,
-        watches=[_noted(commands)],
+        watches=[_tick_logger(commands)],
         waiting=lambda reason, _=None: send(Waits(name, reason)),
     )
     commands.ends()
     return Repeated(name, replayed.record.encoded(), replayed.error)
 
 
-def _noted(commands: CommandLog) -> Watch:
+def _tick_logger(commands: CommandLog) -> Watch:
     """Return a callback that notes each simulated tick in a log."""
     return lambda step, verdict: commands.simulated(step.tick + 1, over=verdict.ended is not None)
 
@@ -288,7 +288,7 @@ def run_job(
     watches: list[Watch] = [watcher.watch]
     if commands is not None:
         commands.begins()
-        watches.append(_noted(commands))
+        watches.append(_tick_logger(commands))
     try:
         if renderer is not None:
             link_to(renderer.address, lambda: send(Waits(name, "waits for the shared renderer")))

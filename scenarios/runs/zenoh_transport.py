@@ -92,7 +92,7 @@ class _LeasedWorker(Lease):
         """Take in a report, which is answered once it is processed."""
         done = () if report.done is None else (report.done,)
         failure = _failure_in(report)
-        self.take((*report.said, *done), failure, lambda reply: _answer(query, reply))
+        self.add_report((*report.said, *done), failure, lambda reply: _answer(query, reply))
 
     def poll(self, handle: MessageHandler) -> AttemptFailure | None:
         failure = super().poll(handle)
@@ -240,7 +240,7 @@ class ZenohWorkers:
         for slot_key in [slot_key for slot_key in self._claims if slot_key[0] == worker]:
             self._drop_claim(slot_key)
         for lease in [lease for slot_key, lease in self._leases.items() if slot_key[0] == worker]:
-            lease.lose(f"worker {worker} was lost")
+            lease.mark_lost(f"worker {worker} was lost")
 
     def _drop_claim(self, slot_key: _SlotKey) -> None:
         if slot_key in self._claims:
@@ -270,7 +270,7 @@ class ZenohWorkers:
             _answer(query, Assignment(lease.number, lease.job))  # the first reply was lost
             return
         if lease is not None:
-            lease.lose(f"worker {claim.worker} does not continue with it")
+            lease.mark_lost(f"worker {claim.worker} does not continue with it")
         self._drop_claim(slot_key)
         self._claims[slot_key] = (query, time.monotonic())
 
@@ -330,7 +330,7 @@ class ZenohWorkers:
     def _turn_away(self, report: Report, query: Query, why: str) -> None:
         self.registry.turned_away(report.worker, "", why)
         if (lease := self._lease_of(report)) is not None:
-            lease.lose(f"its worker was turned away: {why}")
+            lease.mark_lost(f"its worker was turned away: {why}")
         _answer(query, Reply("turned_away", why))
 
     def _refusal(self, report: Report) -> str:

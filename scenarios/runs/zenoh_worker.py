@@ -32,7 +32,7 @@ _RETRY_S: Final = 0.5
 """Seconds between two attempts to find a coordinator or a run."""
 _WAIT_S: Final = 0.25
 """Longest time in seconds between two checks of the environment slots."""
-_LOOKS_S: Final = 5.0
+_LOOK_AFTER_S: Final = 5.0
 """Seconds without a reply after which a worker looks for another run at the same address."""
 _PARTING_S: Final = 10.0
 """Seconds for which a worker that leaves tries to deliver its results."""
@@ -197,7 +197,7 @@ class _Service:
         self._replies: queue.SimpleQueue[
             tuple[JobClient | None, CoordinatorRequest, bytes | None, str]
         ] = queue.SimpleQueue()
-        self._looks_s = time.monotonic() + _LOOKS_S
+        self._next_look_s = time.monotonic() + _LOOK_AFTER_S
         self._refusal = ""
 
     def serve(self) -> bool:
@@ -255,7 +255,7 @@ class _Service:
     ) -> None:
         if payload is not None:
             self._contact.made("the coordinator answers again")
-            self._looks_s = time.monotonic() + _LOOKS_S
+            self._next_look_s = time.monotonic() + _LOOK_AFTER_S
         if error and error != self._refusal:
             self._refusal = error
             self._say(f"the coordinator refused a '{request.act}': {error}")
@@ -265,10 +265,10 @@ class _Service:
     def _other_run(self) -> bool:
         """Return whether another run has taken the place of this one; checked while it does not
         answer."""
-        if time.monotonic() < self._looks_s:
+        if time.monotonic() < self._next_look_s:
             return False
         self._contact.missing("the coordinator does not answer: waits for it")
-        self._looks_s = time.monotonic() + 1.0
+        self._next_look_s = time.monotonic() + 1.0
         runs = [key.split("/")[1] for key in self._session.answers(keys.EVERY_RUN, timeout_s=2.0)]
         return bool(runs) and self._run not in runs
 

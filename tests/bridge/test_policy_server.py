@@ -525,7 +525,7 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
             )
             assert other.stdout is not None and "stop with Ctrl-C" in other.stdout.readline()
             servers = PolicyServers("both", PolicyHost(servers=(at,)))
-            wait_until(lambda: len(servers.know(PATIENCE_S)) == 2)
+            wait_until(lambda: len(servers.find_policy(PATIENCE_S)) == 2)
             servers.close()
             driver = remote_driver("zenoh:both", PolicyHost(servers=(at,), run="r"))
             driver.reset("k1", 1)

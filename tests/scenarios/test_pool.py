@@ -545,7 +545,7 @@ class Ended(SharedRenderer):
         self.at = RendererAddress(address="nowhere", asks=True)
         self.end = end
 
-    def tend(self) -> None:
+    def check(self) -> None:
         """It has ended already."""
 
     def end_of(self, number: int) -> RendererEnd | None:
