@@ -141,6 +141,6 @@ def test_each_engine_is_imported_where_architecture_says() -> None:
         assert where[name] and all(path.startswith("physics/") for path in where[name])
     said = " ".join((ROOT / "ARCHITECTURE.md").read_text().split())
     assert (
-        "libsumo is imported only in `sumo_nets/engine.py`, PyBullet and moderngl only in "
-        "`physics`, zenoh only in `bridge/session.py` and in `bridge/policy_server.py`" in said
+        "Only `sumo_nets/engine.py` imports libsumo, and only `physics` imports PyBullet and "
+        "moderngl. Only `bridge/session.py` imports zenoh, and `bridge/policy_server.py`" in said
     )

@@ -160,7 +160,7 @@ def test_a_worker_for_one_run_does_not_wait_for_ever(
 ) -> None:
     """It ends, and says why, when it was cut off from a run that is over, and when none was ever
     there."""
-    monkeypatch.setattr(zenoh_worker, "_LOOKS_S", 0.0)
+    monkeypatch.setattr(zenoh_worker, "_LOOK_AFTER_S", 0.0)
     run = Run(tmp_path)
     said = list[str]()
 
