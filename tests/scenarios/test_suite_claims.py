@@ -303,7 +303,7 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             "was changed since",
         ),
         "a-proof-missing": ("proofs", with_proof(unit, scenario="nobody"), "has no proof"),
-        "a-proof-that-touches": ("proofs", with_proof(unit, obstacles_m=-0.1), "touches"),
+        "a-proof-that-touches": ("proofs", with_proof(unit, obstacles_m=-0.1), "has a contact"),
         "a-proof-too-slow": ("proofs", with_proof(unit, time_s=61.0), "no time within the limit"),
         "two-experts": ("proofs", with_proof(unit, expert="route"), "several experts"),
         "too-short": ("lengths", of(unit, [nearer(unit.suite.scenarios[0], 0.4)]), "m long"),

@@ -18,7 +18,7 @@ from cosim.core.geometry import Floats, wrap_angles
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.run_folder import read_records
-from cosim.spec.events import Event
+from cosim.spec.events import Event, EventKinds
 from cosim.spec.scenario import Scenario, read_suite
 from scenarios.events import EVENT_KINDS
 
@@ -54,7 +54,9 @@ def sheet_of_run(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, ...]]:
+def rows_of(
+    scenario: Scenario, record: Record, log: Log, kinds: EventKinds = EVENT_KINDS
+) -> list[tuple[object, ...]]:
     """Return the rows of an episode.
 
     stated_m: trigger distance of the event, else of its kind; NaN if the crosswalk is the trigger.
@@ -81,7 +83,7 @@ def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, 
         trigger_m = event.route_s_m - float(log.route_s_m[before] if first else 0.0)
         stated_m = event.trigger_m
         if stated_m is None:
-            stated_m = EVENT_KINDS[event.kind].trigger_m
+            stated_m = kinds[event.kind].trigger_m
         error_m = abs((event.half_length_m if stated_m is None else stated_m) - trigger_m)
         came_m = float(log.route_s_m[before] - log.route_s_m[before - 1]) if before else 0.0
         period_m = max(float(log.travelled_m[before]), came_m)
