@@ -20,7 +20,7 @@ from cosim.spec.injection import POINT_FORMS, Ack, InjectionRequest
 
 LARGEST_B: Final = 64 * 1024
 """Largest injection in bytes."""
-_MOST_SHOWN: Final = 60
+_MAX_SHOWN: Final = 60
 """Longest invalid value in an error message in characters."""
 _JSON_BEGINS: Final = b"{[ \t\r\n"
 """First bytes of a JSON message."""
@@ -69,7 +69,7 @@ def _found(payload: bytes, error: str) -> str:
         value = _decoder(payload)(payload)
         for field, index in _STEP.findall(place[1]):
             value = value[field] if field else value[int(index)]
-        return f", found {repr(value)[:_MOST_SHOWN]}"
+        return f", found {repr(value)[:_MAX_SHOWN]}"
     return ""
 
 

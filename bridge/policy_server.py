@@ -36,13 +36,13 @@ LARGEST_MESSAGE_BYTES = 16 << 20
 """Largest message over Zenoh in bytes."""
 _WINDOW_S = 0.002
 """Seconds that a policy with act_batch waits for further requests before it answers a batch."""
-_MOST_SLOTS = 4096
+_MAX_SLOTS = 4096
 """Largest number of open episodes of a server; beyond it the longest idle one is dropped."""
 CLOSE_AFTER_S = 300.0
 """Seconds without a request after which a server drops an episode."""
 _TAKEN_OVER_AFTER_S = 30.0
 """Seconds without a request after which a policy object for one episode at a time is free again."""
-_MOST_ANSWER_BYTES = 2 << 20
+_MAX_ANSWER_BYTES = 2 << 20
 """Largest answer in bytes; of a larger array, which is invalid, only the shape is sent."""
 _OWN_PACKAGES = {"cosim", "scenarios", "sumo_nets", "physics", "bridge"}
 _PICTURE = ("rgb", "depth", "labels")
@@ -424,7 +424,7 @@ class PolicyDesk:
         now = time.monotonic()
         slots = sorted(self._slots.items(), key=lambda item: item[1].used_at_s)
         for number, (key, slot) in enumerate(slots):
-            if now - slot.used_at_s > self._forget_after_s or len(slots) - number >= _MOST_SLOTS:
+            if now - slot.used_at_s > self._forget_after_s or len(slots) - number >= _MAX_SLOTS:
                 self._end(key, slot)
 
     def _act(self, requests: list[tuple[_Slot, ActRequest, Any]]) -> None:
@@ -554,7 +554,7 @@ def _packed_waypoints(answer: Any) -> PackedArray:
         shown = repr(answer)
         shown = shown if len(shown) <= 80 and shown.isprintable() else f"a {type(answer).__name__}"
         raise PolicyFault(f"answered {shown}: neither a Command nor waypoints")
-    if array.nbytes > _MOST_ANSWER_BYTES:
+    if array.nbytes > _MAX_ANSWER_BYTES:
         return PackedArray(array.dtype.str, array.shape)
     return pack_array(array)
 

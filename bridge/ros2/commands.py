@@ -22,7 +22,7 @@ _TWIST_B: Final = 52
 """Size of a Twist in bytes, by which it is known where keys do not name the type."""
 _WALL_NS: Final = 10**18
 """Stamps above are of a wall clock, in nanoseconds."""
-_MOST_POINTS: Final = 32
+_MAX_POINTS: Final = 32
 """Largest number of points of a plan that are recorded."""
 _FRAMES: Final = ("", "map", "odom")
 """Frames in which a plan is read."""
@@ -180,7 +180,7 @@ def plan_points(
     points = np.array([(one.pose.position.x, one.pose.position.y) for one in path.poses])
     if not np.isfinite(points).all():
         return refused("number", "with positions that are not finite numbers")
-    chosen = np.linspace(0, len(points) - 1, min(len(points), _MOST_POINTS)).round().astype(int)
+    chosen = np.linspace(0, len(points) - 1, min(len(points), _MAX_POINTS)).round().astype(int)
     heading = pose.heading_rad or 0.0
     cos, sin = math.cos(heading), math.sin(heading)
     offset = points[chosen] - (pose.x_m, pose.y_m)
@@ -189,15 +189,15 @@ def plan_points(
 
 
 class Inbox:
-    """Unread messages of a topic, at most `most` of them and `most_b` bytes.
+    """Unread messages of a topic, at most `most` of them and `max_b` bytes.
 
     newest: Whether the oldest message is dropped if it is full, instead of the new one.
     """
 
-    def __init__(self, *, newest: bool, most: int = 1024, most_b: int = 4 << 20) -> None:
+    def __init__(self, *, newest: bool, most: int = 1024, max_b: int = 4 << 20) -> None:
         self._newest = newest
         self._most = most
-        self._most_b = most_b
+        self._max_b = max_b
         self._lock = threading.Lock()
         self._messages: deque[Received] = deque()
         self._held_b = 0
@@ -210,7 +210,7 @@ class Inbox:
         with self._lock:
             self._messages.append(got)
             self._held_b += len(got.payload)
-            while len(self._messages) > self._most or self._held_b > self._most_b:
+            while len(self._messages) > self._most or self._held_b > self._max_b:
                 lost = self._messages.popleft() if self._newest else self._messages.pop()
                 self._held_b -= len(lost.payload)
 

@@ -38,7 +38,7 @@ LIDAR: Final = "lidar_link"
 IMU: Final = "imu_link"
 _JPEG_QUALITY: Final = 90
 """Quality of compressed pictures, of 100."""
-_LEAST_RANGE_M: Final = 0.05
+_MIN_RANGE_M: Final = 0.05
 """Smallest range of the lidar in metres."""
 _OPTICAL_IN_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Axes of an optical frame in the frame of its camera: z ahead, x right, y down."""
@@ -236,7 +236,7 @@ def laser_scan(scan: Scan, time_ns: int) -> Any:
         step,
         0.0,
         0.0,
-        _LEAST_RANGE_M,
+        _MIN_RANGE_M,
         spec.range_m,
         np.ascontiguousarray(scan.ranges_m[0], np.float32),
         np.zeros(0, np.float32),

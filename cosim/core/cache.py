@@ -74,7 +74,7 @@ _IN_USE_FOLDER: Final = ".in-use"
 """Folder with the lists of entries in use."""
 _LOCK: Final = ".lock"
 """File that serializes changes of the lists."""
-_MOST_LISTS: Final = 32
+_MAX_LISTS: Final = 32
 """Number of lists above which a new process removes those of ended processes."""
 
 
@@ -227,7 +227,7 @@ class _InUseList:
         self._listed = set[str]()
         self._file = lists / f"{os.getpid()}-{secrets.token_hex(4)}"
         with lock(folder / _LOCK):
-            if sum(1 for _ in os.scandir(lists)) > _MOST_LISTS:
+            if sum(1 for _ in os.scandir(lists)) > _MAX_LISTS:
                 _remove_dead_lists(lists)
             self._held = lock(self._file)
             self._held.acquire()

@@ -19,15 +19,15 @@ from cosim.spec.robot import Robot
 
 EPS_M = 1e-8
 """Coordinate in metres below which a waypoint counts as at the robot."""
-MOST_NUMBERS = 100_000
+MAX_NUMBERS = 100_000
 """Maximum number of numbers in a policy's answer."""
 REAL_KINDS = "iuf"
 """numpy's kinds of real numbers: integers, unsigned integers, floats."""
-_MOST_SHOWN = 80
+_MAX_SHOWN = 80
 """Maximum length of an answer in a message, in characters."""
 _COLUMNS = (2, 4)
 """Valid numbers of columns of waypoints."""
-_MOST_RECORDED = 256
+_MAX_RECORDED = 256
 """Maximum number of recorded waypoints of an answer; all up to the followed one are recorded."""
 _LARGEST = float(np.finfo(np.float32).max)
 """Largest float32."""
@@ -62,7 +62,7 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
     answer: a Command, or waypoints (N, 2) or (N, 4), of which one is followed (the result is a
         Planned).
     Raises PolicyError with the answer for NaN, infinities, too few waypoints, more than
-    MOST_NUMBERS numbers, and anything else than real numbers.
+    MAX_NUMBERS numbers, and anything else than real numbers.
     """
     if isinstance(answer, Command):
         speeds = (answer.v_mps, answer.w_radps)
@@ -86,7 +86,7 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
 
 def _planned(command: Command, waypoints: Floats, index: int) -> WaypointCommand:
     """Return a command together with its waypoints in metres."""
-    recorded = np.clip(waypoints[: max(_MOST_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
+    recorded = np.clip(waypoints[: max(_MAX_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
         np.float32
     )
     return WaypointCommand(command.v_mps, command.w_radps, recorded, index)
@@ -124,13 +124,13 @@ def _waypoints(answer: object, index: int) -> Floats:
 
 def check_numbers(shape: Sequence[int]) -> None:
     """Raise PolicyError for an array shape with too many numbers."""
-    if (count := math.prod(shape)) > MOST_NUMBERS:
+    if (count := math.prod(shape)) > MAX_NUMBERS:
         shown = ", ".join(map(str, shape[:4])) + (
             ", ..." if len(shape) > 4 else "," * (len(shape) == 1)
         )
         raise PolicyError(
             f"answered an array of shape ({shown}): {count} numbers; an answer holds at most "
-            f"{MOST_NUMBERS}"
+            f"{MAX_NUMBERS}"
         )
 
 
@@ -146,12 +146,12 @@ def _number(value: object) -> float:
 
 def _shown(value: object) -> str:
     """Return an answer for a message: its repr if it is short and stable, else its type."""
-    if isinstance(value, int) and value.bit_length() > _MOST_SHOWN:
+    if isinstance(value, int) and value.bit_length() > _MAX_SHOWN:
         return f"an integer of {value.bit_length()} bits"
     try:
         text = repr(value)
     except Exception:  # noqa: BLE001  a repr may do anything
         return f"a {type(value).__name__}"
     stable = " at 0x" not in text
-    short = len(text) <= _MOST_SHOWN and text.isprintable()
+    short = len(text) <= _MAX_SHOWN and text.isprintable()
     return text if stable and short else f"a {type(value).__name__}"

@@ -17,7 +17,7 @@ from cosim.episode.interfaces import RangeSensor
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 from cosim.spec.sensors import (
-    MOST_TRACKS,
+    MAX_TRACKS,
     TRACKING_RANGE_M,
     Imu,
     ImuKind,
@@ -113,7 +113,7 @@ class Tracker:
         velocities += noise.velocity_mps * errors[2:]
         far = np.hypot(*positions)
         order = np.argsort(far, kind="stable")
-        order = order[seen[order]][:MOST_TRACKS]
+        order = order[seen[order]][:MAX_TRACKS]
         self._keep({people.ids[i] for i in rows.tolist()}, time_s, before_s)
         names = [people.ids[i] for i in rows[order].tolist()]
         ids = self._ids(names, switch[order], positions.T[order], time_s)

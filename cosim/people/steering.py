@@ -40,7 +40,7 @@ TURNS: Final = tuple(
 )
 """Cosine and sine of the turns that are tried to either side, 10 to 110 degrees."""
 
-LEAST_DISTANCE_SHARE: Final = 0.98
+MIN_DISTANCE_SHARE: Final = 0.98
 """Share of their distance that people closer than two radii keep at least."""
 
 _CROSSING: Final = 0.35
@@ -139,7 +139,7 @@ def _relevant_disks(
         far_m = math.hypot(dx, dy)
         ahead = dx * wanted_mps[0] + dy * wanted_mps[1] > 0.0
         if far_m < STEERING_NEAR_M and (ahead or far_m < SHOULDER_TO_SHOULDER_M):
-            keep_m = min(room_m, max(LEAST_DISTANCE_SHARE * far_m, SHOULDER_TO_SHOULDER_M))
+            keep_m = min(room_m, max(MIN_DISTANCE_SHARE * far_m, SHOULDER_TO_SHOULDER_M))
             room_m2 = dx * dx + dy * dy - keep_m * keep_m
             disks.append(_Disk((dx, dy), (one.vx_mps, one.vy_mps), keep_m, one.share, room_m2))
     return disks

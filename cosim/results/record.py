@@ -37,7 +37,7 @@ from cosim.spec.scenario import Scenario, Split, content_hash
 from cosim.spec.weather import CLEAR
 
 _SCHEMA = 1
-_MOST_BYTES = 256 << 20
+_MAX_BYTES = 256 << 20
 
 Status = Literal["done", "crashed", "invalid"]
 
@@ -211,7 +211,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     def load(cls, path: Path) -> Record:
         """Load a record. Raises RunError naming the file and the field."""
         try:
-            data = read_limited(path, _MOST_BYTES)
+            data = read_limited(path, _MAX_BYTES)
         except OSError as error:
             raise RunError(f"{path}: not an episode record: {error.strerror}") from error
         except ValueError as error:

@@ -190,7 +190,7 @@ def record_difference(mine: Record, theirs: Record) -> str:
 
 
 _ATTEMPTS = "attempts.jsonl"
-_MOST_BYTES = 256 << 20
+_MAX_BYTES = 256 << 20
 _ROOM_REMEDY = "finished episodes are kept; make room and go on with --resume"
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """Files that a run leaves if it was killed before it began."""
@@ -520,7 +520,7 @@ def read_scenarios(path: Path) -> Mapping[str, Scenario]:
 def read_spec(path: Path) -> RunSpec:
     """Load the spec of a run. Raises UsageError, listing nearby runs, if the folder holds none."""
     try:
-        return decode_spec(read_limited(path / "run.json", _MOST_BYTES), path / "run.json")
+        return decode_spec(read_limited(path / "run.json", _MAX_BYTES), path / "run.json")
     except FileNotFoundError:
         near = [
             str(run.parent) for run in (*path.glob("*/run.json"), *path.parent.glob("*/run.json"))

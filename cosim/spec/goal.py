@@ -53,7 +53,7 @@ _GREY: Final = 128
 """Grey value of an example picture."""
 _FARTHEST_M: Final = 10_000.0
 """Largest coordinate of a point in a learner's space, in metres."""
-_MOST_LETTERS: Final = 400
+_MAX_LETTERS: Final = 400
 """Largest length of an instruction in a learner's space, in characters."""
 _NEAREST_M: Final = 5.0
 """Least distance of a sub-goal or random point, in metres."""
@@ -246,7 +246,7 @@ class Instruction(TurningGoal, frozen=True, tag="instruction"):
 
     @classmethod
     def space(cls, size: tuple[int, int]) -> TextSpace:
-        return TextSpace(_MOST_LETTERS, string.ascii_letters + string.digits + " .,")
+        return TextSpace(_MAX_LETTERS, string.ascii_letters + string.digits + " .,")
 
     @classmethod
     def example(cls, size: tuple[int, int]) -> Instruction:
@@ -666,7 +666,7 @@ def protocols_of(*types: type[AnyGoal]) -> tuple[GoalProtocol, ...]:
     )
 
 
-def most_goal_bytes(size: tuple[int, int]) -> int:
+def max_goal_bytes(size: tuple[int, int]) -> int:
     """Return the size of the largest goal array in bytes.
 
     size: width and height of the policy's pictures.

@@ -140,9 +140,9 @@ class RouteCrossing(Ranged, frozen=True, kw_only=True):
 
 DEFAULT_PERSONS = 50
 """Default number of persons around the robot."""
-MOST_PERSONS = 1000
+MAX_PERSONS = 1000
 """Maximum number of persons; SUMO would be too slow for more."""
-MOST_PER_1000_M2 = 150.0
+MAX_PER_1000_M2 = 150.0
 """Maximum density in persons per 1000 m2. Denser crowds have no space to enter 1.5 m apart."""
 
 
@@ -157,12 +157,12 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     added: whether the crowd was requested in place of the suite's own.
     """
 
-    persons: Annotated[int, Within(0, MOST_PERSONS)] = DEFAULT_PERSONS
+    persons: Annotated[int, Within(0, MAX_PERSONS)] = DEFAULT_PERSONS
     radius_m: Annotated[float, Within(20, 500)] = 80.0
     vehicles: Annotated[int, Within(0, 200)] = 20
     density: Annotated[
         float | None,
-        Within(0, MOST_PER_1000_M2, words="must be in {range} per 1000 m2, not {value}"),
+        Within(0, MAX_PER_1000_M2, words="must be in {range} per 1000 m2, not {value}"),
     ] = None
     residents: Annotated[int, Within(0, 60)] = 0
     groups: Annotated[float, SHARE] = 0.0

@@ -22,8 +22,8 @@ GOAL_POSITIONS: Final[tuple[Position, ...]] = ("goal", "share")
 """Positions that need the distance to the goal, so the protocol `final_point`."""
 BEST_BLIND: Final = "best blind schedule found"
 """Name of the row of a suite's exploitability in tables."""
-MOST_STOPS: Final = 5
-MOST_LANES: Final = 4
+MAX_STOPS: Final = 5
+MAX_LANES: Final = 4
 
 _AT: Final = Within(0, 100_000)
 _SPEED_MPS: Final = Within(0, 5)
@@ -87,8 +87,8 @@ class Schedule(Ranged, frozen=True, kw_only=True):
 
     name: Annotated[str, PathName("a schedule")]
     v_mps: Annotated[float, _SPEED_MPS] = 1.2
-    stops: Annotated[tuple[Stop, ...], ItemCount(0, MOST_STOPS)] = ()
-    lanes: Annotated[tuple[LaneChange, ...], ItemCount(0, MOST_LANES)] = ()
+    stops: Annotated[tuple[Stop, ...], ItemCount(0, MAX_STOPS)] = ()
+    lanes: Annotated[tuple[LaneChange, ...], ItemCount(0, MAX_LANES)] = ()
     speeds: Annotated[tuple[SpeedChange, ...], ItemCount(0, 1)] = ()
     goal: ScheduleGoal = "none"
 

@@ -11,7 +11,7 @@ from cosim.spec.scenario import Scenario, Split, Suite
 
 STATIC: Final = "static"
 """Structure of `reactive` scenarios without an event, selectable like an event kind."""
-_MOST_NAMED: Final = 3
+_MAX_NAMED: Final = 3
 """Maximum number of scenarios that are listed by name, if no other options select them."""
 
 
@@ -114,7 +114,7 @@ def _options_for(whole: Suite, ids: Sequence[str]) -> list[str]:
             continue
         if {scenario.id for scenario in found} == {*ids}:
             return _as_options(kinds, split, episodes, without)
-    return [f"--scenario {name}" for name in ids] if len(ids) <= _MOST_NAMED else []
+    return [f"--scenario {name}" for name in ids] if len(ids) <= _MAX_NAMED else []
 
 
 def _as_options(

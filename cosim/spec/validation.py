@@ -21,7 +21,7 @@ from cosim.core.errors import SpecError
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 """Names that are valid in paths and keys."""
-MOST_SHOWN: Final = 60
+MAX_SHOWN: Final = 60
 """Maximum length of a value in a message, in characters."""
 
 
@@ -168,9 +168,9 @@ def field_error(field: str, rule: Rule, value: Any) -> str:
 def shown(value: object) -> str:
     """Return a value for a message: on one line, quoted if it is text, cut if it is long."""
     return (
-        f"'{one_line(value, MOST_SHOWN)}'"
+        f"'{one_line(value, MAX_SHOWN)}'"
         if isinstance(value, str)
-        else one_line(repr(value), MOST_SHOWN)
+        else one_line(repr(value), MAX_SHOWN)
     )
 
 

@@ -13,7 +13,7 @@ from physics.textures.layers import LINEAR_OF_SRGB_BYTE, linear_to_srgb
 
 EDGE_M: Final = 0.1
 """Length in metres above which edges are split, unless there would be too many triangles."""
-MOST_TRIANGLES: Final = 1_000_000
+MAX_TRIANGLES: Final = 1_000_000
 """Number of triangles of a mesh above which edges are left longer."""
 _PLACES: Final = (
     *((0.94, 0.03, 0.03), (0.7, 0.25, 0.05), (0.7, 0.05, 0.25)),
@@ -41,7 +41,7 @@ def bake_texture(
     uv: Floats,
     pixels: NDArray[np.uint8],
     unit_m: float,
-    most: int = MOST_TRIANGLES,
+    most: int = MAX_TRIANGLES,
 ) -> Baked:
     """Return a mesh whose vertices have the mean colour of the texture around them.
 

@@ -57,7 +57,7 @@ class ChildProcess:
     serves: function that the worker runs, as module:name.
     called: kind of the process, for messages.
     also: further descriptors to pass on.
-    most_bytes: size limit of a message from it.
+    max_bytes: size limit of a message from it.
     sandbox: sandbox in which it runs, without the memory of the pending call.
     open: whether it is not known to have ended.
     """
@@ -68,7 +68,7 @@ class ChildProcess:
         serves: str,
         called: str,
         also: tuple[int, ...] = (),
-        most_bytes: int = MAX_MESSAGE_BYTES,
+        max_bytes: int = MAX_MESSAGE_BYTES,
         sandbox: Sandbox | None = None,
     ) -> None:
         self.log = str(log)
@@ -80,7 +80,7 @@ class ChildProcess:
         self.in_engine = False
         self.in_policy = False
         ours, theirs = socket.socketpair()
-        self.wire = MessageSocket(ours, most_bytes)
+        self.wire = MessageSocket(ours, max_bytes)
         call = () if sandbox is not None else (self._asked.descriptor,)
         given = (theirs.fileno(), *call, *also)
         path = [str(Path(entry).absolute()) for entry in sys.path]

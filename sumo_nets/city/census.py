@@ -35,7 +35,7 @@ FORK_RAD = math.radians(152.0)
 """A junction of three arms is a Y if no two neighbouring arms are farther apart, else a T,
 radians."""
 
-LEAST_CLEAR_M = 1.2
+MIN_CLEAR_M = 1.2
 """Smallest free width in a city without faults, metres."""
 _LONGEST_M = 1500.0
 """Smallest length of the longest walk in a city without faults, metres."""
@@ -297,7 +297,7 @@ def _faults(found: Census, place: StreetMap, signals: Sequence[str]) -> list[str
         faults.append(f"only {found.one_piece:.1%} of the walkable area is one piece")
     if loose:
         faults.append(f"{loose} strips end at no corner")
-    if found.clear_m < LEAST_CLEAR_M:
+    if found.clear_m < MIN_CLEAR_M:
         faults.append(f"a passage is only {found.clear_m:.2f} m wide")
     if found.km2 > 3.0 and found.longest_m < _LONGEST_M:
         faults.append(f"the longest walk has only {found.longest_m:.0f} m")

@@ -23,7 +23,7 @@ _PLACES: Final = re.compile(
     r"/onnxruntime_src/\S+:\d+ [^()]*\((?:[^()]|\([^()]*\))*\)(?: const)? "
 )
 """Error codes and source locations in messages of onnxruntime."""
-_MOST_SAID: Final = 400
+_MAX_SAID: Final = 400
 """Largest number of characters of a runtime's message that is shown."""
 
 Tensor = NDArray[Any]
@@ -179,4 +179,4 @@ def _refusal(error: Exception, version: str) -> str:
 def runtime_message(error: Exception) -> str:
     """Return a runtime's message on one line, without codes and source locations."""
     said = _PLACES.sub("", " ".join(str(error).split()))
-    return said if len(said) <= _MOST_SAID else f"{said[:_MOST_SAID]}..."
+    return said if len(said) <= _MAX_SAID else f"{said[:_MAX_SAID]}..."

@@ -31,7 +31,7 @@ from cosim.policies.onnx.inputs import StateInput
 from cosim.policies.onnx.manifest import (
     EXAMPLE_FILE,
     MANIFEST_FILE,
-    MOST_EXAMPLE_BYTES,
+    MAX_EXAMPLE_BYTES,
     BundleManifest,
     read_bundle_manifest,
 )
@@ -303,7 +303,7 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
     """
     path = policy.example
     try:
-        held: dict[str, Tensor] = read_npz(path, most_bytes=MOST_EXAMPLE_BYTES)
+        held: dict[str, Tensor] = read_npz(path, max_bytes=MAX_EXAMPLE_BYTES)
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:

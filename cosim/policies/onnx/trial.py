@@ -24,7 +24,7 @@ ROOM_BYTES: Final = 4 << 30
 """Memory in bytes that a graph may use in addition to _TIMES the size of its files."""
 _TIMES: Final = 8
 """Memory that a graph may use, as a multiple of the size of its files."""
-_MOST_ANSWER_BYTES: Final = 512 << 20
+_MAX_ANSWER_BYTES: Final = 512 << 20
 """Largest size of all outputs in bytes."""
 
 _Packed = tuple[str, tuple[int, ...], bytes]
@@ -147,9 +147,9 @@ def _serve(path: Path, wire: MessageSocket) -> None:
             outputs = graph.ask(
                 {name: _unpacked(one) for name, one in request.tensors.items()}, request.names
             )
-            if (size := sum(array.nbytes for array in outputs.values())) > _MOST_ANSWER_BYTES:
+            if (size := sum(array.nbytes for array in outputs.values())) > _MAX_ANSWER_BYTES:
                 raise ValueError(
-                    f"the outputs hold {size} bytes; at most {_MOST_ANSWER_BYTES} are taken"
+                    f"the outputs hold {size} bytes; at most {_MAX_ANSWER_BYTES} are taken"
                 )
             reply: _Outputs | _Raised = _Outputs(
                 {name: _packed(array) for name, array in outputs.items()}

@@ -304,7 +304,7 @@ def test_a_plan_is_turned_into_the_robots_frame() -> None:
 def test_an_inbox_is_bounded_in_messages_and_bytes() -> None:
     """A full inbox drops the newest message, or the oldest one for the rule `rate`."""
     for newest, numbers in ((False, [0, 1, 2]), (True, [7, 8, 9])):
-        for inbox in (Inbox(newest=newest, most=3), Inbox(newest=newest, most_b=300)):
+        for inbox in (Inbox(newest=newest, most=3), Inbox(newest=newest, max_b=300)):
             for number in range(10):
                 inbox.put(Received(bytes([number]) * 100))
             assert len(inbox) == 3
