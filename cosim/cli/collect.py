@@ -238,7 +238,7 @@ def collect_command(
     collecting = demo.collecting
     host = host_of(config)
     expert = inspected_driver(config.policy, host, jobs)
-    options = EpisodeOptions.asked(replace(config, camera=camera_here(config.camera)))
+    options = EpisodeOptions.from_config(replace(config, camera=camera_here(config.camera)))
     source = _source(config, demo)
     began_s = time.monotonic()
     try:

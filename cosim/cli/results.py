@@ -259,9 +259,9 @@ def show(
 ) -> None:
     """Show the table of a run, finished or not, or one episode as a picture from above."""
     from cosim.cli.run_table import kinds_of, print_by_kind, print_table
-    from cosim.results.finished_run import check_record_file, other_schema
     from cosim.results.run_folder import read_records, read_spec
     from cosim.results.table import table_of
+    from cosim.results.verified_run import check_record_file, other_schema
 
     spec = read_spec(folder)
     records = {record.scenario.id: record for record in read_records(folder)}

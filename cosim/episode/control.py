@@ -38,8 +38,8 @@ def _command_for(x_m: float, y_m: float, heading_rad: float | None, rule: Waypoi
 
     heading_rad: heading of the waypoint, None without one.
 
-    At the robot's own position the command turns to the heading, or stands without one. Exactly at
-    the side it turns by a quarter turn. Otherwise v = x / dt, and w = arctan(y / x) / dt
+    At the robot's own position the command turns to the heading, or stops without one. Exactly at
+    its side it turns by a quarter turn. Otherwise v = x / dt, and w = arctan(y / x) / dt
     (`shipped`) or atan2(y, x) / dt (`atan2`).
     """
     if abs(x_m) < EPS_M and abs(y_m) < EPS_M:
@@ -60,7 +60,7 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
     """Return the clipped command of a policy's answer.
 
     answer: a Command, or waypoints (N, 2) or (N, 4), of which one is followed (the result is a
-        Planned).
+        WaypointCommand).
     Raises PolicyError with the answer for NaN, infinities, too few waypoints, more than
     MAX_NUMBERS numbers, and anything else than real numbers.
     """
@@ -75,16 +75,16 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
         command = clipped(Command(*numbers), robot)
         if not isinstance(answer, WaypointCommand):
             return command
-        return _planned(command, _waypoints(answer.waypoints, rule.index), rule.index)
+        return _with_waypoints(command, _waypoints(answer.waypoints, rule.index), rule.index)
     waypoints = _waypoints(answer, rule.index)
     x, y, *turn = waypoints[rule.index].tolist()
     heading_rad = math.atan2(turn[1], turn[0]) if turn else None
     command = clipped(_command_for(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
     waypoints[:, :2] *= rule.unit_m
-    return _planned(command, waypoints, rule.index)
+    return _with_waypoints(command, waypoints, rule.index)
 
 
-def _planned(command: Command, waypoints: Floats, index: int) -> WaypointCommand:
+def _with_waypoints(command: Command, waypoints: Floats, index: int) -> WaypointCommand:
     """Return a command together with its waypoints in metres."""
     recorded = np.clip(waypoints[: max(_MAX_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
         np.float32

@@ -90,7 +90,7 @@ class Tracker:
         """Record the people before a tick, for velocities."""
         self._past.append(before.people)
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Forget all tracks: the robot was put elsewhere."""
         self._tracks.clear()
 
@@ -202,7 +202,7 @@ class InertialSensor:
         one, two = before.trunk, after.trunk
         self._motion = None if one is None or two is None else (one, two)
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Forget the motion: the robot was put elsewhere, at rest."""
         self._motion = None
 

@@ -227,25 +227,25 @@ class RunFolder:
 
         Raises RunError if the folder holds a run, MachineError if it cannot be written.
         """
-        refuse_used(path)
+        check_unused(path)
         return cls(path, spec, suite)
 
     @classmethod
-    def resume(cls, path: Path, spec: RunSpec, whole: Suite | None = None) -> RunFolder:
+    def resume(cls, path: Path, spec: RunSpec, suite: Suite | None = None) -> RunFolder:
         """Prepare to resume the run folder at `path`.
 
-        whole: suite that its scenarios are from
+        suite: suite from which the scenarios of `spec` were selected
 
         Raises RunError, naming the difference, if the folder holds another run.
         """
-        refuse_not_begun(path)
+        check_begun(path)
         found = read_spec(path)
         if found.policy == spec.policy and found.setup.policy_source != spec.setup.policy_source:
             raise RunError(
                 f"{path} is of another run: the source of policy '{spec.policy}' was edited since "
                 "it began. Resume with the source as it was, or choose another --out."
             )
-        if (difference := found.apart(spec, whole=whole)) is not None:
+        if (difference := found.difference_from(spec, suite=suite)) is not None:
             raise RunError(
                 f"{path} is of another run: its {difference.field} is "
                 f"{difference.mine}, now asked for is {difference.theirs}. "
@@ -259,7 +259,7 @@ class RunFolder:
             _acquire(self._lock, self.path)
         try:
             if self._suite is not None:
-                refuse_used(self.path)
+                check_unused(self.path)
                 self._begin(self._suite)
             self._open_database()
             self._remember()
@@ -526,7 +526,7 @@ def read_spec(path: Path) -> RunSpec:
             str(run.parent) for run in (*path.glob("*/run.json"), *path.parent.glob("*/run.json"))
         ]
         if path.is_dir():
-            refuse_not_begun(path)
+            check_begun(path)
             nearby = f"Runs in it and beside it: {listed(str(path), near)}"
             raise UsageError(f"{path} is no run folder: it holds no run.json. {nearby}") from None
         raise unknown("run", str(path), near) from None
@@ -541,7 +541,7 @@ def read_spec(path: Path) -> RunSpec:
         ) from error
 
 
-def refuse_not_begun(path: Path) -> None:
+def check_begun(path: Path) -> None:
     """Raise UsageError if a folder to be resumed is missing or was stopped before its run began."""
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= UNFINISHED
@@ -576,13 +576,13 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
         raise RunError(f"{path / DATABASE}: cannot be read: {error.strerror or error}") from error
 
 
-def refuse_in_use(path: Path) -> None:
+def check_not_in_use(path: Path) -> None:
     """Raise RunError, naming the process, while a run is writing to its folder."""
     if is_locked(path / "lock"):
         raise _in_use(path)
 
 
-def refuse_used(path: Path) -> None:
+def check_unused(path: Path) -> None:
     """Raise RunError if a folder holds a run, or files other than the start of one."""
     try:
         if (path / "run.json").exists():

@@ -170,7 +170,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     collecting: DemoOptions | None = None
 
     @classmethod
-    def asked(cls, config: RunConfig) -> EpisodeOptions:
+    def from_config(cls, config: RunConfig) -> EpisodeOptions:
         """Return the options that a run's config requests. Raises UsageError."""
         return cls(
             seed=config.seed,
@@ -203,7 +203,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
         if self.real_time and self.latency_ms:
             raise UsageError("real_time measures the latency of every answer: leave latency_ms out")
 
-    def scenario(self, scenario: Scenario) -> Scenario:
+    def apply_to(self, scenario: Scenario) -> Scenario:
         """Return a scenario with the robot and the weather of these options. Raises UsageError,
         SpecError."""
         return scenario.driven_by(self.robot).in_weather(self.weather)

@@ -89,8 +89,8 @@ class Scorer:
             if self._hashes:
                 self._recorder.add(step, verdict)
             return verdict
-        self._recorder.add(step, verdict, self._traffic.see(step))
-        self._monitor.see(step)
+        self._recorder.add(step, verdict, self._traffic.update(step))
+        self._monitor.update(step)
         self._failures += verdict.failures
         self._walked_into += verdict.walked_into
         if verdict.red_light_entry is not None:

@@ -79,7 +79,7 @@ class StagedScenario:
     entrances: arrivals and departures of the crowd.
     """
 
-    parts: EpisodeEngines
+    engines: EpisodeEngines
     robot: Robot
     renderer: str
     gait_hash: str
@@ -197,7 +197,7 @@ def staged(
             return waits_before(street_map, scenario.route_line, scenario.crossings, robot)
 
         yield StagedScenario(
-            parts=EpisodeEngines(world, crowd, directed, camera),
+            engines=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
             renderer=renderer,
             gait_hash="" if gait is None else gait.digest,

@@ -53,7 +53,7 @@ def walked(scenario: Scenario, robot: str, push_ns: float) -> RecordedEpisode:
 
     def push(step: Step, verdict: Verdict) -> None:
         if step.tick == PUSH_TICK and push_ns:
-            bodies = stages[0].parts.world._engine  # type: ignore[attr-defined]
+            bodies = stages[0].engines.world._engine  # type: ignore[attr-defined]
             heading = step.motion.robot.pose.heading_rad
             force = push_ns / 0.005 * np.array([-math.sin(heading), math.cos(heading), 0.0])
             (x, y, z), _ = p.getBasePositionAndOrientation(bodies._robot, bodies._client)

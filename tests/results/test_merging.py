@@ -48,7 +48,7 @@ def shards(folder: Path, of: int, **fields: object) -> list[Path]:
     them."""
     cut = [Shard(number, of) for number in range(1, of + 1)]
     return [
-        kept(folder / f"{one.number}", changed(SPEC, shard=one, **fields), one.share(WAYS))
+        kept(folder / f"{one.number}", changed(SPEC, shard=one, **fields), one.select(WAYS))
         for one in cut
     ]
 
@@ -172,7 +172,7 @@ def test_different_episodes_of_a_scenario_are_a_conflict(
         (
             "versions",
             {"numpy": "2", "arithmetic": "2e"},
-            "the processors or C libraries round differently",
+            "processors or C libraries of the two machines round differently",
         ),
     ],
     ids=["seed", "policy", "scenarios", "package", "arithmetic"],
@@ -229,17 +229,17 @@ def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
 def test_a_shard_that_is_none_is_refused(words: str) -> None:
     """In one line that says how it is written."""
     with pytest.raises(UsageError, match="give i/n, with i from 1 to n"):
-        Shard.called(words, 100)
+        Shard.parse(words, 100)
 
 
 def test_shards_share_out_every_scenario_once() -> None:
     """Whatever they are cut in; of more shards than scenarios some would be empty, which is
     refused."""
     for of in range(1, 8):
-        cut = [Shard.called(f"{number}/{of}", 7).share(range(7)) for number in range(1, of + 1)]
+        cut = [Shard.parse(f"{number}/{of}", 7).select(range(7)) for number in range(1, of + 1)]
         assert sorted(itertools.chain(*cut)) == list(range(7)) and all(cut)
     with pytest.raises(UsageError, match="the run has 7 scenarios"):
-        Shard.called("1/8", 7)
+        Shard.parse("1/8", 7)
 
 
 def test_a_shard_needs_the_seed_of_its_run(cosim: Cosim) -> None:

@@ -507,7 +507,7 @@ def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> 
     driver = load_policy(_DRIVER)
     surface = surface_of_place(scenario.place)
     robot_model = robot_called(scenario.robot)
-    scenario = options.scenario(scenario)
+    scenario = options.apply_to(scenario)
     if options.weather != CLEAR and surface.scan is not None:
         raise UsageError(
             f"--weather {options.weather}: scanned places are drawn in the light of their scan: "
