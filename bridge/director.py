@@ -131,15 +131,15 @@ class RemoteDirector:
         began = time.monotonic()
         if self._waiting is not None and self._wait_s > NOTICE_S:
             try:
-                return self._session.ask(self._key, payload, timeout_s=NOTICE_S)
+                return self._session.query(self._key, payload, timeout_s=NOTICE_S)
             except TimeoutError:
                 self._waiting(f"waits at tick {tick} for the director, {self._wait_s:g} s at most")
         try:
-            return self._session.ask(
+            return self._session.query(
                 self._key, payload, timeout_s=self._wait_s - (time.monotonic() - began)
             )
         except TimeoutError:
-            raise TimeoutError(f"nobody answered on '{self._key}' for {self._wait_s:g} s") from None
+            raise TimeoutError(f"no reply on '{self._key}' within {self._wait_s:g} s") from None
 
 
 def _check(reply: EventReply, query: EventQuery) -> None:

@@ -18,7 +18,7 @@ from bridge.session import Session
 from cosim.core.errors import EngineError, SpecError
 from cosim.spec.injection import POINT_FORMS, Ack, InjectionRequest
 
-LARGEST_B: Final = 64 * 1024
+MAX_MESSAGE_B: Final = 64 * 1024
 """Largest injection in bytes."""
 _MAX_SHOWN: Final = 60
 """Longest invalid value in an error message in characters."""
@@ -45,11 +45,11 @@ def serve_injections(session: Session, key: str, offer: Offer) -> None:
 
 def answer_injection(payload: bytes, offer: Offer) -> Ack:
     """Return the acknowledgement of a message."""
-    if len(payload) > LARGEST_B:
+    if len(payload) > MAX_MESSAGE_B:
         return Ack(
             id="",
             status="refused",
-            reason=f"{len(payload)} bytes: a message has at most {LARGEST_B}",
+            reason=f"{len(payload)} bytes: a message has at most {MAX_MESSAGE_B}",
         )
     try:
         return offer(_decoder(payload)(payload, type=InjectionRequest))
@@ -98,10 +98,10 @@ def send_injection(session: Session, key: str, injection: bytes, timeout_s: floa
 
     Raises SpecError if it is too long, EngineError on timeout or an invalid reply.
     """
-    if len(injection) > LARGEST_B:
-        raise SpecError(f"{len(injection)} bytes: an injection has at most {LARGEST_B}")
+    if len(injection) > MAX_MESSAGE_B:
+        raise SpecError(f"{len(injection)} bytes: an injection has at most {MAX_MESSAGE_B}")
     try:
-        return msgspec.json.decode(session.ask(key, injection, timeout_s=timeout_s), type=Ack)
+        return msgspec.json.decode(session.query(key, injection, timeout_s=timeout_s), type=Ack)
     except TimeoutError as error:
         raise EngineError(
             f"{error}: the episode has ended, or is too busy; what it did is in its log"

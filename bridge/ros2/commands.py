@@ -14,10 +14,10 @@ from bridge.ros2.types import NO_HASH, from_cdr
 from cosim.core.geometry import Floats
 from cosim.core.state import Command
 from cosim.spec.odometry import Odometry
-from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, TAKEN, Ros2Wait
+from cosim.spec.ros2 import CMD_VEL, COMMAND_TOPICS, MAX_MESSAGE_B, PLAN, Ros2Wait
 
-TWIST, TWIST_STAMPED = COMMAND_TYPES = TAKEN[CMD_VEL]
-(PATH,) = TAKEN[PLAN]
+TWIST, TWIST_STAMPED = COMMAND_TYPES = COMMAND_TOPICS[CMD_VEL]
+(PATH,) = COMMAND_TOPICS[PLAN]
 _TWIST_B: Final = 52
 """Size of a Twist in bytes, by which it is known where keys do not name the type."""
 _WALL_NS: Final = 10**18
@@ -44,7 +44,7 @@ class Fault(NamedTuple):
 class Received(NamedTuple):
     """A received message.
 
-    payload: Its bytes; empty if it is longer than `LARGEST_B`.
+    payload: Its bytes; empty if it is longer than `MAX_MESSAGE_B`.
     type, hash: From its key; "" if the key does not name them.
     sender: The gid of its publisher; empty if it is not known.
     by: Its publisher in words.
@@ -125,14 +125,14 @@ def fault_of_form(got: Received, topic: str, wanted_hash: str, *, attached: bool
     attached: Whether the dialect has attachments.
     """
     kind: FaultKind
-    if got.type and got.type not in TAKEN[topic]:
+    if got.type and got.type not in COMMAND_TOPICS[topic]:
         kind = "type"
-        words = f"publishes {topic} as {got.type}: publish {' or '.join(TAKEN[topic])}"
+        words = f"publishes {topic} as {got.type}: publish {' or '.join(COMMAND_TOPICS[topic])}"
     elif got.hash and got.hash != wanted_hash:
         kind, words = "hash", hash_fault(got.type, got.hash, wanted_hash)
-    elif got.size_b > LARGEST_B:
+    elif got.size_b > MAX_MESSAGE_B:
         kind = "size"
-        words = f"sends {got.size_b} bytes on {topic}: a message has at most {LARGEST_B}"
+        words = f"sends {got.size_b} bytes on {topic}: a message has at most {MAX_MESSAGE_B}"
     elif attached and not got.sender:
         kind = "attachment"
         words = f"sends {topic} without the attachment of rmw_zenoh: see --ros2-dialect"

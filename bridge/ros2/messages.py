@@ -25,7 +25,7 @@ from cosim.episode.interfaces import Observation
 from cosim.spec.camera import Calibration
 from cosim.spec.goal import Instruction, PointGoal
 from cosim.spec.odometry import Odometry
-from cosim.spec.ros2 import ORIGIN_S, SENT
+from cosim.spec.ros2 import ORIGIN_S, PUBLISHED_TOPICS
 from cosim.spec.sensors import Imu, Scan
 
 _NS: Final = 1_000_000_000
@@ -376,7 +376,7 @@ class Topic(NamedTuple):
     @property
     def type(self) -> str:
         """Type of its messages."""
-        return SENT[self.name]
+        return PUBLISHED_TOPICS[self.name]
 
 
 _LATCHED: Final = Qos(depth=1, latched=True)

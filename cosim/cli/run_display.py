@@ -102,7 +102,7 @@ class Terminal(EpisodeBars):
                 stack.enter_context(board.bars)
                 yield board.tell
         except KeyboardInterrupt:
-            self._print_how_to_continue(plan, len(run.held.finished()))
+            self._print_how_to_continue(plan, len(run.held.finished_ids()))
             raise typer.Exit(INTERRUPTED) from None
         self.figures = going.figures
 

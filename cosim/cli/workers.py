@@ -193,7 +193,9 @@ def status_command(
     connection = connecting("viewer", "--connect", str(connect), tls, insecure)
     with open_session(connection, notice) as session:
         _show_status(
-            lambda: _status_of_answers(session.answers(keys.EVERY_RUN, timeout_s=5.0), str(connect))
+            lambda: _status_of_answers(
+                session.query_all(keys.EVERY_RUN, timeout_s=5.0), str(connect)
+            )
         )
 
 

@@ -42,9 +42,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DATABASE = "results.sqlite"
-REMEDY = (
-    "give the command of the run again with --resume, which makes it anew from the records on disk"
-)
+REMEDY = "give the command of the run again with --resume, which builds it from the records on disk"
+"""Remedy for a missing or damaged database."""
 _DAMAGE_CODES = {
     sqlite3.SQLITE_ERROR,
     sqlite3.SQLITE_CORRUPT,
@@ -150,7 +149,7 @@ def damage_of_episode(path: Path, scenario_id: str, row: Record | None = None) -
     """
     file = record_file(path, scenario_id)
     if row is not None and row.ended is None and not file.exists():
-        return ""  # given up: an episode without files
+        return ""  # an episode without files, whose attempts all failed
     try:
         record = Record.load(file)
         if record.scenario.id != scenario_id:
@@ -191,13 +190,16 @@ def record_difference(mine: Record, theirs: Record) -> str:
 
 _ATTEMPTS = "attempts.jsonl"
 _MAX_BYTES = 256 << 20
-_ROOM_REMEDY = "finished episodes are kept; make room and go on with --resume"
+_ROOM_REMEDY = "finished episodes are safe: make room, and continue with --resume"
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """Files that a run leaves if it was killed before it began."""
 
 
 class FailedAttempt(NamedTuple):
-    """Failed attempt at a scenario. away: its worker left, or its machine was lost."""
+    """Failed attempt at a scenario.
+
+    away: whether its worker left, or its machine was lost
+    """
 
     scenario: str
     away: bool
@@ -216,10 +218,10 @@ class RunFolder:
         self.notes: list[str] = []
         self._suite = suite
         self._lock = lock(path / "lock", wait=False)
-        self._add_connection: sqlite3.Connection | None = None
+        self._connection: sqlite3.Connection | None = None
         self._guard: FolderGuard | None = None
         self._rows: dict[str, bytes] = {}
-        self._begun: dict[str, bytes] = {}
+        self._start_files: dict[str, bytes] = {}
 
     @classmethod
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
@@ -248,7 +250,7 @@ class RunFolder:
         if (difference := found.difference_from(spec, suite=suite)) is not None:
             raise RunError(
                 f"{path} is of another run: its {difference.field} is "
-                f"{difference.mine}, now asked for is {difference.theirs}. "
+                f"{difference.mine}, and this command has {difference.theirs}. "
                 f"Resume with the same command, or choose another --out.{difference.hint}"
             )
         return cls(path, found)
@@ -262,7 +264,7 @@ class RunFolder:
                 check_unused(self.path)
                 self._begin(self._suite)
             self._open_database()
-            self._remember()
+            self._note_files()
         except BaseException:
             self._lock.release()
             raise
@@ -274,9 +276,9 @@ class RunFolder:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._add_connection is not None:
-            self._add_connection.close()
-            self._add_connection = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
         if self._guard is not None:
             self._guard.close()
             self._guard = None
@@ -286,12 +288,12 @@ class RunFolder:
         """Return the folder of an episode."""
         return self.path / "episodes" / scenario_id
 
-    def finished(self) -> set[str]:
+    def finished_ids(self) -> set[str]:
         """Return ids of the scenarios with a row."""
         with _database_errors(self.path), closing(connect_database(self.path)) as database:
             return {scenario for (scenario,) in database.execute("select scenario from episodes")}
 
-    def add(self, record: Record) -> None:
+    def add_row(self, record: Record) -> None:
         """Append the row of a finished episode; a second one of the same scenario is ignored.
 
         A database that was damaged during the run is written again.
@@ -300,9 +302,9 @@ class RunFolder:
         self._rows.setdefault(record.scenario.id, row)
         values = record.scenario.id, row.decode()
         try:
-            if self._add_connection is None:  # reused: opening takes longer than adding
-                self._add_connection = connect_database(self.path)
-            with self._add_connection as database:
+            if self._connection is None:  # reused: opening takes longer than adding
+                self._connection = connect_database(self.path)
+            with self._connection as database:
                 database.execute(
                     "insert or ignore into episodes (scenario, record) values (?, ?)", values
                 )
@@ -311,7 +313,7 @@ class RunFolder:
                 raise database_error(self.path, error) from error
             self._replace_database(self.path / DATABASE)
 
-    def _remove(self, scenarios: Sequence[str]) -> None:
+    def _remove_rows(self, scenarios: Sequence[str]) -> None:
         """Delete the rows of episodes that will run again."""
         with (
             _database_errors(self.path),
@@ -322,7 +324,7 @@ class RunFolder:
                 "delete from episodes where scenario = ?", [(name,) for name in scenarios]
             )
 
-    def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
+    def write_episode(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
         """Write the files of an episode, the record last, and add its row.
 
         log: bytes of the `Log`
@@ -335,7 +337,7 @@ class RunFolder:
                 if data:
                     write_atomic(target / name, data)
             record.save(target / "record.json")
-        self.add(record)
+        self.add_row(record)
 
     def write_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
         """Write a camera frame of an episode."""
@@ -366,13 +368,13 @@ class RunFolder:
         with _write_errors(path, _ROOM_REMEDY), path.open("ab") as file:
             file.write(msgspec.json.encode(attempt) + b"\n")
 
-    def _is_whole(self, scenario_id: str, row: Record | None = None) -> bool:
+    def _is_valid(self, scenario_id: str, row: Record | None = None) -> bool:
         """Return whether the files of an episode are valid; note any damage."""
         if damage := damage_of_episode(self.path, scenario_id, row):
             self.notes.append(f"{damage}. This episode is run again.")
         return not damage
 
-    def forget(self, scenario_id: str) -> None:
+    def delete_episode(self, scenario_id: str) -> None:
         """Delete the files of an earlier attempt at a scenario."""
         folder = self.episode_folder(scenario_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
@@ -388,7 +390,7 @@ class RunFolder:
 
         table = table_of(self.restore())
         path = self.path / "results.csv"
-        with _write_errors(path, "all episodes are kept; make room and add --resume"):
+        with _write_errors(path, "all episodes are safe: make room and add --resume"):
             write_atomic(path, table.to_csv(index=False).encode())
         return table
 
@@ -404,15 +406,15 @@ class RunFolder:
                 return
             for folder in (self.path / "episodes", self.path / "logs"):
                 folder.mkdir(exist_ok=True)
-            for name, data in self._begun.items():
+            for name, data in self._start_files.items():
                 write_atomic(self.path / name, data)
             self._replace_database(database)
 
     def _replace_database(self, database: Path) -> None:
         """Write the database again from the rows of this process."""
-        if self._add_connection is not None:
-            self._add_connection.close()
-            self._add_connection = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
         for end in ("", "-wal", "-shm"):
             database.with_name(DATABASE + end).unlink(missing_ok=True)
         with _database_errors(self.path):
@@ -423,11 +425,11 @@ class RunFolder:
                     [(name, row.decode()) for name, row in self._rows.items()],
                 )
 
-    def _remember(self) -> None:
-        """Note what `mend` restores."""
+    def _note_files(self) -> None:
+        """Read what `mend` restores: the folder, its spec, its scenarios and its rows."""
         self._guard = FolderGuard(self.path)
         for name in ("scenarios.json", "run.json"):
-            self._begun[name] = (self.path / name).read_bytes()
+            self._start_files[name] = (self.path / name).read_bytes()
         for record in read_records(self.path):
             self._rows.setdefault(record.scenario.id, RECORD_FILE.encode(record))
 
@@ -478,20 +480,22 @@ class RunFolder:
             database.replace(database.with_name(DATABASE + ".damaged"))
             check_database(self.path)
         rows = [] if self._suite is not None else read_records(self.path)
-        if invalid := [row.scenario.id for row in rows if not self._is_whole(row.scenario.id, row)]:
-            self._remove(invalid)
+        if invalid := [row.scenario.id for row in rows if not self._is_valid(row.scenario.id, row)]:
+            self._remove_rows(invalid)
         on_disk = {
             p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")
         }
-        without_row = set(self.spec.scenarios) & on_disk.keys() - self.finished() - {*invalid}
+        without_row = set(self.spec.scenarios) & on_disk.keys() - self.finished_ids() - {*invalid}
         restored = [
-            name for name in sorted(without_row, key=on_disk.__getitem__) if self._is_whole(name)
+            name for name in sorted(without_row, key=on_disk.__getitem__) if self._is_valid(name)
         ]
         for name in restored:
-            self.add(Record.load(self.episode_folder(name) / "record.json"))
+            self.add_row(Record.load(self.episode_folder(name) / "record.json"))
         if damage:
-            repair = f"made anew from {len(restored)} records on disk, kept as {DATABASE}.damaged"
-            self.notes.append(f"{database} was damaged ({damage}): {repair}")
+            repair = f"it was built again from {len(restored)} records on disk"
+            self.notes.append(
+                f"{database} was damaged ({damage}): {repair}; the old file is {DATABASE}.damaged"
+            )
 
 
 @contextmanager
@@ -527,7 +531,7 @@ def read_spec(path: Path) -> RunSpec:
         ]
         if path.is_dir():
             check_begun(path)
-            nearby = f"Runs in it and beside it: {listed(str(path), near)}"
+            nearby = f"Runs in it and next to it: {listed(str(path), near)}"
             raise UsageError(f"{path} is no run folder: it holds no run.json. {nearby}") from None
         raise unknown("run", str(path), near) from None
     except NotADirectoryError:
@@ -547,7 +551,7 @@ def check_begun(path: Path) -> None:
         path.is_dir() and {entry.name for entry in path.iterdir()} <= UNFINISHED
     ):
         raise UsageError(
-            f"{path}: no run has begun there, so that nothing is kept: give the command of "
+            f"{path}: no run has begun there, so there is nothing to resume: give the command of "
             f"the run without --resume"
         )
 

@@ -100,7 +100,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         if self.guests == ("ros2",):
             return f"whoever can reach {self.listen} may see the sensors and drive the robot"
         may = {
-            "coordinator": "watch, inject pedestrians, take episodes and tell their results, and "
+            "coordinator": "watch, inject pedestrians, take episodes and report their results, and "
             "answer as a policy",
             "director": "ask it",
             "policy": "ask it and see what it answers to",

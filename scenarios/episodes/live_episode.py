@@ -116,7 +116,7 @@ class LiveEpisode:
         if news:
             topics["events"] = news
         for topic, content in topics.items():
-            self._session.tell(f"{self._prefix}/{topic}", msgspec.json.encode(content))
+            self._session.publish_lossy(f"{self._prefix}/{topic}", msgspec.json.encode(content))
 
     def _status(self) -> bytes:
         tick = -1 if self._step is None else self._step.tick

@@ -136,7 +136,7 @@ def held_run(plan: PlannedRun, folder: Path) -> Iterator[HeldRun]:
         patience=plan.patience,
     )
     with held:
-        done = held.finished()
+        done = held.finished_ids()
         yield HeldRun(held, hello, plan.picked, [one for one in plan.picked if one.id not in done])
 
 

@@ -10,7 +10,7 @@ import msgspec
 
 from bridge.policy_server import ActRequest, EndRequest, PackedArray, ResetRequest, pack_array
 from cosim.core.errors import UsageError
-from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer, when
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer, call_in_words
 from cosim.policies.load import REMOTE_SCHEME, load_policy
 from cosim.policies.user_module import importable_name
 from cosim.spec.connection import Connection
@@ -113,7 +113,7 @@ class _RendererCarrier:
 
     def ask(self, question: ResetRequest | ActRequest) -> bytes:
         if isinstance(question, ActRequest):
-            return self._linked().exchange(question, when("act", question.tick))
+            return self._linked().exchange(question, call_in_words("act", question.tick))
         self._link = link_to(self._address)
         return self._link.exchange(question, "reset")
 

@@ -210,7 +210,7 @@ def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> Non
         run = cosim(*words, "--director-wait", "5", cwd=tmp_path)
     lost = recorded(tmp_path, "t-1")
     assert run.returncode == 1 and lost["status"] == "invalid"
-    assert "nobody answered on 'cosim/run/env/t-1/director' for 5 s" in lost["reason"]
+    assert "no reply on 'cosim/run/env/t-1/director' within 5 s" in lost["reason"]
     assert "t-1: waits at tick" in run.stderr and "5 s at most" in run.stderr
 
 

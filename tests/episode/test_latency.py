@@ -236,7 +236,7 @@ def test_a_measured_latency_is_that_of_every_command_of_the_run(
     other = cosim(*words, "--resume", cwd=tmp_path)
     assert (
         other.returncode == 2
-        and f"its latency_ms is {latency_ms}, now asked for is 0.0" in other.stderr
+        and f"its latency_ms is {latency_ms}, and this command has 0.0" in other.stderr
     )
 
 

@@ -187,7 +187,7 @@ def test_a_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
         graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
         for k in range(5):
             given = 3.0 * normal(k, inputs)
-            expected = graph.ask({"obs": given[None]}, ["actions"])["actions"][0]
+            expected = graph.run({"obs": given[None]}, ["actions"])["actions"][0]
             assert network.answer(given, ())[0] == pytest.approx(expected, abs=1e-5)
 
 
@@ -226,7 +226,7 @@ def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
     held = {"h_in": np.zeros((1, 1, 8), np.float32), "c_in": np.zeros((1, 1, 8), np.float32)}
     for k in range(6):
         given = 3.0 * normal(10 + k, 5)
-        found = graph.ask({"obs": given[None], **held}, ["actions", "h_out", "c_out"])
+        found = graph.run({"obs": given[None], **held}, ["actions", "h_out", "c_out"])
         held = {"h_in": found["h_out"], "c_in": found["c_out"]}
         answer, state = network.answer(given, state)
         assert answer == pytest.approx(found["actions"][0], abs=1e-5)

@@ -294,7 +294,7 @@ def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
     with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
         for record in read_records(run):
             other = fields if of in ("", record.scenario.id) else {}
-            folder.keep(
+            folder.write_episode(
                 changed(record, **other),
                 (run / f"episodes/{record.scenario.id}/trajectory.npz").read_bytes(),
             )
@@ -497,7 +497,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "no run": (
         lambda run: (run / "run.json").unlink(),
-        "{run} is no run folder: it holds no run.json. Runs in it and beside it: {first}",
+        "{run} is no run folder: it holds no run.json. Runs in it and next to it: {first}",
     ),
     "a damaged database": (
         lambda run: (run / "results.sqlite").write_bytes(b"nothing" * 500),

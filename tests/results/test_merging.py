@@ -39,7 +39,7 @@ def kept(path: Path, spec: RunSpec, ways: Sequence[Scenario], wall_s: float = 1.
         for way in reversed(ways):
             record, log = episode_of(way, SUITE.content_hash, HOWS[way.id])
             record = msgspec.structs.replace(record, clock={"wall_s": wall_s})
-            folder.keep(record, log.encoded() if log is not None else b"")
+            folder.write_episode(record, log.encoded() if log is not None else b"")
     return path
 
 
@@ -120,7 +120,7 @@ def test_what_is_missing_is_named_and_can_be_run(tmp_path: Path, cosim: Cosim) -
     )
     assert not (tmp_path / "merged/results.csv").exists()
     with RunFolder.resume(tmp_path / "merged", SPEC) as folder:
-        assert folder.finished() == set(SPEC.scenarios) - {"s-001", "s-004"}
+        assert folder.finished_ids() == set(SPEC.scenarios) - {"s-001", "s-004"}
 
 
 def test_equal_episodes_are_taken_once(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_different_episodes_of_a_scenario_are_a_conflict(
             record = msgspec.structs.replace(record, state_hash="f00")
         else:
             log.pose[0, 2] += 1e-16
-        folder.keep(record, log.encoded())
+        folder.write_episode(record, log.encoded())
     said = cosim("merge", *map(str, parts), str(other), "--out", str(tmp_path / "merged"))
     assert said.returncode == 2 and not (tmp_path / "merged").exists()
     assert f"CONFLICT: {other} and {parts[0]} have different episodes of 's-002'" in said.stderr
@@ -217,9 +217,9 @@ def test_what_is_damaged_in_use_or_in_the_way_is_refused(tmp_path: Path) -> None
 def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
     """Another one, or the whole run, is refused: the shards are named as they are asked for."""
     (first, _) = shards(tmp_path, 2)
-    with pytest.raises(RunError, match="its shard is 1/2, now asked for is 2/2"):
+    with pytest.raises(RunError, match="its shard is 1/2, and this command has 2/2"):
         RunFolder.resume(first, msgspec.structs.replace(SPEC, shard=Shard(2, 2)))
-    with pytest.raises(RunError, match="its shard is 1/2, now asked for is None"):
+    with pytest.raises(RunError, match="its shard is 1/2, and this command has None"):
         RunFolder.resume(first, SPEC)
 
 

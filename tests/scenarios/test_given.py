@@ -147,8 +147,8 @@ def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
     spec = read_spec(tmp_path / "run")
     assert (spec.manifest.goal, spec.manifest.odometry) == ("route_point", "gps")
     for goal, named in (
-        ("final_point", "now asked for is final_point"),
-        (None, "now asked for is none"),
+        ("final_point", "and this command has final_point"),
+        (None, "and this command has none"),
     ):
         other = EpisodeOptions(seed=2, goal=goal)  # type: ignore[arg-type]
         with pytest.raises(

@@ -77,7 +77,7 @@ def test_a_run_resumed_with_another_selection_names_the_options(
     assert str(caught.value) == (
         f"{tmp_path / 'run'} is of another run: its choice of scenarios is 60 of 1700 "
         f"(--event frontal --episodes 30), "
-        "now asked for is 1700 of 1700 (all). Resume with the same command, or choose another --out."
+        "and this command has 1700 of 1700 (all). Resume with the same command, or choose another --out."
     )
     difference = spec(some).difference_from(spec(every))
     assert difference is not None and (difference.mine, difference.theirs) == (

@@ -70,7 +70,7 @@ def _answer_in_grey(
     name, shape = given
     wanted, sides = output
     try:
-        answer = graph.ask({name: np.full(shape, 0.5, np.float32)}, [wanted])[wanted]
+        answer = graph.run({name: np.full(shape, 0.5, np.float32)}, [wanted])[wanted]
     except Exception as error:
         raise UsageError(
             f"{graph.path}: cannot be run by onnxruntime: {runtime_message(error)}"

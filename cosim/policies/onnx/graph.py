@@ -74,7 +74,7 @@ class RunnableGraph(Protocol):
     inputs: Mapping[str, TensorPort]
     outputs: Mapping[str, TensorPort]
 
-    def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    def run(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
         """Run the graph and return the named outputs. Errors of the runtime are passed on."""
 
 
@@ -118,7 +118,7 @@ class Graph:
         shape = tuple(side if isinstance(side, int) and side >= 0 else None for side in sides)
         return TensorPort(name, np.dtype(_TYPES[kind]), shape)
 
-    def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    def run(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
         """Run the graph and return the named outputs. Errors of the runtime are passed on."""
         return dict(zip(names, self._session.run(list(names), dict(tensors)), strict=True))
 

@@ -178,10 +178,10 @@ class OnnxPolicy:
         """Run the graph on one observation, or on a batch."""
         inputs = [memory.feeder.feed(one) for memory, one in zip(memories, seen, strict=True)]
         if len(inputs) == 1:
-            outputs = [graph.ask(inputs[0], self._names)]
+            outputs = [graph.run(inputs[0], self._names)]
         else:
             batch = {name: np.concatenate([one[name] for one in inputs]) for name in inputs[0]}
-            together = graph.ask(batch, self._names)
+            together = graph.run(batch, self._names)
             outputs = [
                 {name: array[i : i + 1] for name, array in together.items()}
                 for i in range(len(inputs))
@@ -227,7 +227,7 @@ class OnnxPolicy:
             for _ in range(2):
                 answer = self._answers(graph, [self._memory], [seen])[0]
                 command_of(answer, rule=self.manifest.waypoints, robot=seen.robot)
-            outputs = graph.ask(self._memory.feeder.feed(seen), self._names)
+            outputs = graph.run(self._memory.feeder.feed(seen), self._names)
             return b"".join(outputs[name].tobytes() for name in self._names)
         except UsageError:
             raise
@@ -330,7 +330,7 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
             )
     try:
         with policy.open_graph() as graph:
-            found = graph.ask({name: held[name] for name in graph.inputs}, list(graph.outputs))
+            found = graph.run({name: held[name] for name in graph.inputs}, list(graph.outputs))
     except UsageError:
         raise
     except Exception as error:

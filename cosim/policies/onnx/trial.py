@@ -92,7 +92,7 @@ class TrialGraph:
     def __exit__(self, *_: object) -> None:
         self._child.close()
 
-    def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    def run(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
         """Run the graph and return the named outputs.
 
         Raises RuntimeError with the runtime's message.
@@ -144,7 +144,7 @@ def _serve(path: Path, wire: MessageSocket) -> None:
     while True:
         request = msgspec.msgpack.decode(wire.receive(), type=_Request)
         try:
-            outputs = graph.ask(
+            outputs = graph.run(
                 {name: _unpacked(one) for name, one in request.tensors.items()}, request.names
             )
             if (size := sum(array.nbytes for array in outputs.values())) > _MAX_ANSWER_BYTES:

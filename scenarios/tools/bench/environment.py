@@ -209,7 +209,7 @@ def _bare_query_ms() -> float:
         for _ in range(_QUERIES):
             between += 1.0
             began = time.perf_counter()
-            session.ask("bench", b"", timeout_s=_PATIENCE_S)
+            session.query("bench", b"", timeout_s=_PATIENCE_S)
             found.append(time.perf_counter() - began)
     return 1000.0 * statistics.median(found)
 

@@ -175,7 +175,7 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         with open_session(
             Connection(role="worker", connect=at, tls=str(made / "worker"))
         ) as worker:
-            assert worker.ask("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
+            assert worker.query("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
         monkeypatch.setattr(
             settings, "CONNECTS_WITHIN_S", 0.1
         )  # what is refused is so however long it is tried
