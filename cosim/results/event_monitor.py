@@ -62,7 +62,7 @@ class EventMonitor:
 
     kinds: table of event kinds
     robot: the robot that carries the camera
-    hidden: occlusion test at the end of the current step
+    occluded: occlusion test at the end of the current step
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class EventMonitor:
         scenario: Scenario,
         kinds: EventKinds,
         robot: Robot,
-        hidden: OcclusionTest,
+        occluded: OcclusionTest,
         tick_ms: int,
     ) -> None:
         self._events = scenario.events
         self._mount = STANDARD_CAMERA.on(robot)
-        self._hidden = hidden
+        self._occluded = occluded
         self._passed_round = [kinds[event.kind].passed_as_group for event in scenario.events]
         self._tick_ms = tick_ms
         self._go_on_mps = scenario.go_on_mps
@@ -151,7 +151,7 @@ class EventMonitor:
             points = body_points(eye, xy, height_m)
             inside = points[in_picture(robot.pose, self._mount, STANDARD_CAMERA, points - eye)]
             least = _VISIBLE_SHARE * len(points)
-            if len(inside) >= least and (~self._hidden(eye, inside)).sum() >= least:
+            if len(inside) >= least and (~self._occluded(eye, inside)).sum() >= least:
                 return True
         return False
 

@@ -203,7 +203,7 @@ def staged(
             gait_hash="" if gait is None else gait.digest,
             scan=_look_of(street, renderer, options) if camera is not None or cameras else None,
             scorer=Scorer(
-                scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock
+                scenario, kinds, street_map, WalkableArea(walkable), robot, world.occluded, clock
             ),
             observer=Observer(
                 scenario,

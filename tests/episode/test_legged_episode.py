@@ -105,7 +105,7 @@ def test_a_body_that_flies_makes_the_episode_invalid_with_the_engines_values(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where every height counts as flying, the row says so; it is no failure of the policy."""
-    monkeypatch.setattr("physics.dynamics.legs.watch._FLIES_M", -1.0)
+    monkeypatch.setattr("physics.dynamics.legs.leg_monitor._FLIES_M", -1.0)
     suite = Suite(name="one", version="1", scenarios=(scenario,))
     options = EpisodeOptions(seed=0, robot=LEGGED[0])
     (row,) = cosim.run(suite, Straight(), options=options).to_dict("records")

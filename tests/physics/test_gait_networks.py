@@ -34,7 +34,7 @@ from cosim.policies.onnx.manifest import file_facts
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.policies.onnx.weights import NetworkFile
 from cosim.spec.robot import COURIER, DOG, WALKER, Legs
-from physics.dynamics.drive import SUBSTEP_S, BodyNow
+from physics.dynamics.drive import SUBSTEP_S, MeasuredBody
 from physics.dynamics.drives import drive_of, gait_drive
 from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
@@ -401,13 +401,13 @@ def test_speeds_of_a_gait_are_averaged_over_its_own_cycle(tmp_path: Path) -> Non
             assert world._watch is not None and world._watch._count == round(cycle_s / SUBSTEP_S)
 
 
-def still_body(**changes: Any) -> BodyNow:
+def still_body(**changes: Any) -> MeasuredBody:
     """A dog at rest."""
     assert isinstance(DOG.drive, Legs)
     rest = DOG.drive.rest_rad
     level = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     zero = (0.0, 0.0, 0.0)
-    return BodyNow(zero, level, zero, zero, rest, (0.0,) * 12)._replace(**changes)
+    return MeasuredBody(zero, level, zero, zero, rest, (0.0,) * 12)._replace(**changes)
 
 
 def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy(
@@ -439,7 +439,7 @@ class Fixed:
     def reset(self) -> None:
         pass
 
-    def step(self, command: Command, body: BodyNow) -> list[float]:
+    def step(self, command: Command, body: MeasuredBody) -> list[float]:
         return self._torques_nm
 
 

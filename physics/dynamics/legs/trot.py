@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
-from physics.dynamics.drive import BodyNow, towards
+from physics.dynamics.drive import MeasuredBody, towards
 from physics.dynamics.legs.pd import torques_nm
 from physics.robots.dog import HIP_AHEAD_M, HIP_ASIDE_M, SEGMENT_M, THIGH_ASIDE_M
 
@@ -121,11 +121,11 @@ class Trot:
         self._swings = 0
         self._left_steps = 0
 
-    def step(self, command: Command, body: BodyNow) -> Sequence[float]:
+    def step(self, command: Command, body: MeasuredBody) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
         return torques_nm(self._legs.kp, self._legs.kd, self.targets(command, body), body)
 
-    def targets(self, command: Command, body: BodyNow) -> Sequence[float]:
+    def targets(self, command: Command, body: MeasuredBody) -> Sequence[float]:
         """Return the 12 target angles for the next substep."""
         gains, dt_s = self._gains, self._dt_s
         m, (vx, vy, vz), spin = body.rotation, body.velocity_mps, body.spin_radps
