@@ -126,7 +126,9 @@ class RemoteDirector:
         """
         try:
             reply = decode_versioned(
-                self._query(encode_query(query, self._version), query.tick), EventReply, self._version
+                self._query(encode_query(query, self._version), query.tick),
+                EventReply,
+                self._version,
             )
             _check(reply, query)
         except (TimeoutError, EngineError) as error:

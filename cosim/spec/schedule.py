@@ -93,19 +93,19 @@ class Schedule(Ranged, frozen=True, kw_only=True):
     goal: ScheduleGoal = "none"
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return f"schedule '{self.name}': "
 
     def contradictions(self) -> Iterator[str]:
         if len(self.name) > 80:
-            yield f"{self.called}name must have at most 80 characters"
+            yield f"{self.prefix}name must have at most 80 characters"
         if self.goal == "final_point":
             return
         for kind, parts in (("stops", self.stops), ("lanes", self.lanes), ("speeds", self.speeds)):
             for number, part in enumerate(parts):
                 if part.by in GOAL_POSITIONS:
                     yield (
-                        f"{self.called}{kind}[{number}] is placed by '{part.by}', which needs "
+                        f"{self.prefix}{kind}[{number}] is placed by '{part.by}', which needs "
                         f'"goal": "final_point", not "{self.goal}"'
                     )
 

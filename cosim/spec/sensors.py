@@ -88,7 +88,7 @@ class ScanSpec(Ranged, frozen=True, dict=True):
     noise_m: Annotated[float, Within(0, 1)] = 0.02
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "scan "
 
     def contradictions(self) -> Iterator[str]:

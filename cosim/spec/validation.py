@@ -137,10 +137,10 @@ class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         refusals = (
             field_error(field, rule, getattr(self, field)) for field, rule in rules_of(type(self))
         )
-        return [self.called + refusal for refusal in refusals if refusal]
+        return [self.prefix + refusal for refusal in refusals if refusal]
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         """Prefix of field names in messages."""
         return f"{type(self).__name__.lower()} "
 

@@ -164,7 +164,7 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
     output: GraphOutput
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return ""
 
     @property

@@ -29,7 +29,7 @@ class GaitPart(Ranged, frozen=True, kw_only=True):
     """Part of a manifest; messages name its place in the file."""
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return ""
 
 
