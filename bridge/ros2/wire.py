@@ -31,7 +31,7 @@ class Qos(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Return its text in a token; defaults stay empty.
+        """Text in a token; defaults are empty.
 
         >>> Qos().text, Qos(depth=1, latched=True).text
         ('::,10:,:,:,,', ':1:,1:,:,:,,')
@@ -62,7 +62,7 @@ class Endpoint(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        """Return its node for messages, as "/robot/driver" or "a node of session 1a2b"."""
+        """Node for messages, as "/robot/driver" or "a node of session 1a2b"."""
         if not self.node:
             return f"a node of session {self.session[:8]}"
         return f"{self.namespace.rstrip('/')}/{self.node}"
@@ -245,7 +245,7 @@ class Attachment(NamedTuple):
 
     @property
     def data(self) -> bytes:
-        """Return its 33 bytes.
+        """The 33 bytes of the attachment.
 
         >>> Attachment(1, 0, bytes(16)).data[16]
         16

@@ -176,7 +176,7 @@ class DemoConfig:
 
     @property
     def collecting(self) -> DemoOptions:
-        """Return the settings of the recorded data. Raises UsageError, SpecError."""
+        """Settings of the recorded data. Raises UsageError, SpecError."""
         from cosim.spec.camera import CameraSpec
         from cosim.spec.demo_options import DemoOptions
         from cosim.spec.sensors import ScanSpec, imu_called, people_called

@@ -21,7 +21,7 @@ class FolderGuard:
 
     @property
     def _opened(self) -> Path:
-        """Return a link to the folder, wherever it is."""
+        """Path of the open folder, wherever it is now."""
         return Path(f"/proc/self/fd/{self._descriptor}")
 
     def close(self) -> None:

@@ -48,19 +48,19 @@ class Estimate(NamedTuple):
 
     @property
     def has_interval(self) -> bool:
-        """Return whether there is an interval."""
+        """Whether there is an interval."""
         return not math.isnan(self.low)
 
     @property
     def counts(self) -> str:
-        """Return the counts of a share or rate as text; "" for other means and without a value."""
+        """Counts of a share or rate as text; "" for other means and without a value."""
         if not self.n or math.isnan(self.counted):
             return ""
         return counts_in_words(self.counted, self.n, self.metres)
 
     @property
     def in_words(self) -> str:
-        """Return the mean with two decimals, or the counts below MIN_N; "-" without a value.
+        """Mean with two decimals, or the counts below MIN_N; "-" without a value.
 
         >>> Estimate(0.75, 0.41, 0.93, 12, counted=9.0).in_words
         '0.75'

@@ -101,17 +101,17 @@ class Tick:
 
     @property
     def robot(self) -> RobotState:
-        """Return the robot at the end of the tick."""
+        """Robot at the end of the tick."""
         return self.step.motion.robot
 
     @cached_property
     def near(self) -> Nearness:
-        """Return the proximity of people at the end of the tick."""
+        """Proximity of people at the end of the tick."""
         return nearness(self.robot, self.step.street_after.people, self.footprint_m)
 
     @property
     def travelled_m(self) -> float:
-        """Return the distance driven in this tick on wheels, metres."""
+        """Distance driven in this tick on wheels, metres."""
         track = np.concatenate([[self.step.robot.pose[:2]], self.step.motion.trace[:, :2]])
         way = track[1:] - track[:-1]
         return float(np.hypot(way[:, 0], way[:, 1]).sum())
@@ -264,7 +264,7 @@ class Log:
 
     @property
     def on_legs(self) -> bool:
-        """Return whether the robot has legs."""
+        """Whether the robot has legs."""
         return self.legs.shape[1:] > (0,)
 
     def robot(self, tick: int) -> RobotState:

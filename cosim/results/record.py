@@ -196,7 +196,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def answer_ms(self) -> float | None:
-        """Return the median measured answer time of the policy in real time; else None."""
+        """Median measured answer time of the policy in real time; else None."""
         return self.clock.get("answer_ms") if self.setup.real_time else None
 
     def save(self, path: Path) -> None:

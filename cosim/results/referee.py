@@ -389,7 +389,7 @@ class Referee:
 
     @property
     def _last_m(self) -> float:
-        """Return the largest arc length, metres, of a reset before the goal."""
+        """Largest arc length, metres, of a reset before the goal."""
         return max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
 
     def _reset_after_push(self, fall: Failure, step: Step) -> Reset:

@@ -103,7 +103,7 @@ class BulletWorld:
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Return length and width of the robot in metres."""
+        """Length and width of the robot in metres."""
         return self.robot.footprint_m
 
     def __enter__(self) -> Self:

@@ -126,7 +126,7 @@ class Tube:
 
     @property
     def corners(self) -> Floats:
-        """Return (V, 3) approximate positions of the corners without turning."""
+        """Approximate positions of the corners without turning, (V, 3)."""
         return np.asarray(
             self.middle + self.ring[:, 2:3] * self.ahead + self.ring[:, 3:4] * self.side
         )

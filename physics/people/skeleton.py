@@ -91,7 +91,7 @@ class Skeleton:
 
     @property
     def offsets_m(self) -> Floats:
-        """Return (24, 3) offsets of joints from their parents, and of the pelvis from the
+        """Offsets (24, 3) of joints from their parents, and of the pelvis from the
         ground.
         """
         rest = self.rest_m

@@ -301,17 +301,17 @@ class Prop:
 
     @property
     def size_m(self) -> Size:
-        """Return length, depth and height."""
+        """Length, depth and height."""
         return KINDS[self.kind].size_m(self.variant)
 
     @property
     def form(self) -> tuple[str, int, int]:
-        """Return the arguments of `parts_of`; props with equal forms share meshes."""
+        """Arguments of `parts_of`; props with equal forms share meshes."""
         return self.kind, self.variant, self.paint if KINDS[self.kind].grown else 0
 
     @property
     def drawn_heading_rad(self) -> float:
-        """Return the heading of the drawn parts."""
+        """Heading of the drawn parts."""
         return self.heading_rad + self.turned_rad
 
 

@@ -69,12 +69,12 @@ class ReportedRun:
 
     @property
     def records(self) -> tuple[Record, ...]:
-        """Return the records, sorted by scenario."""
+        """Records, sorted by scenario."""
         return tuple(self.whole.records.values())
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Return one row per episode, see the class."""
+        """One row per episode, see the class."""
         table = table_of(self.records)
         of = [self.scenarios[name] for name in table["scenario"]]
         return table.assign(

@@ -144,7 +144,7 @@ class Views(NamedTuple):
 
     @property
     def tiles(self) -> tuple[int, int]:
-        """Return columns and rows of tiles of a picture."""
+        """Columns and rows of tiles of a picture."""
         width, height = self.size
         return -(-width // glsl.TILE_PX), -(-height // glsl.TILE_PX)
 
