@@ -34,7 +34,10 @@ FaultKind = Literal[
 
 
 class Fault(NamedTuple):
-    """Why a message is refused. words: its publisher and the remedy."""
+    """Why a message is refused.
+
+    words: its publisher and the remedy.
+    """
 
     topic: str
     kind: FaultKind

@@ -298,7 +298,10 @@ def depth_image(depth: NDArray[np.float32], time_ns: int) -> Any:
 
 
 def camera_info(camera: Calibration, size: tuple[int, int], time_ns: int) -> Any:
-    """Return the calibration of a camera. size: width and height in pixels."""
+    """Return the calibration of a camera.
+
+    size: width and height in pixels.
+    """
     wide, high = size
     matrix = np.ascontiguousarray(camera.matrix, float)
     whole = message("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)

@@ -38,7 +38,10 @@ class Network(NamedTuple):
 
 
 class _Publisher(NamedTuple):
-    """A declared publisher. numbers: a list with its last sequence number."""
+    """A declared publisher.
+
+    numbers: a list with its last sequence number.
+    """
 
     key: str
     type: str

@@ -24,7 +24,10 @@ _SECTION: Final = "§"
 
 
 class Qos(NamedTuple):
-    """Quality of service, always reliable. latched: transient local durability."""
+    """Quality of service, always reliable.
+
+    latched: transient local durability.
+    """
 
     depth: int = 10
     latched: bool = False
@@ -237,7 +240,11 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """Metadata of a message. number: sequence number from 1; time_ns: since 1970."""
+    """Metadata of a message.
+
+    number: sequence number from 1
+    time_ns: since 1970.
+    """
 
     number: int
     time_ns: int

@@ -142,7 +142,10 @@ class _Digested(Policy, Protocol):
 
 
 def _bundle(folder: Path, within_s: float | None) -> Callable[[], _Digested]:
-    """Return a function that loads the policy of an ONNX bundle. within_s: see `OnnxPolicy`."""
+    """Return a function that loads the policy of an ONNX bundle.
+
+    within_s: see `OnnxPolicy`.
+    """
 
     def make() -> _Digested:
         from cosim.policies.onnx.policy import onnx_policy  # onnxruntime takes a moment to import

@@ -128,7 +128,10 @@ def _paste(
     wanted: NDArray[np.bool_],
     share: float,
 ) -> None:
-    """Mix cells into the picture. corner: x, y of the upper left corner of the first cell, m."""
+    """Mix cells into the picture.
+
+    corner: x, y of the upper left corner of the first cell, m.
+    """
     height, width = sheet.image.shape[:2]
     x = bounds[0] + (np.arange(width) + 0.5) / sheet.px_per_m
     y = bounds[3] - (np.arange(height) + 0.5) / sheet.px_per_m

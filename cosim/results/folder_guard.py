@@ -13,7 +13,10 @@ _OWNER_RWX: Final = 0o700
 
 
 class FolderGuard:
-    """Guard of one open folder. path: where the folder must be."""
+    """Guard of one open folder.
+
+    path: where the folder must be.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -92,7 +92,10 @@ def time_to_collision_s(offset: Floats, velocity: Floats, radius_m: float) -> Fl
 
 @dataclass(frozen=True)
 class Tick:
-    """One recorded tick. footprint_m: length and width of the robot."""
+    """One recorded tick.
+
+    footprint_m: length and width of the robot.
+    """
 
     step: Step
     verdict: Verdict

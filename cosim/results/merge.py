@@ -46,7 +46,10 @@ class MergeResult(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """Folder to be merged. records: by scenario id."""
+    """Folder to be merged.
+
+    records: by scenario id.
+    """
 
     path: Path
     spec: RunSpec

@@ -220,7 +220,12 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def decoded(cls, data: bytes, where: Path) -> Record:
-        """Decode a record. where: path named in errors. Raises RunError."""
+        """Decode a record.
+
+        where: path named in errors.
+
+        Raises RunError.
+        """
         try:
             record = RECORD_FILE.decode(data)
         except (msgspec.DecodeError, RecursionError, SpecError) as error:

@@ -236,7 +236,9 @@ def _count_in_words(ids: Sequence[str], others: Sequence[str]) -> str:
 
 
 def decode_spec(data: bytes, where: Path) -> RunSpec:
-    """Decode a run.json. where: path named in errors.
+    """Decode a run.json.
+
+    where: path named in errors.
 
     Raises RunError for another schema, ValueError for bytes that are no run.json.
     """

@@ -60,7 +60,10 @@ class Stop(Part, frozen=True, kw_only=True):
 
 
 class LaneChange(Part, frozen=True, kw_only=True):
-    """Change to another lane. to_m: lateral offset from the way, left positive."""
+    """Change to another lane.
+
+    to_m: lateral offset from the way, left positive.
+    """
 
     to_m: Annotated[float, Within(-20, 20)]
 

@@ -220,7 +220,10 @@ def _seat(build: Build) -> Piece:
 
 
 def legs(build: Build, kind: Legs, bare: bool, loose: float = 0.0) -> list[Piece]:
-    """Return both legs and shoes. bare: skin shows below the cloth of shorts or skirts."""
+    """Return both legs and shoes.
+
+    bare: skin shows below the cloth of shorts or skirts.
+    """
     pieces: list[Piece] = []
     for side, left in (("left", 1.0), ("right", -1.0)):
         hip, knee, ankle = f"{side}_hip", f"{side}_knee", f"{side}_ankle"

@@ -84,7 +84,11 @@ REACH_RAD: Final = np.deg2rad(74.0)
 
 @dataclass(frozen=True, slots=True)
 class Skeleton:
-    """Joint positions of a body at rest. rest_m: (24, 3); height_m: from sole to crown."""
+    """Joint positions of a body at rest.
+
+    rest_m: (24, 3)
+    height_m: from sole to crown.
+    """
 
     rest_m: Floats
     height_m: float

@@ -27,7 +27,10 @@ _ROUNDS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Baked:
-    """A mesh with colours of vertices. edge_m: longest edge that was left, metres."""
+    """A mesh with colours of vertices.
+
+    edge_m: longest edge that was left, metres.
+    """
 
     vertices: Floats
     triangles: NDArray[np.int64]

@@ -51,7 +51,10 @@ _BASE_M: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Holes:
-    """Closed holes of the measured ground. area_m2: of all of them together."""
+    """Closed holes of the measured ground.
+
+    area_m2: of all of them together.
+    """
 
     count: int
     area_m2: float
@@ -59,7 +62,10 @@ class Holes:
 
 @dataclass(frozen=True, slots=True)
 class _Lattice:
-    """Lattice over a mesh. shape: rows and columns."""
+    """Lattice over a mesh.
+
+    shape: rows and columns.
+    """
 
     origin: Floats
     step_m: float

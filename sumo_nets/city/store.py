@@ -35,7 +35,10 @@ _NETCONVERT = (
 
 
 def city_as_net(city: City, folder: Path) -> bytes:
-    """Return the net of a city. folder: for temporary files."""
+    """Return the net of a city.
+
+    folder: for temporary files.
+    """
     plan = plan_city(city.seed, city.size_m, city.style)
     return with_signal_programs(
         without_comments(_converted(plan, folder).read_bytes()), plan.signal_rng

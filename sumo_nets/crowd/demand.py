@@ -166,7 +166,10 @@ class Pedestrians:
         self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
 
     def _remove(self, name: str, here: set[str]) -> None:
-        """Remove a person with its group. here: persons in the simulation; it is updated."""
+        """Remove a person with its group.
+
+        here: persons in the simulation; it is updated.
+        """
         if name in here:
             for fellow in self._cohesion.dissolve(name):
                 self._entrances.people[self._engine.simulation.getTime()].append(fellow)

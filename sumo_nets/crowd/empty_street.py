@@ -85,8 +85,10 @@ class EmptyStreet(Crowd):
         return self._street
 
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
-        """Advance by one tick, with the event pedestrians at their current poses. absent: has no
-        effect."""
+        """Advance by one tick, with the event pedestrians at their current poses.
+
+        absent: has no effect.
+        """
         self._street = self._read(
             self.street.tick + 1, robot.pose.x_m, robot.pose.y_m, reply.actors
         )

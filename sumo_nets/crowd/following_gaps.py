@@ -49,7 +49,10 @@ class FollowingGaps:
         self._engine.person.setMinGap(name, gap_m)
 
     def update(self, near: NearPersons) -> None:
-        """Update the gaps. near: the persons in the simulation near the robot."""
+        """Update the gaps.
+
+        near: the persons in the simulation near the robot.
+        """
         here = [name for name in near.names if name in self._gaps_m]
         if len(self._gaps_m) > 2 * len(here):
             self._gaps_m = {name: self._gaps_m[name] for name in here}

@@ -156,7 +156,10 @@ class PoseFilter:
     def _separated(
         self, before: Floats, shown: Floats, others: Floats, standing: NDArray[np.bool_]
     ) -> Floats:
-        """Keep people apart. others: (K, 2) positions of people who do not give way, metres."""
+        """Keep people apart.
+
+        others: (K, 2) positions of people who do not give way, metres.
+        """
         count = len(shown)
         if len(self._unyielding) != count + len(others) or len(others) != self._others:
             self._others = len(others)

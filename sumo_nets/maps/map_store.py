@@ -77,7 +77,10 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class KnownMap(msgspec.Struct, frozen=True):
-    """A known place. origin: "imported" or "sumo" (in the SUMO package, imported on first use)."""
+    """A known place.
+
+    origin: "imported" or "sumo" (in the SUMO package, imported on first use).
+    """
 
     name: str
     origin: str

@@ -59,7 +59,10 @@ def refuse_box_outside(source: Path, box: Box, bounds: Box, unit: str = "degrees
 
 @dataclass(slots=True)
 class _Part:
-    """Ids of the cropped part. cuts: indices of the first and last node of shortened streets."""
+    """Ids of the cropped part.
+
+    cuts: indices of the first and last node of shortened streets.
+    """
 
     nodes: set[int] = field(default_factory=set)
     ways: set[int] = field(default_factory=set)

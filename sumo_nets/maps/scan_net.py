@@ -118,7 +118,10 @@ class _Zebra:
 
 
 class _NoCrossing(Exception):
-    """A crossing that does not fit on its road. number: of its area."""
+    """A crossing that does not fit on its road.
+
+    number: of its area.
+    """
 
     def __init__(self, number: int, reason: str) -> None:
         super().__init__(reason)
@@ -138,7 +141,11 @@ class _Plan:
 
 
 class ScanNet(NamedTuple):
-    """Built net. findings: a sentence each; inner_iou: of SUMO's lanes and the drawn ground."""
+    """Built net.
+
+    findings: a sentence each
+    inner_iou: of SUMO's lanes and the drawn ground.
+    """
 
     path: Path
     findings: tuple[str, ...]

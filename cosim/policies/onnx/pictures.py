@@ -73,7 +73,9 @@ def combine_frames(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
 
 
 def tensor_shape(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
-    """Return the shape of a tensor. sides: rows, columns and channels of a frame.
+    """Return the shape of a tensor.
+
+    sides: rows, columns and channels of a frame.
 
     >>> tensor_shape((64, 85, 3), 6, "N(TC)HW")
     (1, 18, 64, 85)

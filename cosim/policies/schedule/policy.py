@@ -158,7 +158,10 @@ class SchedulePolicy:
 
 
 class _Progress(NamedTuple):
-    """Progress of a robot. length_m: of the way, infinite if unknown."""
+    """Progress of a robot.
+
+    length_m: of the way, infinite if unknown.
+    """
 
     along_m: float
     length_m: float

@@ -72,7 +72,10 @@ def weights_in_words(robot: Robot) -> str:
 
 
 def network_gait(robot: Robot, legs: Legs, dt_s: float, setup: NetworkSetup) -> NetworkGait:
-    """Return a gait for a robot. dt_s: duration of a substep."""
+    """Return a gait for a robot.
+
+    dt_s: duration of a substep.
+    """
     return NetworkGait(robot, legs, dt_s, setup, MODELS[robot.name])
 
 

@@ -77,7 +77,10 @@ class NetworkSetup:
 
 
 class NetworkGait:
-    """Gait of one robot. dt_s: duration of a substep."""
+    """Gait of one robot.
+
+    dt_s: duration of a substep.
+    """
 
     def __init__(
         self, robot: Robot, legs: Legs, dt_s: float, setup: NetworkSetup, model: Model

@@ -98,7 +98,10 @@ def leg_angles(x_m: float, y_m: float, z_m: float, side: float) -> tuple[float, 
 
 
 class Trot:
-    """Trot of one robot. dt_s: duration of a substep."""
+    """Trot of one robot.
+
+    dt_s: duration of a substep.
+    """
 
     def __init__(self, robot: Robot, legs: Legs, dt_s: float, gains: TrotGains = GAINS) -> None:
         self._ramps = robot.acceleration_mps2 * dt_s, robot.acceleration_radps2 * dt_s
@@ -201,7 +204,10 @@ class Trot:
             foot[1] = begin[1] + (goal_y - begin[1]) * smooth
 
     def _angles(self, m: tuple[float, ...], lifted: float) -> list[float]:
-        """Return the joint angles for the feet. lifted: share of the swing's height."""
+        """Return the joint angles for the feet.
+
+        lifted: share of the swing's height.
+        """
         gains = self._gains
         swinging = _PAIRS[self._swings] if self._left_steps else ()
         angles: list[float] = []
