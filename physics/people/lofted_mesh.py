@@ -214,6 +214,11 @@ def _shares(rows: Floats) -> Floats:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
+def scaled_vector(vector: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+    """Return a vector times a factor."""
+    return vector[0] * factor, vector[1] * factor, vector[2] * factor
+
+
 def ball(
     coat: str,
     at: tuple[float, float, float],

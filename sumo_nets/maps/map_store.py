@@ -173,7 +173,7 @@ def read_map(place: CityMap | str) -> StreetMap:
         with_features(street_map.net_hash, path.with_name(FEATURES_FILE)), path.parent
     )
     whole = dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
-    return whole.with_source_hash(f"{street_map.made_of}-{known_as}")
+    return whole.with_input_hash(f"{street_map.input_hash}-{known_as}")
 
 
 def map_hash(net: Path) -> str:

@@ -103,8 +103,8 @@ class _Memory:
         self.feeder = feeder
         self.last: Command = STILL
 
-    def forget(self) -> None:
-        self.feeder.forget()
+    def clear(self) -> None:
+        self.feeder.clear()
         self.last = STILL
 
 
@@ -157,7 +157,7 @@ class OnnxPolicy:
 
     def on_reset(self) -> None:
         """Clear the history."""
-        self._memory.forget()
+        self._memory.clear()
 
     def act(self, observation: Observation) -> PolicyAnswer:
         """Return waypoints (N, 2) or (N, 4) in units of the manifest's rule, or a command."""
@@ -254,7 +254,7 @@ class OnnxBatchPolicy(OnnxPolicy):
 
     def on_reset(self, episode_id: str = "") -> None:
         """Clear the history of an episode."""
-        self._memories[episode_id].forget()
+        self._memories[episode_id].clear()
 
     def ended(self, episode_id: str) -> None:
         """Remove an episode."""
