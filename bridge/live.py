@@ -20,6 +20,8 @@ from cosim.spec.injection import POINT_FORMS, Ack, InjectionRequest
 
 MAX_MESSAGE_B: Final = 64 * 1024
 """Largest injection in bytes."""
+_ACK_TIMEOUT_S: Final = 5.0
+"""Timeout of an acknowledgement in seconds."""
 _MAX_SHOWN: Final = 60
 """Longest invalid value in an error message in characters."""
 _JSON_BEGINS: Final = b"{[ \t\r\n"
@@ -93,7 +95,7 @@ def _encoded(ack: Ack, *, as_json: bool) -> bytes:
     return msgspec.json.encode(ack) if as_json else msgspec.msgpack.encode(ack)
 
 
-def send_injection(session: Session, key: str, injection: bytes, timeout_s: float = 5.0) -> Ack:
+def send_injection(session: Session, key: str, injection: bytes) -> Ack:
     """Send an injection (JSON) and wait for its acknowledgement.
 
     Raises SpecError if it is too long, EngineError on timeout or an invalid reply.
@@ -101,7 +103,9 @@ def send_injection(session: Session, key: str, injection: bytes, timeout_s: floa
     if len(injection) > MAX_MESSAGE_B:
         raise SpecError(f"{len(injection)} bytes: an injection has at most {MAX_MESSAGE_B}")
     try:
-        return msgspec.json.decode(session.query(key, injection, timeout_s=timeout_s), type=Ack)
+        return msgspec.json.decode(
+            session.query(key, injection, timeout_s=_ACK_TIMEOUT_S), type=Ack
+        )
     except TimeoutError as error:
         raise EngineError(
             f"{error}: the episode has ended, or is too busy; what it did is in its log"

@@ -186,11 +186,9 @@ class InertialSensor:
         kind: ImuKind,
         draws: np.random.Generator,
         noise: ImuNoise = ImuNoise(),  # noqa: B008
-        tick_s: float = Clock().tick_s,
     ) -> None:
         self._draws = draws
         self._noise = noise if kind == "noisy" else None
-        self._tick_s = tick_s
         self._time_s = 0.0
         self._motion: tuple[Trunk, Trunk] | None = None
         biases = np.repeat([noise.gyro_bias_radps, noise.accel_bias_mps2], 3)
@@ -211,10 +209,9 @@ class InertialSensor:
         still = (0.0, 0.0, 0.0)
         rotation = _LEVEL if robot.trunk is None else robot.trunk.rotation
         before, after = self._motion or (Trunk(rotation, still, still),) * 2
-        gyro = _turn(before.rotation, after.rotation, self._tick_s)
+        gyro = _turn(before.rotation, after.rotation, _TICK_S)
         pull = [
-            (v - u) / self._tick_s
-            for u, v in zip(before.velocity_mps, after.velocity_mps, strict=True)
+            (v - u) / _TICK_S for u, v in zip(before.velocity_mps, after.velocity_mps, strict=True)
         ]
         pull[2] += _GRAVITY_MPS2
         values = [*gyro, *_inverse_rotated(after.rotation, pull)]

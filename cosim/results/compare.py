@@ -22,7 +22,7 @@ from cosim.results.discerned import (
     with_discerned,
     without_decoys,
 )
-from cosim.results.intervals import BOOTSTRAP, CONFIDENCE, MIN_N, counts_in_words
+from cosim.results.intervals import BOOTSTRAP, CONFIDENCE, MIN_N, RATE_PER_M, counts_in_words
 from cosim.results.metrics import (
     COUNTERFACTUAL,
     METRICS,
@@ -101,12 +101,11 @@ def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
 
 
 def difference_of_rates(
-    before: tuple[Floats, Floats], after: tuple[Floats, Floats], per: float = 100.0
+    before: tuple[Floats, Floats], after: tuple[Floats, Floats]
 ) -> PairedDifference:
-    """Return the difference of pooled rates.
+    """Return the difference of pooled rates per 100 m.
 
     before, after: counts (N,) and metres (N,) of the same N scenarios
-    per: metres that the rate refers to
 
     A bootstrap sample draws the same scenarios for both runs and divides all counts by all metres.
     """
@@ -116,7 +115,10 @@ def difference_of_rates(
     if not n or min(columns[1].sum(), columns[3].sum()) < RATE_NEEDS_M:
         return _NO_PAIRS
     counted, metres, counted_after, metres_after = columns
-    rates = per * counted.sum() / metres.sum(), per * counted_after.sum() / metres_after.sum()
+    rates = (
+        RATE_PER_M * counted.sum() / metres.sum(),
+        RATE_PER_M * counted_after.sum() / metres_after.sum(),
+    )
     differs = (counted != counted_after) | (metres != metres_after)
     changed = int((differs & ((counted > 0.0) | (counted_after > 0.0))).sum())
     if not differs.any() or not (counted.any() or counted_after.any()):
@@ -124,7 +126,7 @@ def difference_of_rates(
     drawn = [column[_draws(n)].sum(axis=1) for column in columns]
     moved = (drawn[1] > 0.0) & (drawn[3] > 0.0)
     counted, metres, counted_after, metres_after = (column[moved] for column in drawn)
-    low, high = _interval(per * (counted_after / metres_after - counted / metres), n)
+    low, high = _interval(RATE_PER_M * (counted_after / metres_after - counted / metres), n)
     return PairedDifference(*rates, low, high, n, changed)
 
 

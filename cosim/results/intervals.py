@@ -19,14 +19,19 @@ from scipy.special import gammaincinv, ndtri
 from cosim.core.geometry import Floats
 
 CONFIDENCE: Final = 0.95
+"""Confidence level of all intervals."""
 BOOTSTRAP: Final = 2000
 """Number of bootstrap samples."""
 MIN_N: Final = 5
 """Fewest episodes with an interval or a verdict: below, a bootstrap sees almost no spread."""
+RATE_PER_M: Final = 100.0
+"""Metres that rates refer to."""
 RARE: Final = 20
 """Number of events from which on the interval of a rate is a bootstrap interval."""
 _TAIL: Final = (1.0 - CONFIDENCE) / 2
+"""Probability beyond either bound."""
 _NONE: Final = (math.nan, math.nan)
+"""Bounds without an interval."""
 
 
 class Estimate(NamedTuple):
@@ -111,21 +116,20 @@ def estimate_of_mean(values: Floats) -> Estimate:
     return Estimate(float(values.mean()), *interval, n)
 
 
-def estimate_of_rate(counts: Floats, metres: Floats, per: float = 100.0) -> Estimate:
-    """Estimate a pooled rate: all events divided by all metres.
+def estimate_of_rate(counts: Floats, metres: Floats) -> Estimate:
+    """Estimate a pooled rate per 100 m: all events divided by all metres.
 
     counts, metres: events and distance of each episode (N,); some distance is above 0
-    per: metres that the rate refers to
     """
     n, counted, over_m = len(counts), float(counts.sum()), float(metres.sum())
     if n < MIN_N:
         interval = _NONE
     elif counted < RARE:
         low, high = garwood(counted)
-        interval = per * low / over_m, per * high / over_m
+        interval = RATE_PER_M * low / over_m, RATE_PER_M * high / over_m
     else:
-        interval = bootstrap(per * counts, metres)
-    return Estimate(per * counted / over_m, *interval, n, counted, over_m)
+        interval = bootstrap(RATE_PER_M * counts, metres)
+    return Estimate(RATE_PER_M * counted / over_m, *interval, n, counted, over_m)
 
 
 def wilson(counted: float, n: int) -> tuple[float, float]:

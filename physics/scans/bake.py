@@ -44,18 +44,20 @@ def bake_texture(
     uv: Floats,
     pixels: NDArray[np.uint8],
     unit_m: float,
-    most: int = MAX_TRIANGLES,
 ) -> Baked:
     """Return a mesh whose vertices have the mean colour of the texture around them.
+
+    Edges are left longer where the mesh would have more than MAX_TRIANGLES triangles.
 
     uv: (V, 2) texture coordinates, v up; they repeat outside of 0 to 1.
     pixels: (H, W, 3) uint8 sRGB.
     unit_m: metres per unit of the vertices.
-    most: number of triangles above which edges are left longer.
     """
     edge_m = EDGE_M
     areas = _areas(vertices, triangles) * unit_m * unit_m
-    while (areas / (0.25 * edge_m * edge_m)).sum() + len(triangles) > max(most, len(triangles) + 1):
+    while (areas / (0.25 * edge_m * edge_m)).sum() + len(triangles) > max(
+        MAX_TRIANGLES, len(triangles) + 1
+    ):
         edge_m *= 1.25
     joined = np.column_stack([vertices, uv])
     joined, triangles = split_edges(joined, triangles, edge_m / unit_m)

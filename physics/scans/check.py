@@ -281,10 +281,10 @@ def lattice_points(area: BaseGeometry, step_m: float) -> Floats:
     return np.column_stack([grid_x[inside], grid_y[inside]])
 
 
-def opaque_sample(splats: Splats, most: int = _MEASURED) -> Splats:
-    """Return opaque splats, evenly over their order."""
+def opaque_sample(splats: Splats) -> Splats:
+    """Return about _MEASURED opaque splats, evenly over their order."""
     opaque = np.flatnonzero(splats.rgba[:, 3] >= _OPAQUE)
-    return take_splats(splats, opaque[:: max(1, math.ceil(len(opaque) / most))])
+    return take_splats(splats, opaque[:: max(1, math.ceil(len(opaque) / _MEASURED))])
 
 
 def check_alignment(

@@ -323,11 +323,11 @@ def obstacle_prop(obstacle: Obstacle, number: int) -> Prop:
     return Prop(f"obstacle:{number}:{obstacle.kind}", kind.name, obstacle.variant, *at, paint)
 
 
-def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.object_]:
-    """Return the (N,) ground rectangles of props, enlarged by a margin."""
+def footprints(props: Sequence[Prop]) -> NDArray[np.object_]:
+    """Return the (N,) ground rectangles of props."""
     if not props:
         return np.zeros(0, dtype=object)
-    half = 0.5 * np.array([prop.size_m[:2] for prop in props]) + margin_m
+    half = 0.5 * np.array([prop.size_m[:2] for prop in props])
     heading = np.array([prop.heading_rad for prop in props])
     along = half[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
     aside = half[:, 1:] * np.column_stack([-np.sin(heading), np.cos(heading)])
