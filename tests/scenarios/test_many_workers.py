@@ -434,7 +434,7 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(
     with hands(run, 1) as (one,):
         one.job()
         with monkeypatch.context() as patch:
-            patch.setattr(RunFolder, "keep", full)
+            patch.setattr(RunFolder, "write_episode", full)
             with pytest.raises(TimeoutError):
                 one.session.query(
                     keys.job(one.run, "report"), one.payload(**one.result()), timeout_s=0.5
