@@ -659,8 +659,8 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
         host = "localhost" if ip_address(host).is_loopback else host
     if host != "localhost" and not insecure and not (tls and found[1] == "tls"):
         raise ValueError(
-            f"{found[0]} is beyond this machine and unguarded: whoever can reach it may ask the "
-            "policy. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
+            f"{found[0]} is beyond this machine and unguarded: anyone who can reach it may query "
+            "the policy. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
         )
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",

@@ -299,7 +299,7 @@ def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
         out.print(f"Bags: {folder / 'bags'}, one for each episode", highlight=False)
         return
     if (back := found.back) is None:
-        err.print("The data set was whole already: nothing is written.")
+        err.print("The data set was complete already: nothing is written.")
         return
     words = (
         f"Read back: {back.rows} rows and pictures; a picture differs from what was drawn for its "

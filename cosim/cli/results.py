@@ -214,7 +214,9 @@ def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run fold
             f"engine failed"
         )
     if scored.untested:
-        lines.append(f"no trajectory tells {', '.join(scored.untested)}: see cosim counterfactual")
+        lines.append(
+            f"not computed from trajectories: {', '.join(scored.untested)}: `cosim counterfactual`"
+        )
     if not scored.differences:
         files = ("record.json", "results.sqlite", *["results.csv"] * scored.table)
         lines.append(f"equal to the bit to {', '.join(files)}")

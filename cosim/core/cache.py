@@ -209,7 +209,7 @@ def cache_entries() -> list[CacheEntry]:
 
 def report_uncached(folder: Path, error: Exception) -> None:
     """Print that something could not be cached, once in a process for each message."""
-    _print_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
+    _print_once(f"note: {folder}: not cached, so that the next process computes it again: {error}")
 
 
 @cache

@@ -148,7 +148,7 @@ def city_net(city: City) -> Path:
             f"{path}: the net's hash is {found}, but the scenario was made on {city.net_hash}: "
             "delete the file to build it again; if the hash stays, the scenario is of "
             "another version of the "
-            "generator or of SUMO: make the suite anew, or install the version it was made with"
+            "generator or of SUMO: build the suite again, or install the version it was made with"
         )
     return path
 

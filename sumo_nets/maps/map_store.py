@@ -150,7 +150,7 @@ def map_net(place: CityMap | str) -> Path:
         raise MapError(
             f"map '{name}': its hash is {found}, but the scenario was made on "
             f"{place.net_hash}: import the same "
-            "file with the same options and versions again, or make the scenarios anew"
+            "file with the same options and versions again, or build the scenarios again"
         )
     return path
 

@@ -481,7 +481,7 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
 def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:
     """`serve` refuses it, and no endpoint, and two, and a name that cannot stand in a key."""
     with pytest.raises(
-        ValueError, match="is beyond this machine and unguarded: whoever can reach it may ask"
+        ValueError, match="is beyond this machine and unguarded: anyone who can reach it may query"
     ):
         serve(Counting(), listen="tcp/0.0.0.0:7449")
     for ends in (

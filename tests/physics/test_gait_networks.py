@@ -398,7 +398,9 @@ def test_speeds_of_a_gait_are_averaged_over_its_own_cycle(tmp_path: Path) -> Non
         assert drive.cycle_s == cycle_s
         with BulletWorld(FLAT, robot=DOG, drive=drive) as world:
             world.place(Pose(0.0, 0.0, 0.0))
-            assert world._leg_monitor is not None and world._leg_monitor._count == round(cycle_s / SUBSTEP_S)
+            assert world._leg_monitor is not None and world._leg_monitor._count == round(
+                cycle_s / SUBSTEP_S
+            )
 
 
 def still_body(**changes: Any) -> MeasuredBody:

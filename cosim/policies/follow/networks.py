@@ -77,7 +77,7 @@ def _answer_in_grey(
         ) from error
     if answer.shape != sides or not np.isfinite(answer).all():
         raise UsageError(
-            f"{graph.path}: tells {wanted} {answer.shape}; wanted are finite numbers, {sides}"
+            f"{graph.path}: returns {wanted} {answer.shape}; expected are finite numbers, {sides}"
         )
     return answer.tobytes()
 

@@ -170,7 +170,7 @@ def _refusal(error: Exception, version: str) -> str:
     remedy = (
         "export it with other operators, or a lower opset"
         if lacks or "opset" in said.lower()
-        else "export it anew"
+        else "export it again"
     )
     what = "has an operator that onnxruntime lacks" if lacks else "is refused by onnxruntime"
     return f"{what} ({version}): {said}; {remedy}"

@@ -242,7 +242,7 @@ def _number(tensors: Mapping[str, Tensor], one: Element) -> float:
     if one.index >= numbers.size:
         raise UsageError(
             f"output: '{one.name}' holds {numbers.size} numbers, and number {one.index} "
-            f"(from 0) is asked"
+            f"(from 0) is requested"
         )
     return float(numbers[one.index])
 

@@ -233,7 +233,7 @@ class OnnxPolicy:
             raise
         except PolicyError as error:
             raise UsageError(
-                f"{graph.path}: in a grey street the policy {error}: are its weights whole?"
+                f"{graph.path}: in a grey street the policy {error}: are its weights intact?"
             ) from error
         except Exception as error:
             raise UsageError(
@@ -338,7 +338,7 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
     for name, array in wanted.items():
         if found[name].shape != array.shape:
             raise UsageError(
-                f"{path}: expected.{name} is {array.shape}, the graph tells {found[name].shape}"
+                f"{path}: expected.{name} is {array.shape}, the graph returns {found[name].shape}"
             )
     return {
         name: float(np.abs(found[name].astype(float) - array).max(initial=0.0))

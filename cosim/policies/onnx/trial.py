@@ -125,7 +125,7 @@ class TrialGraph:
     def _dead(self) -> UsageError:
         return UsageError(
             f"{self.path}: ends onnxruntime: the process that ran it {self._child.ended()}; "
-            f"export it anew"
+            f"export it again"
         )
 
 

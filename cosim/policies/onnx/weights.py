@@ -108,7 +108,7 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
     if bad:
         more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
         raise UsageError(
-            f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it anew"
+            f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it again"
         )
     digest = hashlib.blake2b(digest_size=32)
     size = 0

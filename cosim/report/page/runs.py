@@ -194,6 +194,6 @@ def _check_same_suites(runs: Sequence[VerifiedRun]) -> None:
         if other.spec.setup.suite_hash != run.spec.setup.suite_hash:
             raise RunError(
                 f"{run.path} and {other.path} are of different suites '{run.spec.suite}' "
-                f"({run.spec.setup.suite_hash}, {other.spec.setup.suite_hash}): their rows cannot "
-                "stand in one table. Report them apart, or run one again"
+                f"({run.spec.setup.suite_hash}, {other.spec.setup.suite_hash}): their rows "
+                "cannot be in one table. Report them separately, or run one again"
             )

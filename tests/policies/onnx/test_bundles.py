@@ -94,7 +94,7 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "nan": (
         tiny_graph(bright=NAN),
         {},
-        "model.onnx: weights are NaN or infinite: bright; export it anew",
+        "model.onnx: weights are NaN or infinite: bright; export it again",
     ),
     "half-nan": (tiny_graph(unused=HALF_NAN), {}, "weights are NaN or infinite: unused"),
     "text": (b"once upon a time", {}, "model.onnx: is no ONNX graph: is no protobuf message"),
@@ -119,7 +119,7 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
         graph_bytes(OVERFLOWS, [OBS], [port("action", 1, 5, 2)]),
         ONES,
         "in a grey street the policy output 'action' of the graph holds NaN or infinity: are "
-        "its weights whole?",
+        "its weights intact?",
     ),
     "reshape": (
         graph_bytes(
