@@ -60,7 +60,7 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
         ("role", str(folder), "guest"): "Valid choices: coordinator, director",
         ("role", str(folder), "director"): "--host NAME",
         ("role", str(folder), "worker", "--host", "a b"): "a name or address of a machine",
-        ("role", str(folder), "worker", "--host", "w.lan"): "the role worker does not",
+        ("role", str(folder), "worker", "--host", "w.lan"): "the role worker connects",
         ("role", str(tmp_path / "none"), "worker"): "holds no authority",
         ("show", str(tmp_path)): "holds no certificate",
     }.items():
