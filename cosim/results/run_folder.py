@@ -179,12 +179,13 @@ def record_difference(mine: Record, theirs: Record) -> str:
         msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs)
     )
     for field, value in fields.items():
-        if isinstance(value, dict):
-            for name in dict.fromkeys([*value, *their_fields[field]]):
-                if value.get(name) != (their_value := their_fields[field].get(name)):
-                    return f"{field}.{name} is {value.get(name)}, there {their_value}"
-        elif value != their_fields[field]:
-            return f"{field} is {shown(value)}, there {shown(their_fields[field])}"
+        their_value = their_fields[field]
+        if isinstance(value, dict) and isinstance(their_value, dict):
+            for name in dict.fromkeys([*value, *their_value]):
+                if value.get(name) != their_value.get(name):
+                    return f"{field}.{name} is {value.get(name)}, there {their_value.get(name)}"
+        elif value != their_value:
+            return f"{field} is {shown(value)}, there {shown(their_value)}"
     return ""
 
 

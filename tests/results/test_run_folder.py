@@ -19,8 +19,8 @@ import pytest
 from cosim.core.errors import MachineError, RunError, UsageError
 from cosim.results.log import COLUMNS, Log
 from cosim.results.metrics import METRICS
-from cosim.results.record import Record
-from cosim.results.run_folder import RunFolder, read_records, read_spec
+from cosim.results.record import Record, ScanLook
+from cosim.results.run_folder import RunFolder, read_records, read_spec, record_difference
 from cosim.results.run_setup import RunSetup
 from cosim.results.run_spec import Shard
 from cosim.results.table import summary_of, table_of, table_row
@@ -550,3 +550,11 @@ def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
     )
     assert not (tmp_path / "above.png").exists()
     assert cosim("show", "run", "--episode", "s-0", cwd=tmp_path).returncode == 0
+
+
+def test_records_differ_if_only_one_has_a_scan() -> None:
+    """The difference is described in both orders, also if the first record has the scan."""
+    plain = record("s-0")
+    scanned = msgspec.structs.replace(plain, scan=ScanLook(appearance="splats"))
+    assert record_difference(plain, scanned).startswith("scan is None, there {'appearance'")
+    assert record_difference(scanned, plain).endswith("there None")
