@@ -81,15 +81,21 @@ def check_database(path: Path) -> None:
 
 
 def select_records(database: sqlite3.Connection) -> list[Record]:
-    """Return all records in the order in which their episodes ended. Raises sqlite3.Error,
-    DecodeError."""
+    """Return all records in the order in which their episodes ended.
+
+    Raises sqlite3.Error for a damaged database, DecodeError for a damaged row.
+    """
     rows: Sequence[tuple[object]] = database.execute(
         "select record from episodes order by rowid"
     ).fetchall()
-    return [RECORD_FILE.decode(_text(value)) for (value,) in rows]
+    try:
+        return [RECORD_FILE.decode(_text(value)) for (value,) in rows]
+    except RecursionError as error:
+        raise msgspec.DecodeError("a row is nested too deep") from error
 
 
 def _text(value: object) -> str:
+    """Return the text of a row. Raises DecodeError for another type."""
     if not isinstance(value, str):
         raise msgspec.DecodeError("a row holds no text")
     return value

@@ -229,6 +229,12 @@ def odd_rows(database: Path) -> None:
         connection.execute("update episodes set record = '{'")
 
 
+def deep_rows(path: Path) -> None:
+    deep = '{"unknown": ' + "[" * 100_000 + "]" * 100_000 + "}"
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("update episodes set record = ?", (deep,))
+
+
 def null_rows(database: Path) -> None:
     with closing(sqlite3.connect(database)) as connection, connection:
         connection.execute("update episodes set record = null")
@@ -236,7 +242,7 @@ def null_rows(database: Path) -> None:
 
 DAMAGES = {
     damage.__name__: damage
-    for damage in (garbage, cut_off, overwritten, another_table, odd_rows, null_rows)
+    for damage in (garbage, cut_off, overwritten, another_table, odd_rows, null_rows, deep_rows)
 }
 
 
