@@ -4,7 +4,7 @@ The simulator queries the director in every tick and waits (lockstep). The direc
 (`cosim.spec.events`), so a query may be repeated, and a director may be restarted without changing
 the episode.
 
-Both ends sign messages with the version of their behaviours and reject other versions.
+Messages carry the version of the behaviours of their sender. Each end rejects other versions.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ LONGEST_REASON = 500
 _T = TypeVar("_T")
 
 
-class SignedMessage(msgspec.Struct, frozen=True):
+class VersionedMessage(msgspec.Struct, frozen=True):
     """Message with the version of the sender's behaviours."""
 
-    by: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    version: Annotated[str, msgspec.Meta(max_length=64)] = msgspec.field(default="", name="by")
     message: msgspec.Raw = msgspec.Raw(b"")
 
 
-def sign(message: msgspec.Struct, by: str) -> bytes:
+def encode_versioned(message: msgspec.Struct, version: str) -> bytes:
     """Encode a message with the version of its sender's behaviours."""
-    return encode(SignedMessage(by, msgspec.Raw(encode(message))))
+    return encode(VersionedMessage(version, msgspec.Raw(encode(message))))
 
 
-def verify(payload: bytes, kind: type[_T], by: str) -> _T:
-    """Decode a signed message. Raises EngineError if invalid or from another version than `by`."""
-    envelope = decode(payload, SignedMessage)
-    if envelope.by != by:
+def decode_versioned(payload: bytes, kind: type[_T], version: str) -> _T:
+    """Decode a message. Raises EngineError if it is invalid or from another version."""
+    envelope = decode(payload, VersionedMessage)
+    if envelope.version != version:
         raise EngineError(
-            f"behaviours '{envelope.by}' met behaviours '{by}': run and director must be "
+            f"behaviours '{envelope.version}' met behaviours '{version}': run and director must be "
             f"started from the same code"
         )
     return decode(bytes(envelope.message), kind)
@@ -64,15 +64,17 @@ class QueryParts(msgspec.Struct, frozen=True):
     events: msgspec.Raw
 
 
-def sign_query(query: EventQuery, by: str) -> bytes:
-    """Encode a signed query."""
+def encode_query(query: EventQuery, version: str) -> bytes:
+    """Encode a query with the version of its sender's behaviours."""
     bare = msgspec.structs.replace(query, events=())
-    return sign(QueryParts(msgspec.Raw(encode(bare)), msgspec.Raw(encode(query.events))), by)
+    return encode_versioned(
+        QueryParts(msgspec.Raw(encode(bare)), msgspec.Raw(encode(query.events))), version
+    )
 
 
-def verify_query(payload: bytes, by: str) -> EventQuery:
-    """Decode a signed query. Raises EngineError as `verify` does."""
-    parts = verify(payload, QueryParts, by)
+def decode_query(payload: bytes, version: str) -> EventQuery:
+    """Decode a query. Raises EngineError as `decode_versioned` does."""
+    parts = decode_versioned(payload, QueryParts, version)
     query = decode(bytes(parts.query), EventQuery)
     return msgspec.structs.replace(query, events=_events(bytes(parts.events)))
 
@@ -83,15 +85,20 @@ def _events(payload: bytes) -> tuple[Event, ...]:
     return decode(payload, tuple[Event, ...])
 
 
-def serve_director(session: Session, key: str, react: React, by: str = "") -> None:
-    """Answer queries on `key` with the pure function `react`. by: version of its behaviours."""
-    session.serve(key, lambda payload: sign(react(verify_query(payload, by)), by))
+def serve_director(session: Session, key: str, react: React, version: str = "") -> None:
+    """Answer queries on `key` with the pure function `react`.
+
+    version: Version of its behaviours.
+    """
+    session.serve(
+        key, lambda payload: encode_versioned(react(decode_query(payload, version)), version)
+    )
 
 
 class RemoteDirector:
     """`cosim.episode.interfaces.Director` that queries over Zenoh.
 
-    by: Version of the simulator's behaviours.
+    version: Version of the simulator's behaviours.
     wait_s: Timeout of a reply in seconds.
     waiting: Called after NOTICE_S without a reply.
     """
@@ -101,13 +108,13 @@ class RemoteDirector:
         session: Session,
         key: str,
         *,
-        by: str = "",
+        version: str = "",
         wait_s: float = 10.0,
         waiting: Progress | None = None,
     ) -> None:
         self._session = session
         self._key = key
-        self._by = by
+        self._version = version
         self._wait_s = wait_s
         self._waiting = waiting
 
@@ -118,7 +125,11 @@ class RemoteDirector:
         lost: its errors are the simulator's, EngineError.
         """
         try:
-            reply = verify(self._ask(sign_query(query, self._by), query.tick), EventReply, self._by)
+            reply = decode_versioned(
+                self._query(encode_query(query, self._version), query.tick),
+                EventReply,
+                self._version,
+            )
             _check(reply, query)
         except (TimeoutError, EngineError) as error:
             why = str(error)[:LONGEST_REASON]
@@ -126,20 +137,20 @@ class RemoteDirector:
             raise failed(f"director, tick {query.tick} of '{query.episode}': {why}") from error
         return reply
 
-    def _ask(self, payload: bytes, tick: int) -> bytes:
+    def _query(self, payload: bytes, tick: int) -> bytes:
         """Return the reply, with retries until the timeout."""
         began = time.monotonic()
         if self._waiting is not None and self._wait_s > NOTICE_S:
             try:
-                return self._session.ask(self._key, payload, timeout_s=NOTICE_S)
+                return self._session.query(self._key, payload, timeout_s=NOTICE_S)
             except TimeoutError:
                 self._waiting(f"waits at tick {tick} for the director, {self._wait_s:g} s at most")
         try:
-            return self._session.ask(
+            return self._session.query(
                 self._key, payload, timeout_s=self._wait_s - (time.monotonic() - began)
             )
         except TimeoutError:
-            raise TimeoutError(f"nobody answered on '{self._key}' for {self._wait_s:g} s") from None
+            raise TimeoutError(f"no reply on '{self._key}' within {self._wait_s:g} s") from None
 
 
 def _check(reply: EventReply, query: EventQuery) -> None:

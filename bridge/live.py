@@ -18,9 +18,11 @@ from bridge.session import Session
 from cosim.core.errors import EngineError, SpecError
 from cosim.spec.injection import POINT_FORMS, Ack, InjectionRequest
 
-LARGEST_B: Final = 64 * 1024
+MAX_MESSAGE_B: Final = 64 * 1024
 """Largest injection in bytes."""
-_MOST_SHOWN: Final = 60
+_ACK_TIMEOUT_S: Final = 5.0
+"""Timeout of an acknowledgement in seconds."""
+_MAX_SHOWN: Final = 60
 """Longest invalid value in an error message in characters."""
 _JSON_BEGINS: Final = b"{[ \t\r\n"
 """First bytes of a JSON message."""
@@ -45,11 +47,11 @@ def serve_injections(session: Session, key: str, offer: Offer) -> None:
 
 def answer_injection(payload: bytes, offer: Offer) -> Ack:
     """Return the acknowledgement of a message."""
-    if len(payload) > LARGEST_B:
+    if len(payload) > MAX_MESSAGE_B:
         return Ack(
             id="",
             status="refused",
-            reason=f"{len(payload)} bytes: a message has at most {LARGEST_B}",
+            reason=f"{len(payload)} bytes: a message has at most {MAX_MESSAGE_B}",
         )
     try:
         return offer(_decoder(payload)(payload, type=InjectionRequest))
@@ -69,7 +71,7 @@ def _found(payload: bytes, error: str) -> str:
         value = _decoder(payload)(payload)
         for field, index in _STEP.findall(place[1]):
             value = value[field] if field else value[int(index)]
-        return f", found {repr(value)[:_MOST_SHOWN]}"
+        return f", found {repr(value)[:_MAX_SHOWN]}"
     return ""
 
 
@@ -93,15 +95,17 @@ def _encoded(ack: Ack, *, as_json: bool) -> bytes:
     return msgspec.json.encode(ack) if as_json else msgspec.msgpack.encode(ack)
 
 
-def send_injection(session: Session, key: str, injection: bytes, timeout_s: float = 5.0) -> Ack:
+def send_injection(session: Session, key: str, injection: bytes) -> Ack:
     """Send an injection (JSON) and wait for its acknowledgement.
 
     Raises SpecError if it is too long, EngineError on timeout or an invalid reply.
     """
-    if len(injection) > LARGEST_B:
-        raise SpecError(f"{len(injection)} bytes: an injection has at most {LARGEST_B}")
+    if len(injection) > MAX_MESSAGE_B:
+        raise SpecError(f"{len(injection)} bytes: an injection has at most {MAX_MESSAGE_B}")
     try:
-        return msgspec.json.decode(session.ask(key, injection, timeout_s=timeout_s), type=Ack)
+        return msgspec.json.decode(
+            session.query(key, injection, timeout_s=_ACK_TIMEOUT_S), type=Ack
+        )
     except TimeoutError as error:
         raise EngineError(
             f"{error}: the episode has ended, or is too busy; what it did is in its log"

@@ -36,13 +36,13 @@ LARGEST_MESSAGE_BYTES = 16 << 20
 """Largest message over Zenoh in bytes."""
 _WINDOW_S = 0.002
 """Seconds that a policy with act_batch waits for further requests before it answers a batch."""
-_MOST_SLOTS = 4096
+_MAX_SLOTS = 4096
 """Largest number of open episodes of a server; beyond it the longest idle one is dropped."""
 CLOSE_AFTER_S = 300.0
 """Seconds without a request after which a server drops an episode."""
 _TAKEN_OVER_AFTER_S = 30.0
 """Seconds without a request after which a policy object for one episode at a time is free again."""
-_MOST_ANSWER_BYTES = 2 << 20
+_MAX_ANSWER_BYTES = 2 << 20
 """Largest answer in bytes; of a larger array, which is invalid, only the shape is sent."""
 _OWN_PACKAGES = {"cosim", "scenarios", "sumo_nets", "physics", "bridge"}
 _PICTURE = ("rgb", "depth", "labels")
@@ -271,29 +271,30 @@ class EpisodeDecoder:
             parts = zip(("matrix", "distortion", "on_robot"), map(np.array, camera))
             self.cameras[name] = self.makes["camera"](**dict(parts))
 
-    def decoded(self, one: ActRequest, arrays: dict[str, Any]) -> Any:
+    def decoded(self, request: ActRequest, arrays: dict[str, Any]) -> Any:
         """Return the observation in a request with these arrays."""
         makes = self.makes
         pictures = {}
         for name in [name for name in self.cameras if name]:
             parts = {kind: arrays.get(f"{name}/{kind}") for kind in _PICTURE}
             pictures[name] = makes["picture"](camera=self.cameras[name], **parts)
-        goal = {name[5:]: one for name, one in arrays.items() if name.startswith("goal.")}
+        goal = {name[5:]: value for name, value in arrays.items() if name.startswith("goal.")}
         tracks = {k: arrays.get(f"people.{k}") for k in ("ids", "positions_m", "velocities_mps")}
         lidar = makes["lidar"](**self.about.lidar) if "scan" in arrays else None
-        pose = dict(zip(("x_m", "y_m", "heading_rad"), one.odometry or ()))
+        pose = dict(zip(("x_m", "y_m", "heading_rad"), request.odometry or ()))
+        imu = request.imu
         return makes["observation"](
             **{kind: arrays.get(kind) for kind in _PICTURE},
-            **{name: getattr(one, name) for name in _NUMBERS},
+            **{name: getattr(request, name) for name in _NUMBERS},
             robot=self.robot,
-            privileged=self.privileged(one.knowledge) if one.knowledge else None,
+            privileged=self.privileged(request.knowledge) if request.knowledge else None,
             episode=self.episode,
-            goal=makes["goal"](**one.goal, **goal) if one.goal else None,
+            goal=makes["goal"](**request.goal, **goal) if request.goal else None,
             odometry=makes["odometry"](**pose) if pose else None,
             camera=self.cameras.get(""),
             pictures=pictures,
             scan=makes["scan"](ranges_m=arrays["scan"], spec=lidar) if lidar else None,
-            imu=makes["imu"](gyro_radps=one.imu[:3], accel_mps2=one.imu[3:]) if one.imu else None,
+            imu=makes["imu"](gyro_radps=imu[:3], accel_mps2=imu[3:]) if imu else None,
             people=None if tracks["ids"] is None else makes["people"](**tracks),
         )
 
@@ -303,11 +304,11 @@ class EpisodeDecoder:
 
 
 class _Slot:
-    """Open episode with its last step and reply. called: name passed to the policy."""
+    """Open episode with its last step and reply, by the name that the policy knows."""
 
-    def __init__(self, called: str, attempt: str) -> None:
+    def __init__(self, episode_name: str, attempt: str) -> None:
         self.policy: Any = None
-        self.called = called
+        self.episode_name = episode_name
         self.attempt = attempt
         self.decoder: Any = None
         self.step = -1
@@ -373,27 +374,27 @@ class PolicyDesk:
         self._act(list(new.values()))
         return [began[i] if i in began else self._reply(one) for i, one in enumerate(requests)]
 
-    def _slot(self, one: Any) -> _Slot | None:
-        slot = self._slots.get((one.run, one.episode))
-        return slot if slot is not None and slot.attempt == one.attempt else None
+    def _slot(self, request: Any) -> _Slot | None:
+        slot = self._slots.get((request.run, request.episode))
+        return slot if slot is not None and slot.attempt == request.attempt else None
 
-    def _reply(self, one: Any) -> PolicyReply:
-        if isinstance(one, Refusal):
-            return one
-        slot = self._slot(one)
-        if isinstance(one, EndRequest):
-            self._end((one.run, one.episode), slot)
-            return EpisodeReply(*one.signature)
+    def _reply(self, request: Any) -> PolicyReply:
+        if isinstance(request, Refusal):
+            return request
+        slot = self._slot(request)
+        if isinstance(request, EndRequest):
+            self._end((request.run, request.episode), slot)
+            return EpisodeReply(*request.signature)
         if slot is None:
             return Refusal("unknown", "this episode did not begin here, or was dropped")
         slot.used_at_s = time.monotonic()
-        if one.step != slot.step:
-            return Refusal("message", f"step {one.step} was requested after step {slot.step}")
+        if request.step != slot.step:
+            return Refusal("message", f"step {request.step} was requested after step {slot.step}")
         return slot.reply
 
-    def _begin(self, one: ResetRequest) -> PolicyReply:
-        key = one.run, one.episode
-        slot = self._slot(one)
+    def _begin(self, request: ResetRequest) -> PolicyReply:
+        key = request.run, request.episode
+        slot = self._slot(request)
         if slot is not None and slot.step < 0:  # a repeated request: the reply was lost
             return slot.reply
         self._end(key, self._slots.get(key))
@@ -401,13 +402,13 @@ class PolicyDesk:
         if self.at_once and not self._idle:
             return Refusal("busy", "this policy answers for one episode at a time: serve its class")
         # Two runs of one seed may begin at once: the names of their episodes must differ.
-        taken = any(other.called == one.episode for other in self._slots.values())
-        called = f"{one.episode}-{one.run[:4]}" if taken else one.episode
-        self._slots[key] = slot = _Slot(called, one.attempt)
+        taken = any(other.episode_name == request.episode for other in self._slots.values())
+        episode_name = f"{request.episode}-{request.run[:4]}" if taken else request.episode
+        self._slots[key] = slot = _Slot(episode_name, request.attempt)
         with self._call([slot], "reset"):
             slot.policy = self.policy if self.batches else (self._idle or [self._make()]).pop()
-            slot.policy.reset(slot.called, one.seed)
-            slot.reply = EpisodeReply(*one.signature)
+            slot.policy.reset(slot.episode_name, request.seed)
+            slot.reply = EpisodeReply(*request.signature)
         return slot.reply
 
     def _end(self, key: tuple[str, str], slot: _Slot | None) -> None:
@@ -417,14 +418,14 @@ class PolicyDesk:
             self._idle.append(slot.policy)
         if self._for_many and callable(ended := getattr(slot.policy, "ended", None)):
             with self._call([slot], "ended"):
-                ended(slot.called)
+                ended(slot.episode_name)
 
     def _forget(self) -> None:
         """Close idle episodes, and the longest idle one if there are too many."""
         now = time.monotonic()
         slots = sorted(self._slots.items(), key=lambda item: item[1].used_at_s)
         for number, (key, slot) in enumerate(slots):
-            if now - slot.used_at_s > self._forget_after_s or len(slots) - number >= _MOST_SLOTS:
+            if now - slot.used_at_s > self._forget_after_s or len(slots) - number >= _MAX_SLOTS:
                 self._end(key, slot)
 
     def _act(self, requests: list[tuple[_Slot, ActRequest, Any]]) -> None:
@@ -434,22 +435,22 @@ class PolicyDesk:
         for group in [ready] * bool(ready) if self.batches else [[one] for one in ready]:
             self._answer(group)
 
-    def _observation(self, slot: _Slot, one: ActRequest, memory: Any) -> Any:
+    def _observation(self, slot: _Slot, request: ActRequest, memory: Any) -> Any:
         """Decode an observation and report a reset to the policy; None if refused."""
-        slot.step = one.step
+        slot.step = request.step
         slot.used_at_s = time.monotonic()
         try:
-            if slot.decoder is None or one.about is not None:
-                slot.decoder = self._decoder(slot.called, one.about or EpisodeConstants())
-            arrays = {name: unpack_array(array, memory) for name, array in one.arrays.items()}
-            observation = slot.decoder.decoded(one, arrays)
+            if slot.decoder is None or request.about is not None:
+                slot.decoder = self._decoder(slot.episode_name, request.about or EpisodeConstants())
+            arrays = {name: unpack_array(array, memory) for name, array in request.arrays.items()}
+            observation = slot.decoder.decoded(request, arrays)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the message
             slot.reply = Refusal("message", f"not an observation: {error}"[:LONGEST_MESSAGE])
             return None
         earlier = slot.reply
-        if one.reset and callable(on_reset := getattr(slot.policy, "on_reset", None)):
-            with self._call([slot], "on_reset", one.tick):
-                on_reset(*([slot.called] if self._for_many else []))
+        if request.reset and callable(on_reset := getattr(slot.policy, "on_reset", None)):
+            with self._call([slot], "on_reset", request.tick):
+                on_reset(*([slot.episode_name] if self._for_many else []))
         return observation if slot.reply is earlier else None
 
     def _answer(self, group: list[tuple[_Slot, ActRequest, Any]]) -> None:
@@ -527,12 +528,12 @@ def unpack_array(array: PackedArray, memory: Any = None) -> Any:
     return np.frombuffer(memory, array.dtype, count, array.at).reshape(array.shape).copy()
 
 
-def _packed_answer(one: ActRequest, answer: Any) -> ActReply:
+def _packed_answer(request: ActRequest, answer: Any) -> ActReply:
     """Serialize an answer. Raises PolicyFault if invalid, and any exception of its attributes."""
     if isinstance(answer, dict) and set(answer) == {"v_mps", "w_radps"}:
         answer = SimpleNamespace(**answer)
     if not (hasattr(answer, "v_mps") and hasattr(answer, "w_radps")):
-        return ActReply(*one.signature, one.step, waypoints=_packed_waypoints(answer))
+        return ActReply(*request.signature, request.step, waypoints=_packed_waypoints(answer))
     speeds = answer.v_mps, answer.w_radps
     numbers = (int, float, np.integer, np.floating)
     if not all(isinstance(v, numbers) and not isinstance(v, bool) for v in speeds):
@@ -540,10 +541,9 @@ def _packed_answer(one: ActRequest, answer: Any) -> ActReply:
         raise PolicyFault(f"answered {shown}: both must be finite numbers")
     huge = (isinstance(v, int) and v.bit_length() > 1000 for v in speeds)
     v_mps, w_radps = (np.inf if large else float(v) for v, large in zip(speeds, huge))
+    reply = *request.signature, request.step, v_mps, w_radps
     plan = getattr(answer, "waypoints", None)
-    if plan is None:
-        return ActReply(*one.signature, one.step, v_mps, w_radps)
-    return ActReply(*one.signature, one.step, v_mps, w_radps, _packed_waypoints(plan), planned=True)
+    return ActReply(*reply) if plan is None else ActReply(*reply, _packed_waypoints(plan), True)
 
 
 def _packed_waypoints(answer: Any) -> PackedArray:
@@ -554,7 +554,7 @@ def _packed_waypoints(answer: Any) -> PackedArray:
         shown = repr(answer)
         shown = shown if len(shown) <= 80 and shown.isprintable() else f"a {type(answer).__name__}"
         raise PolicyFault(f"answered {shown}: neither a Command nor waypoints")
-    if array.nbytes > _MOST_ANSWER_BYTES:
+    if array.nbytes > _MAX_ANSWER_BYTES:
         return PackedArray(array.dtype.str, array.shape)
     return pack_array(array)
 
@@ -659,8 +659,8 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
         host = "localhost" if ip_address(host).is_loopback else host
     if host != "localhost" and not insecure and not (tls and found[1] == "tls"):
         raise ValueError(
-            f"{found[0]} is beyond this machine and unguarded: whoever can reach it may ask the "
-            "policy. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
+            f"{found[0]} is beyond this machine and unguarded: anyone who can reach it may query "
+            "the policy. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
         )
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",

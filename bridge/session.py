@@ -81,14 +81,14 @@ class Query:
                 query.reply_err(words.encode())
 
 
-QueryOutcome = Literal["answered", "refused", "late", "nobody"]
-"""Result of a query: reply, error reply, timeout, or no queryable."""
+QueryOutcome = Literal["answered", "refused", "timeout", "unserved"]
+"""Outcome of a query: reply, error reply, timeout, or no queryable on its key."""
 
 
 class QueryResult(NamedTuple):
     """Result of a query with the payload of its reply."""
 
-    how: QueryOutcome
+    outcome: QueryOutcome
     payload: bytes = b""
 
 
@@ -126,7 +126,7 @@ class Session:
     @property
     def inside(self) -> Connection:
         """Connection of processes on this machine."""
-        assert self._inside is not None, "this session listens nowhere"
+        assert self._inside is not None, "this session does not listen"
         return self._inside
 
     @property
@@ -155,10 +155,10 @@ class Session:
 
         self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
 
-    def collect(self, key: str, take: Callable[[Query], None], *, found: bool = False) -> None:
-        """Pass queries on `key` to `take`, in a thread of Zenoh that must not block.
+    def serve_later(self, key: str, take: Callable[[Query], None], *, found: bool = False) -> None:
+        """Pass queries on `key` to `take`, which answers them later from any thread.
 
-        The query is answered later.
+        take: Called in a thread of Zenoh that must not block.
         found: See `serve`; such a query is answered on `key`.
         """
 
@@ -172,7 +172,7 @@ class Session:
 
         self._queryables.append(self._session.declare_queryable(key, collected, complete=True))
 
-    def send(
+    def send_query(
         self,
         key: str,
         payload: bytes,
@@ -205,7 +205,7 @@ class Session:
             consolidation=zenoh.ConsolidationMode.NONE,
         )
 
-    def stand(self, key: str) -> Callable[[], None]:
+    def declare_token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token at `key`; return a function that removes it."""
         token = self._session.liveliness().declare_token(key)
         self._tokens.append(token)
@@ -216,12 +216,12 @@ class Session:
 
         return leave
 
-    def watch(
+    def watch_tokens(
         self, key: str, changed: Callable[[str, bool], None], *, ordered: bool = False
     ) -> None:
         """Call `changed(key, alive)` for every liveliness token at a key, now and later.
 
-        ordered: See `listen`.
+        ordered: See `subscribe`.
         """
 
         def received(sample: zenoh.Sample) -> None:
@@ -233,15 +233,15 @@ class Session:
             )
         )
 
-    def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
+    def query_all(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
         """Return all replies to an empty query on a key expression by key, without errors."""
         replies = self._session.get(key, timeout=timeout_s)
         return {
             str(r.ok.key_expr): bytes(r.ok.payload.to_bytes()) for r in replies if r.ok is not None
         }
 
-    def tell(self, key: str, payload: bytes) -> None:
-        """Publish; slow subscribers miss messages."""
+    def publish_lossy(self, key: str, payload: bytes) -> None:
+        """Publish a message that slow subscribers may miss."""
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
     def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
@@ -249,8 +249,9 @@ class Session:
         self._publishers[key].put(payload, attachment=attachment or None)
 
     def advertise(self, key: str, *, latched: int = 0) -> None:
-        """Declare a reliable publisher of a key. The first messages may miss a subscriber that
-        connects at the same moment.
+        """Declare a reliable publisher of a key.
+
+        A subscriber that connects at the same moment may miss the first messages.
 
         latched: Number of messages that later subscribers also get, if they query the history.
         """
@@ -284,7 +285,7 @@ class Session:
         status: Any = publisher.matching_status  # a bool in Zenoh's stubs
         return bool(status.matching)
 
-    def listen(
+    def subscribe(
         self,
         key: str,
         handler: Callable[[str, bytes, bytes], None],
@@ -321,7 +322,7 @@ class Session:
                 self._session.declare_subscriber(key, _handler(received, ordered))
             )
 
-    def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryResult:
+    def query_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryResult:
         """Send one query and return its first result."""
         began_s = time.monotonic()
         # Consolidation would delay a reply until all other queryables have finished.
@@ -335,9 +336,9 @@ class Session:
             if message != b"Timeout":
                 return QueryResult("refused", message)
         # If both ends time out at once, a query may end without that message.
-        return QueryResult("late" if time.monotonic() - began_s >= timeout_s else "nobody")
+        return QueryResult("timeout" if time.monotonic() - began_s >= timeout_s else "unserved")
 
-    def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+    def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Return the reply to a query, with retries until the timeout.
 
         Raises TimeoutError without a reply, EngineError for an error reply.
@@ -345,14 +346,14 @@ class Session:
         deadline = time.monotonic() + timeout_s
         pause_s = _FIRST_RETRY_S
         while (left_s := deadline - time.monotonic()) > 0:
-            result = self.ask_once(key, payload, timeout_s=left_s)
-            if result.how == "answered":
+            result = self.query_once(key, payload, timeout_s=left_s)
+            if result.outcome == "answered":
                 return result.payload
-            if result.how == "refused":
+            if result.outcome == "refused":
                 raise EngineError(f"'{key}' answered: {result.payload.decode(errors='replace')}")
             time.sleep(min(pause_s, max(deadline - time.monotonic(), 0.0)))
             pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
-        raise TimeoutError(f"nobody answered on '{key}' for {timeout_s:g} s")
+        raise TimeoutError(f"no reply on '{key}' within {timeout_s:g} s")
 
     def close(self) -> None:
         """Close the session; safe to call twice."""
@@ -386,7 +387,10 @@ class Session:
 
 
 def _handler(received: Callable[[zenoh.Sample], None], ordered: bool) -> Any:
-    """Return Zenoh's handler of a subscription. ordered: See `Session.listen`."""
+    """Return Zenoh's handler of a subscription.
+
+    ordered: See `Session.subscribe`.
+    """
     return zenoh.handlers.Callback(received, indirect=False) if ordered else received
 
 
@@ -405,7 +409,7 @@ def _objection(query: zenoh.Query, key: str, *, found: bool) -> str:
 
 
 class LocalSession(Session):
-    """Session within one thread, without a socket: `ask` runs the handler itself.
+    """Session within one thread, without a socket: `query` runs the handler itself.
 
     Query and reply are publications, because Zenoh's queries use a timer thread that adds latency
     on a busy machine. An interrupt of the calling thread interrupts the handler.
@@ -420,28 +424,28 @@ class LocalSession(Session):
         self._served: list[tuple[_Subscriber, _Subscriber, Handler]] = []
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
-        """Answer queries on `key` in `ask`."""
-        # Only the newest message: an interrupted `ask` may have left an older one.
+        """Answer queries on `key` in `query`."""
+        # Only the newest message: an interrupted `query` may have left an older one.
         question = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
         answer = self._session.declare_subscriber(f"{key}/{_ANSWER}", zenoh.handlers.RingChannel(1))
         self._subscribers += [question, answer]
         self._served.append((question, answer, handler))
 
-    def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+    def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Return the reply of the handler.
 
         Raises TimeoutError at once if the key is not served, EngineError if its handler raised.
         """
         self._session.put(key, payload)
         for question, answer, handler in self._served:
-            if (query := question.try_recv()) is not None:
-                self._answer(f"{key}/{_ANSWER}", handler, query.payload.to_bytes())
+            if (received := question.try_recv()) is not None:
+                self._answer(f"{key}/{_ANSWER}", handler, received.payload.to_bytes())
                 reply = answer.try_recv()
                 assert reply is not None  # it was put in this thread
                 if reply.attachment is not None:
                     raise EngineError(f"'{key}' answered: {reply.payload.to_string()}")
                 return bytes(reply.payload.to_bytes())
-        raise TimeoutError(f"nobody answers on '{key}'")
+        raise TimeoutError(f"'{key}' is not served in this session")
 
     def _answer(self, key: str, handler: Handler, payload: bytes) -> None:
         try:
@@ -452,10 +456,11 @@ class LocalSession(Session):
             self._session.put(key, answer)
 
 
-def open_session(connection: Connection, say: Callable[[str], None] = lambda _: None) -> Session:
+def open_session(connection: Connection, warn: Callable[[str], None] = lambda _: None) -> Session:
     """Open one end of a session: a hub if it listens, else a client of the hub it connects to.
 
-    say: Called once it is open with each warning: insecure settings, expiring certificates.
+    warn: Called with each warning once the session is open: insecure settings, expiring
+        certificates.
     Raises AccessError for invalid certificates on either side (a retry is useless), EngineError if
     the endpoint is in use or does not answer.
 
@@ -463,13 +468,13 @@ def open_session(connection: Connection, say: Callable[[str], None] = lambda _: 
     >>> with open_session(Connection(role="coordinator", listen="tcp/127.0.0.1:7461")) as hub:
     ...     with open_session(hub.inside) as one:
     ...         hub.serve("cosim/r/status", lambda payload: payload.upper())
-    ...         one.ask("cosim/r/status", b"well?", timeout_s=60.0)
+    ...         one.query("cosim/r/status", b"well?", timeout_s=60.0)
     b'WELL?'
     """
     notices = connection_warnings(connection)
     session = _listening(connection) if connection.listen else _connected(connection)
     for line in notices:
-        say(line)
+        warn(line)
     return session
 
 
@@ -484,9 +489,7 @@ def connection_warnings(connection: Connection) -> list[str]:
 
 
 def _listening(connection: Connection) -> Session:
-    remedy = (
-        "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
-    )
+    remedy = "Choose an address of this machine and a free port, like tcp/127.0.0.1:7450."
     failure = f"cannot listen at {connection.listen}"
     if connection.listen.startswith("unixsock-stream/"):
         inside = Connection(role=connection.role, connect=connection.listen)

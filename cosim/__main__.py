@@ -30,7 +30,10 @@ def main() -> None:
         try:
             from cosim.cli.app import main
         except ImportError as error:
-            print(f"error: {error}. The set-up is not whole: `make run` mends it", file=sys.stderr)
+            print(
+                f"error: {error}. The installation is incomplete: `make run` repairs it",
+                file=sys.stderr,
+            )
             raise SystemExit(machine.EXIT_CODE) from None
         main()
     except KeyboardInterrupt:

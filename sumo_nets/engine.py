@@ -191,7 +191,10 @@ def close() -> None:
 
 
 class sumo_errors:
-    """Context that raises SUMO's exceptions as EngineError. doing: the action, for the message."""
+    """Context that raises SUMO's exceptions as EngineError.
+
+    doing: the action, for the message.
+    """
 
     def __init__(self, doing: str) -> None:
         self._doing = doing

@@ -14,15 +14,15 @@ from bridge.ros2.types import NO_HASH, from_cdr
 from cosim.core.geometry import Floats
 from cosim.core.state import Command
 from cosim.spec.odometry import Odometry
-from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, TAKEN, Ros2Wait
+from cosim.spec.ros2 import CMD_VEL, COMMAND_TOPICS, MAX_MESSAGE_B, PLAN, Ros2Wait
 
-TWIST, TWIST_STAMPED = COMMAND_TYPES = TAKEN[CMD_VEL]
-(PATH,) = TAKEN[PLAN]
+TWIST, TWIST_STAMPED = COMMAND_TYPES = COMMAND_TOPICS[CMD_VEL]
+(PATH,) = COMMAND_TOPICS[PLAN]
 _TWIST_B: Final = 52
 """Size of a Twist in bytes, by which it is known where keys do not name the type."""
 _WALL_NS: Final = 10**18
 """Stamps above are of a wall clock, in nanoseconds."""
-_MOST_POINTS: Final = 32
+_MAX_POINTS: Final = 32
 """Largest number of points of a plan that are recorded."""
 _FRAMES: Final = ("", "map", "odom")
 """Frames in which a plan is read."""
@@ -34,7 +34,10 @@ FaultKind = Literal[
 
 
 class Fault(NamedTuple):
-    """Why a message is refused. words: its publisher and the remedy."""
+    """Why a message is refused.
+
+    words: its publisher and the remedy.
+    """
 
     topic: str
     kind: FaultKind
@@ -44,7 +47,7 @@ class Fault(NamedTuple):
 class Received(NamedTuple):
     """A received message.
 
-    payload: Its bytes; empty if it is longer than `LARGEST_B`.
+    payload: Its bytes; empty if it is longer than `MAX_MESSAGE_B`.
     type, hash: From its key; "" if the key does not name them.
     sender: The gid of its publisher; empty if it is not known.
     by: Its publisher in words.
@@ -125,14 +128,14 @@ def fault_of_form(got: Received, topic: str, wanted_hash: str, *, attached: bool
     attached: Whether the dialect has attachments.
     """
     kind: FaultKind
-    if got.type and got.type not in TAKEN[topic]:
+    if got.type and got.type not in COMMAND_TOPICS[topic]:
         kind = "type"
-        words = f"publishes {topic} as {got.type}: publish {' or '.join(TAKEN[topic])}"
+        words = f"publishes {topic} as {got.type}: publish {' or '.join(COMMAND_TOPICS[topic])}"
     elif got.hash and got.hash != wanted_hash:
         kind, words = "hash", hash_fault(got.type, got.hash, wanted_hash)
-    elif got.size_b > LARGEST_B:
+    elif got.size_b > MAX_MESSAGE_B:
         kind = "size"
-        words = f"sends {got.size_b} bytes on {topic}: a message has at most {LARGEST_B}"
+        words = f"sends {got.size_b} bytes on {topic}: a message has at most {MAX_MESSAGE_B}"
     elif attached and not got.sender:
         kind = "attachment"
         words = f"sends {topic} without the attachment of rmw_zenoh: see --ros2-dialect"
@@ -180,7 +183,7 @@ def plan_points(
     points = np.array([(one.pose.position.x, one.pose.position.y) for one in path.poses])
     if not np.isfinite(points).all():
         return refused("number", "with positions that are not finite numbers")
-    chosen = np.linspace(0, len(points) - 1, min(len(points), _MOST_POINTS)).round().astype(int)
+    chosen = np.linspace(0, len(points) - 1, min(len(points), _MAX_POINTS)).round().astype(int)
     heading = pose.heading_rad or 0.0
     cos, sin = math.cos(heading), math.sin(heading)
     offset = points[chosen] - (pose.x_m, pose.y_m)
@@ -189,15 +192,15 @@ def plan_points(
 
 
 class Inbox:
-    """Unread messages of a topic, at most `most` of them and `most_b` bytes.
+    """Unread messages of a topic, at most `most` of them and `max_b` bytes.
 
     newest: Whether the oldest message is dropped if it is full, instead of the new one.
     """
 
-    def __init__(self, *, newest: bool, most: int = 1024, most_b: int = 4 << 20) -> None:
+    def __init__(self, *, newest: bool, most: int = 1024, max_b: int = 4 << 20) -> None:
         self._newest = newest
         self._most = most
-        self._most_b = most_b
+        self._max_b = max_b
         self._lock = threading.Lock()
         self._messages: deque[Received] = deque()
         self._held_b = 0
@@ -210,7 +213,7 @@ class Inbox:
         with self._lock:
             self._messages.append(got)
             self._held_b += len(got.payload)
-            while len(self._messages) > self._most or self._held_b > self._most_b:
+            while len(self._messages) > self._most or self._held_b > self._max_b:
                 lost = self._messages.popleft() if self._newest else self._messages.pop()
                 self._held_b -= len(lost.payload)
 

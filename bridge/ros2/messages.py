@@ -25,7 +25,7 @@ from cosim.episode.interfaces import Observation
 from cosim.spec.camera import Calibration
 from cosim.spec.goal import Instruction, PointGoal
 from cosim.spec.odometry import Odometry
-from cosim.spec.ros2 import ORIGIN_S, SENT
+from cosim.spec.ros2 import ORIGIN_S, PUBLISHED_TOPICS
 from cosim.spec.sensors import Imu, Scan
 
 _NS: Final = 1_000_000_000
@@ -38,7 +38,7 @@ LIDAR: Final = "lidar_link"
 IMU: Final = "imu_link"
 _JPEG_QUALITY: Final = 90
 """Quality of compressed pictures, of 100."""
-_LEAST_RANGE_M: Final = 0.05
+_MIN_RANGE_M: Final = 0.05
 """Smallest range of the lidar in metres."""
 _OPTICAL_IN_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Axes of an optical frame in the frame of its camera: z ahead, x right, y down."""
@@ -236,7 +236,7 @@ def laser_scan(scan: Scan, time_ns: int) -> Any:
         step,
         0.0,
         0.0,
-        _LEAST_RANGE_M,
+        _MIN_RANGE_M,
         spec.range_m,
         np.ascontiguousarray(scan.ranges_m[0], np.float32),
         np.zeros(0, np.float32),
@@ -298,7 +298,10 @@ def depth_image(depth: NDArray[np.float32], time_ns: int) -> Any:
 
 
 def camera_info(camera: Calibration, size: tuple[int, int], time_ns: int) -> Any:
-    """Return the calibration of a camera. size: width and height in pixels."""
+    """Return the calibration of a camera.
+
+    size: width and height in pixels.
+    """
     wide, high = size
     matrix = np.ascontiguousarray(camera.matrix, float)
     whole = message("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -376,7 +379,7 @@ class Topic(NamedTuple):
     @property
     def type(self) -> str:
         """Type of its messages."""
-        return SENT[self.name]
+        return PUBLISHED_TOPICS[self.name]
 
 
 _LATCHED: Final = Qos(depth=1, latched=True)

@@ -22,7 +22,7 @@ from bridge.ros2.wire import (
     type_hash,
 )
 from bridge.session import Session
-from cosim.spec.ros2 import LARGEST_B, Ros2Dialect, Ros2Distro
+from cosim.spec.ros2 import MAX_MESSAGE_B, Ros2Dialect, Ros2Distro
 
 NAME: Final = "cosim"
 """Name of the node of a run."""
@@ -38,7 +38,10 @@ class Network(NamedTuple):
 
 
 class _Publisher(NamedTuple):
-    """A declared publisher. numbers: a list with its last sequence number."""
+    """A declared publisher.
+
+    numbers: a list with its last sequence number.
+    """
 
     key: str
     type: str
@@ -71,7 +74,7 @@ class Ros2Node:
         self._entities = 0
         self.tokens_changed_s = time.monotonic()
         self._show(Endpoint("NN", network.domain, session.id, name, namespace=self._namespace))
-        session.watch(self._dialect.tokens, self._token, ordered=ordered)
+        session.watch_tokens(self._dialect.tokens, self._token, ordered=ordered)
 
     @property
     def _namespace(self) -> str:
@@ -121,7 +124,7 @@ class Ros2Node:
             with self.changed:
                 self.changed.notify_all()
 
-        self._session.listen(key, received, ordered=self._ordered)
+        self._session.subscribe(key, received, ordered=self._ordered)
 
     def wait_for(self, holds: Callable[[], object], timeout_s: float) -> bool:
         """Wait until a condition holds; it is tested after each message and change of tokens."""
@@ -194,7 +197,7 @@ class Ros2Node:
     def _show(self, end: Endpoint) -> str:
         """Declare the token of an entity, and return it."""
         token = self._dialect.token(end)
-        self._session.stand(token)
+        self._session.declare_token(token)
         return token
 
     def _token(self, token: str, alive: bool) -> None:
@@ -226,5 +229,5 @@ class Ros2Node:
         if self._dialect.names_type:
             _, name, hash = key.rsplit("/", 2)
         size_b = len(payload)
-        kept = payload if size_b <= LARGEST_B else b""
+        kept = payload if size_b <= MAX_MESSAGE_B else b""
         return Received(kept, ros_type(name), hash, sender, by, size_b)

@@ -24,14 +24,17 @@ _SECTION: Final = "§"
 
 
 class Qos(NamedTuple):
-    """Quality of service, always reliable. latched: transient local durability."""
+    """Quality of service, always reliable.
+
+    latched: transient local durability.
+    """
 
     depth: int = 10
     latched: bool = False
 
     @property
     def text(self) -> str:
-        """Return its text in a token; defaults stay empty.
+        """Text in a token; defaults are empty.
 
         >>> Qos().text, Qos(depth=1, latched=True).text
         ('::,10:,:,:,,', ':1:,1:,:,:,,')
@@ -62,7 +65,7 @@ class Endpoint(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        """Return its node for messages, as "/robot/driver" or "a node of session 1a2b"."""
+        """Node for messages, as "/robot/driver" or "a node of session 1a2b"."""
         if not self.node:
             return f"a node of session {self.session[:8]}"
         return f"{self.namespace.rstrip('/')}/{self.node}"
@@ -237,7 +240,11 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """Metadata of a message. number: sequence number from 1; time_ns: since 1970."""
+    """Metadata of a message.
+
+    number: sequence number from 1
+    time_ns: since 1970.
+    """
 
     number: int
     time_ns: int
@@ -245,7 +252,7 @@ class Attachment(NamedTuple):
 
     @property
     def data(self) -> bytes:
-        """Return its 33 bytes.
+        """The 33 bytes of the attachment.
 
         >>> Attachment(1, 0, bytes(16)).data[16]
         16

@@ -99,7 +99,7 @@ def issue(
         )
     if role not in HUBS and names:
         raise UsageError(
-            f"--host is for those who listen, and the role {role} does not: leave out --host"
+            f"--host is for roles that listen, and the role {role} connects: leave out --host"
         )
     _issue(folder, role, names, days, datetime.now(UTC))
     return place

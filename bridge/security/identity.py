@@ -94,7 +94,7 @@ def checked_identity(connection: Connection, now: datetime | None = None) -> str
             f"`cosim certs`"
         )
     if connection.listen and not found.hosts:
-        raise AccessError(f"{folder / CERTIFICATE} names no host: make it anew with --host")
+        raise AccessError(f"{folder / CERTIFICATE} names no host: issue another with --host")
     renew = f"`cosim certs role ... {found.role} --renew` makes another"
     if now > found.ends:
         raise AccessError(
@@ -160,9 +160,9 @@ _OF_THE_HUB: Final = {
     18: _OTHER_AUTHORITY,
     19: _OTHER_AUTHORITY,
     20: _OTHER_AUTHORITY,
-    26: "is not of one who listens: a coordinator, a director or a policy server",
-    62: "is not for the name {host}: connect to a name of it, or make it anew with --host {host}",
-    64: "is not for the address {host}: connect to a name of it, or make it anew with --host "
+    26: "is not of a role that listens: a coordinator, a director or a policy server",
+    62: "is not for the name {host}: connect to a name of it, or issue another with --host {host}",
+    64: "is not for the address {host}: connect to a name of it, or issue another with --host "
     "{host}",
 }
 """Faults of the hub's certificate by OpenSSL's error numbers (X509_V_ERR_...)."""
@@ -172,7 +172,7 @@ _OF_OURS: Final = {
     "CERTIFICATE_EXPIRED": "has expired there: are the clocks of both machines right?",
     "CERTIFICATE_REQUIRED": "was not shown",
     "BAD_CERTIFICATE": "was not accepted there",
-    "UNSUPPORTED_CERTIFICATE": "is not of one who connects",
+    "UNSUPPORTED_CERTIFICATE": "is not of a role that connects",
 }
 """Faults of our certificate by the end of the TLS alert's name."""
 

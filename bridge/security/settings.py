@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from cosim.spec.connection import Connection, Role
-from cosim.spec.ros2 import SENT, TAKEN
+from cosim.spec.ros2 import COMMAND_TOPICS, PUBLISHED_TOPICS
 
 _ENV = "cosim/*/env/*"
 
@@ -22,21 +22,21 @@ class _Rights(NamedTuple):
     """Rights of a role, as key expressions.
 
     words: Description for users.
-    ask: Keys it may query.
-    hear: Keys it may subscribe to.
-    answer: Keys on which it may declare queryables.
-    show: Keys of its liveliness tokens.
-    tell: Keys on which it may publish.
-    watch: Keys of the liveliness tokens that it may see.
+    queries: Keys it may query.
+    subscribes: Keys it may subscribe to.
+    serves: Keys on which it may declare queryables.
+    tokens: Keys of its liveliness tokens.
+    publishes: Keys on which it may publish.
+    sees_tokens: Keys of the liveliness tokens that it may see.
     """
 
     words: str
-    ask: tuple[str, ...] = ()
-    hear: tuple[str, ...] = ()
-    answer: tuple[str, ...] = ()
-    show: tuple[str, ...] = ()
-    tell: tuple[str, ...] = ()
-    watch: tuple[str, ...] = ()
+    queries: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
+    serves: tuple[str, ...] = ()
+    tokens: tuple[str, ...] = ()
+    publishes: tuple[str, ...] = ()
+    sees_tokens: tuple[str, ...] = ()
 
 
 def _ros2_keys(topics: Iterable[str]) -> tuple[str, ...]:
@@ -47,43 +47,45 @@ def _ros2_keys(topics: Iterable[str]) -> tuple[str, ...]:
     return (*(form.format(topic) for topic in topics for form in forms), *bare)
 
 
-_ROS2_SENT = _ros2_keys(SENT)
-_ROS2_TAKEN = _ros2_keys(TAKEN)
-_ROS2_HISTORY = tuple(f"{key}/@adv/**" for key in _ROS2_SENT)
+_ROS2_PUBLISHED = _ros2_keys(PUBLISHED_TOPICS)
+_ROS2_COMMANDS = _ros2_keys(COMMAND_TOPICS)
+_ROS2_HISTORY = tuple(f"{key}/@adv/**" for key in _ROS2_PUBLISHED)
 _ROS2_TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
 _EVERYTHING = ("**", *_ROS2_TOKENS, "**/@adv/**")
 """All keys; wildcards do not match a chunk that begins with @."""
 
 RIGHTS: Final[dict[Role, _Rights]] = {
     "coordinator": _Rights(
-        "ask policies and directors", ask=("cosim/*/policy/**", f"{_ENV}/director")
+        "query policies and directors", queries=("cosim/*/policy/**", f"{_ENV}/director")
     ),
     "director": _Rights("nothing elsewhere"),
     "worker": _Rights(
-        "take episodes and tell their results, ask policies and directors",
-        ask=(
+        "take episodes and report their results, query policies and directors",
+        queries=(
             "cosim/*/status",
             "cosim/*/jobs/*",
             "cosim/*/nets/*",
             "cosim/*/policy/**",
             f"{_ENV}/director",
         ),
-        show=("cosim/*/workers/*",),
+        tokens=("cosim/*/workers/*",),
     ),
-    "policy": _Rights("answer as a policy", answer=("cosim/*/policy/**",)),
+    "policy": _Rights("answer as a policy", serves=("cosim/*/policy/**",)),
     "viewer": _Rights(
         "watch",
-        ask=("cosim/*/status", *(f"{_ENV}/{key}" for key in ("status", "log", "camera"))),
-        hear=tuple(f"{_ENV}/{key}" for key in ("clock", "robot", "crowd", "signals", "events")),
+        queries=("cosim/*/status", *(f"{_ENV}/{key}" for key in ("status", "log", "camera"))),
+        subscribes=tuple(
+            f"{_ENV}/{key}" for key in ("clock", "robot", "crowd", "signals", "events")
+        ),
     ),
-    "injector": _Rights("inject pedestrians", ask=(f"{_ENV}/inject", f"{_ENV}/status")),
+    "injector": _Rights("inject pedestrians", queries=(f"{_ENV}/inject", f"{_ENV}/status")),
     "ros2": _Rights(
         "see sensors and drive, as a ROS 2 node",
-        ask=(*_ROS2_SENT, *_ROS2_HISTORY),
-        hear=(*_ROS2_SENT, *_ROS2_HISTORY),
-        show=(*_ROS2_TOKENS, *_ROS2_HISTORY),
-        tell=_ROS2_TAKEN,
-        watch=(*_ROS2_TOKENS, *_ROS2_HISTORY),
+        queries=(*_ROS2_PUBLISHED, *_ROS2_HISTORY),
+        subscribes=(*_ROS2_PUBLISHED, *_ROS2_HISTORY),
+        tokens=(*_ROS2_TOKENS, *_ROS2_HISTORY),
+        publishes=_ROS2_COMMANDS,
+        sees_tokens=(*_ROS2_TOKENS, *_ROS2_HISTORY),
     ),
 }
 """Rights by role."""
@@ -93,7 +95,7 @@ _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
     "policy": ("worker", "coordinator", "policy"),
 }
 """Roles allowed at each hub."""
-_LARGEST_B: Final = {
+_MAX_MESSAGE_B: Final = {
     64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
     1 << 20: (f"{_ENV}/director",),
     1 << 10: (
@@ -154,7 +156,7 @@ def access_settings(connection: Connection) -> dict[str, object]:
             "key_exprs": list(keys),
             "size_limit": size_b,
         }
-        for size_b, keys in _LARGEST_B.items()
+        for size_b, keys in _MAX_MESSAGE_B.items()
     ]
     control = {
         "enabled": True,
@@ -170,22 +172,22 @@ def _rules(role: Role) -> list[dict[str, object]]:
     """Return the access rules of a role, for messages into and out of the hub."""
     may = RIGHTS[role]
     rules = [
-        _rule(f"{role} asks", "ingress", ("query",), may.ask),
-        _rule(f"{role} is answered", "egress", ("declare_queryable", "reply"), may.ask),
-        _rule(f"{role} hears", "ingress", ("declare_subscriber",), may.hear),
-        _rule(f"{role} is told", "egress", ("put",), may.hear),
-        _rule(f"{role} answers", "ingress", ("declare_queryable", "reply"), may.answer),
-        _rule(f"{role} is asked", "egress", ("query",), may.answer),
-        _rule(f"{role} shows", "ingress", ("liveliness_token",), may.show),
-        _rule(f"{role} tells", "ingress", ("put",), may.tell),
-        _rule(f"{role} is heard", "egress", ("declare_subscriber",), may.tell),
+        _rule(f"{role} sends queries", "ingress", ("query",), may.queries),
+        _rule(f"{role} gets replies", "egress", ("declare_queryable", "reply"), may.queries),
+        _rule(f"{role} subscribes", "ingress", ("declare_subscriber",), may.subscribes),
+        _rule(f"{role} gets messages", "egress", ("put",), may.subscribes),
+        _rule(f"{role} serves", "ingress", ("declare_queryable", "reply"), may.serves),
+        _rule(f"{role} gets queries", "egress", ("query",), may.serves),
+        _rule(f"{role} declares tokens", "ingress", ("liveliness_token",), may.tokens),
+        _rule(f"{role} publishes", "ingress", ("put",), may.publishes),
+        _rule(f"{role} gets subscribers", "egress", ("declare_subscriber",), may.publishes),
         _rule(
-            f"{role} watches",
+            f"{role} subscribes to tokens",
             "ingress",
             ("declare_liveliness_subscriber", "liveliness_query"),
-            may.watch,
+            may.sees_tokens,
         ),
-        _rule(f"{role} is shown", "egress", ("liveliness_token", "reply"), may.watch),
+        _rule(f"{role} gets tokens", "egress", ("liveliness_token", "reply"), may.sees_tokens),
     ]
     return [rule for rule in rules if rule["key_exprs"]]
 

@@ -176,7 +176,7 @@ class DemoConfig:
 
     @property
     def collecting(self) -> DemoOptions:
-        """Return the settings of the recorded data. Raises UsageError, SpecError."""
+        """Settings of the recorded data. Raises UsageError, SpecError."""
         from cosim.spec.camera import CameraSpec
         from cosim.spec.demo_options import DemoOptions
         from cosim.spec.sensors import ScanSpec, imu_called, people_called
@@ -238,7 +238,7 @@ def collect_command(
     collecting = demo.collecting
     host = host_of(config)
     expert = inspected_driver(config.policy, host, jobs)
-    options = EpisodeOptions.asked(replace(config, camera=camera_here(config.camera)))
+    options = EpisodeOptions.from_config(replace(config, camera=camera_here(config.camera)))
     source = _source(config, demo)
     began_s = time.monotonic()
     try:
@@ -299,7 +299,7 @@ def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
         out.print(f"Bags: {folder / 'bags'}, one for each episode", highlight=False)
         return
     if (back := found.back) is None:
-        err.print("The data set was whole already: nothing is written.")
+        err.print("The data set was complete already: nothing is written.")
         return
     words = (
         f"Read back: {back.rows} rows and pictures; a picture differs from what was drawn for its "

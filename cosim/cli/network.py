@@ -240,11 +240,11 @@ def listen(
     with session:
         if topic == "events":
             try:
-                print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
+                print(session.query(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
             except TimeoutError as error:
                 raise EngineError(f"{error}: the episode has ended, or is too busy") from error
         received: SimpleQueue[bytes] = SimpleQueue()
-        session.listen(f"{below}/{topic}", lambda _, payload, __: received.put(payload))
+        session.subscribe(f"{below}/{topic}", lambda _, payload, __: received.put(payload))
         ends_at = time.monotonic() + (seconds if seconds is not None else 1e9)
         try:
             while (left_s := ends_at - time.monotonic()) > 0.0:
@@ -312,7 +312,7 @@ def _live_episode_now(
         return EngineError(
             f"no run is on the air at {connect}: start one with `cosim run ... --live {connect}`"
         )
-    statuses = session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S)
+    statuses = session.query_all(keys.EVERY_STATUS, timeout_s=SEARCH_S)
     names = {
         _episode_name(below): below
         for below in sorted(key.removesuffix("/status") for key in statuses)

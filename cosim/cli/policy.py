@@ -18,6 +18,7 @@ from cosim.core.errors import SOME_CRASHED, unknown
 from cosim.spec.run_config import RunConfig, run_connections
 
 if TYPE_CHECKING:
+    from cosim.spec.manifest import Manifest
     from scenarios.tools.policy_check.checks import CheckedPolicy
 
 policy_app = typer.Typer(no_args_is_help=True, help="Checks of policies.")
@@ -99,37 +100,43 @@ def check_policy(
     finally:
         driver.close()
     if as_json:
-        report = {
-            "policy": manifest.name,
-            "version": manifest.version,
-            "source": driver.source_hash,
-            "goal": manifest.goal,
-            "answers": found.answers,
-            "answer_ms": found.answer_ms,
-            "checks": {check: one._asdict() for check, one in found.outcomes.items()},
-        }
-        typer.echo(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
+        _print_json(found, manifest, driver.source_hash)
     else:
-        _print(found)
-        out.print(
-            f"{manifest.name} {manifest.version}, goal {manifest.goal}: {found.count('passed')} "
-            f"passed, {found.count('warning')} doubted, {found.count('failed')} failed, "
-            f"{found.count('does not apply')} do not apply; an answer takes {found.answer_ms:.1f} "
-            f"ms (median of {found.answers})",
-            soft_wrap=True,
-            highlight=False,
-        )
+        _print_outcomes(found, manifest)
         if picture is not None:
             out.print(f"Picture: {picture}{instead}", soft_wrap=True, highlight=False)
     if found.count("failed"):
         raise typer.Exit(SOME_CRASHED)
 
 
-def _print(found: CheckedPolicy) -> None:
+def _print_json(found: CheckedPolicy, manifest: Manifest, source_hash: str) -> None:
+    """Print the outcomes of all checks as one JSON object."""
+    report = {
+        "policy": manifest.name,
+        "version": manifest.version,
+        "source": source_hash,
+        "goal": manifest.goal,
+        "answers": found.answers,
+        "answer_ms": found.answer_ms,
+        "checks": {check: one._asdict() for check, one in found.outcomes.items()},
+    }
+    typer.echo(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
+
+
+def _print_outcomes(found: CheckedPolicy, manifest: Manifest) -> None:
+    """Print a row per check, and a line with their numbers."""
     rows = [
         (name, Text(outcome, _COLOURS[outcome]), seen)
         for name, (outcome, seen) in found.outcomes.items()
     ]
     tables.show(
         out, [*tables.names("check"), *tables.labels(""), *tables.words("what was seen")], rows
+    )
+    out.print(
+        f"{manifest.name} {manifest.version}, goal {manifest.goal}: {found.count('passed')} "
+        f"passed, {found.count('warning')} doubted, {found.count('failed')} failed, "
+        f"{found.count('does not apply')} do not apply; an answer takes {found.answer_ms:.1f} "
+        f"ms (median of {found.answers})",
+        soft_wrap=True,
+        highlight=False,
     )

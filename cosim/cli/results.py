@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -213,7 +214,9 @@ def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run fold
             f"engine failed"
         )
     if scored.untested:
-        lines.append(f"no trajectory tells {', '.join(scored.untested)}: see cosim counterfactual")
+        lines.append(
+            f"not computed from trajectories: {', '.join(scored.untested)}: `cosim counterfactual`"
+        )
     if not scored.differences:
         files = ("record.json", "results.sqlite", *["results.csv"] * scored.table)
         lines.append(f"equal to the bit to {', '.join(files)}")
@@ -258,10 +261,8 @@ def show(
     ] = "",
 ) -> None:
     """Show the table of a run, finished or not, or one episode as a picture from above."""
-    from cosim.cli.run_table import kinds_of, print_by_kind, print_table
-    from cosim.results.finished_run import check_record_file, other_schema
     from cosim.results.run_folder import read_records, read_spec
-    from cosim.results.table import table_of
+    from cosim.results.verified_run import check_record_file
 
     spec = read_spec(folder)
     records = {record.scenario.id: record for record in read_records(folder)}
@@ -281,21 +282,35 @@ def show(
         print_sheet(out, sheet_of_run(folder))
         return
     if episode is None:
-        table = table_of(records.values())
-        print_table(out, table, len(spec.scenarios), folder)
-        print_by_kind(out, table, kinds_of(folder))
-        if words := next(filter(None, map(other_schema, records.values())), ""):
-            out.print(
-                f"{words}: its values are shown as recorded, and pooled rates may be missing",
-                soft_wrap=True,
-                highlight=False,
-            )
+        _show_run(folder, [*records.values()], len(spec.scenarios))
         return
     if episode not in records:
         raise unknown(f"finished episode in {folder}", episode, records)
+    _show_episode(folder, records[episode], picture)
+
+
+def _show_run(folder: Path, records: Sequence[Record], scheduled: int) -> None:
+    """Print the table of a run, with a note if its metrics are of another schema."""
+    from cosim.cli.run_table import kinds_of, print_by_kind, print_table
+    from cosim.results.table import table_of
+    from cosim.results.verified_run import other_schema
+
+    table = table_of(records)
+    print_table(out, table, scheduled, folder)
+    print_by_kind(out, table, kinds_of(folder))
+    if words := next(filter(None, map(other_schema, records)), ""):
+        out.print(
+            f"{words}: its values are shown as recorded, and pooled rates may be missing",
+            soft_wrap=True,
+            highlight=False,
+        )
+
+
+def _show_episode(folder: Path, record: Record, picture: Path | None) -> None:
+    """Print the result of an episode, and draw it from above if it ended. Raises UsageError."""
     from scenarios.tools.viewing.episode_pictures import draw_episode
 
-    record = records[episode]
+    episode = record.scenario.id
     print_episode(out, record)
     if record.ended is None and picture is not None:
         raise UsageError(

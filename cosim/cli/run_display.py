@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from scenarios.runs.run import WorkerConnection
     from scenarios.runs.transport import LockedRun
 
-_MOST_CRASHED = 5
+_MAX_CRASHED = 5
 """Largest number of crashed episodes that are named when a run is resumed."""
 _EXAMPLE_PEDESTRIAN = '{"id": "eve", "path": [{"ahead": 15, "left": 1}]}'
 
@@ -104,7 +104,7 @@ class Terminal(EpisodeBars):
                 stack.enter_context(board.bars)
                 yield board.tell
         except KeyboardInterrupt:
-            self._print_how_to_continue(plan, len(run.folder.finished()))
+            self._print_how_to_continue(plan, len(run.folder.finished_ids()))
             raise typer.Exit(INTERRUPTED) from None
         self.figures = going.figures
 
@@ -153,8 +153,8 @@ def _print_crashed(run: LockedRun) -> None:
     records = read_records(run.folder.path)
     crashed = sorted(one.scenario.id for one in records if one.status == "crashed")
     if crashed:
-        chosen = " ".join(f"--scenario {name}" for name in crashed[:_MOST_CRASHED])
-        more = " ..." if len(crashed) > _MOST_CRASHED else ""
+        chosen = " ".join(f"--scenario {name}" for name in crashed[:_MAX_CRASHED])
+        more = " ..." if len(crashed) > _MAX_CRASHED else ""
         notice(
             f"{len(crashed)} of them crashed, which is a result: --resume does not repeat them. To "
             f"run them again, begin another run with {chosen}{more} and another --out."

@@ -53,7 +53,7 @@ class RemainingWork:
 
     @property
     def share(self) -> float:
-        """Return the share of the run that is done, 0 to 1."""
+        """Share of the run that is done, 0 to 1."""
         if not self._lengths_m:
             return 1.0
         done_m = fsum(

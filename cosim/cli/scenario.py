@@ -226,7 +226,7 @@ def run_own(
 
     `cosim run FILE.toml` has all other options of runs.
     """
-    from cosim.results.run_folder import refuse_used
+    from cosim.results.run_folder import check_unused
     from scenarios.runs.policy_host import host_of, inspected_driver
     from scenarios.suites.user_scenarios.check import checked_own
     from scenarios.suites.user_scenarios.read import read_own
@@ -235,7 +235,7 @@ def run_own(
     check_rerun(config.rerun, len(own.variants))
     if config.out is not None and not config.resume:
         for part in _parts(own, config.out).values():
-            refuse_used(part)
+            check_unused(part)
     with doing(f"checking {file}") as progress:
         suite = checked_own(own, progress)
     manifest = inspected_driver(config.policy, host_of(config), config.jobs or 1).manifest

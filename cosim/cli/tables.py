@@ -12,7 +12,7 @@ from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
-_LEAST_NAME: Final = 12
+_MIN_NAME: Final = 12
 """Characters to which a column of names or words may be folded before a table is divided."""
 _LAYOUTS: Final = ((True, 1), (True, 0), (False, 0))
 """Layouts (edge, padding in characters). The first one that fits is used."""
@@ -91,7 +91,7 @@ def fitted(
             for k, column in enumerate(columns)
         ]
         least = [
-            min(natural[k], _LEAST_NAME) if column.folds else max(_width(column.head), cells[k])
+            min(natural[k], _MIN_NAME) if column.folds else max(_width(column.head), cells[k])
             for k, column in enumerate(columns)
         ]
         parts = _divided(columns, least, out.width)

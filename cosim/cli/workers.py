@@ -193,7 +193,9 @@ def status_command(
     connection = connecting("viewer", "--connect", str(connect), tls, insecure)
     with open_session(connection, notice) as session:
         _show_status(
-            lambda: _status_of_answers(session.answers(keys.EVERY_RUN, timeout_s=5.0), str(connect))
+            lambda: _status_of_answers(
+                session.query_all(keys.EVERY_RUN, timeout_s=5.0), str(connect)
+            )
         )
 
 
@@ -214,12 +216,12 @@ def _status_of_folder(folder: Path) -> tuple[RunStatus, str]:
 
     Raises UsageError if the folder has no run.
     """
-    from cosim.results.run_folder import read_records, read_spec, refuse_in_use
+    from cosim.results.run_folder import check_not_in_use, read_records, read_spec
     from scenarios.runs.status import STATUS_FILE, RunStatus, decode_status
 
     spec = read_spec(folder)
     try:
-        refuse_in_use(folder)
+        check_not_in_use(folder)
         runs = False
     except RunError:
         runs = True

@@ -74,7 +74,7 @@ _IN_USE_FOLDER: Final = ".in-use"
 """Folder with the lists of entries in use."""
 _LOCK: Final = ".lock"
 """File that serializes changes of the lists."""
-_MOST_LISTS: Final = 32
+_MAX_LISTS: Final = 32
 """Number of lists above which a new process removes those of ended processes."""
 
 
@@ -209,7 +209,7 @@ def cache_entries() -> list[CacheEntry]:
 
 def report_uncached(folder: Path, error: Exception) -> None:
     """Print that something could not be cached, once in a process for each message."""
-    _print_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
+    _print_once(f"note: {folder}: not cached, so that the next process computes it again: {error}")
 
 
 @cache
@@ -227,7 +227,7 @@ class _InUseList:
         self._listed = set[str]()
         self._file = lists / f"{os.getpid()}-{secrets.token_hex(4)}"
         with lock(folder / _LOCK):
-            if sum(1 for _ in os.scandir(lists)) > _MOST_LISTS:
+            if sum(1 for _ in os.scandir(lists)) > _MAX_LISTS:
                 _remove_dead_lists(lists)
             self._held = lock(self._file)
             self._held.acquire()

@@ -30,13 +30,13 @@ def limit_threads() -> None:
         os.environ.setdefault(name, "1")
 
 
-def exit_with_parent(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
+def exit_with_parent(parent: int, signal_number: signal.Signals = signal.SIGKILL) -> None:
     """Let Linux signal this process when its parent dies; exit at once if the parent is dead.
 
     parent: process id of the parent.
-    how: the signal.
+    signal_number: signal that this process gets.
     """
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, how)
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal_number)
     if os.getppid() != parent:
         os._exit(1)
 

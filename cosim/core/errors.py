@@ -38,11 +38,11 @@ INTERRUPTED = 130
 BROKEN_PIPE = 141
 """Exit code when the reader of standard output has closed the pipe, as shells use it."""
 
-MOST_LISTED = 40
+MAX_LISTED = 40
 """Maximum number of valid choices that a message lists in full; of more, it lists five."""
 
 
-_MOST_LETTERS = 100
+_MAX_LETTERS = 100
 """Maximum length of a name that is compared with valid ones, in characters."""
 _SHOWN_LETTERS = 60
 """Maximum length of a too long path in a message, in characters."""
@@ -207,7 +207,7 @@ def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
 def listed(name: str, choices: Iterable[str]) -> str:
     """Return all choices in one line; of many, their number and the most similar ones."""
     valid = sorted(choices)
-    if len(valid) <= MOST_LISTED:
+    if len(valid) <= MAX_LISTED:
         return ", ".join(valid) or "none"
     near = get_close_matches(name, valid, n=5, cutoff=0.5)
     return f"{len(valid)}, among them {', '.join(sorted(near) or valid[:5])}"
@@ -215,5 +215,5 @@ def listed(name: str, choices: Iterable[str]) -> str:
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return a question that suggests the most similar valid name; "" if none is similar."""
-    near = get_close_matches(name[:_MOST_LETTERS], sorted(valid), n=1, cutoff=0.5)
+    near = get_close_matches(name[:_MAX_LETTERS], sorted(valid), n=1, cutoff=0.5)
     return f" Did you mean {near[0]}?" if near else ""

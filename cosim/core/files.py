@@ -178,7 +178,7 @@ def _restore(scratch: Path) -> None:
                 old.rename(target)
 
 
-def checked_size(path: Path, most_bytes: int) -> int:
+def checked_size(path: Path, max_bytes: int) -> int:
     """Return the size of a file in bytes. Raises OSError.
 
     Raises ValueError for a larger file, and for a folder, a pipe or a device.
@@ -186,12 +186,12 @@ def checked_size(path: Path, most_bytes: int) -> int:
     about = path.stat()
     if not stat.S_ISREG(about.st_mode):
         raise ValueError("is no regular file")
-    if about.st_size > most_bytes:
-        raise ValueError(f"holds {about.st_size} bytes; at most {most_bytes} are read")
+    if about.st_size > max_bytes:
+        raise ValueError(f"holds {about.st_size} bytes; at most {max_bytes} are read")
     return about.st_size
 
 
-def read_limited(path: Path, most_bytes: int) -> bytes:
+def read_limited(path: Path, max_bytes: int) -> bytes:
     """Read a whole file, unless it is too large. Raises as `checked_size` does."""
-    checked_size(path, most_bytes)
+    checked_size(path, max_bytes)
     return path.read_bytes()

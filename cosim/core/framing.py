@@ -19,16 +19,16 @@ socket."""
 
 
 class MessageSocket:
-    """One end of a message socket. Messages longer than `most_bytes` are refused.
+    """One end of a message socket. Messages longer than `max_bytes` are refused.
 
     Only `send` and `receive` wait: the sender of a message may be stopped in the middle of it.
     """
 
-    def __init__(self, end: socket.socket, most_bytes: int = MAX_MESSAGE_BYTES) -> None:
+    def __init__(self, end: socket.socket, max_bytes: int = MAX_MESSAGE_BYTES) -> None:
         self._end = end
         self._incoming = bytearray()
         self._outgoing = bytearray()
-        self._most_bytes = most_bytes
+        self._max_bytes = max_bytes
 
     def fileno(self) -> int:
         return self._end.fileno()
@@ -90,7 +90,7 @@ class MessageSocket:
         if len(self._incoming) < _LENGTH.size:
             return None
         end = _LENGTH.size + int(_LENGTH.unpack_from(self._incoming)[0])
-        if end > self._most_bytes:
+        if end > self._max_bytes:
             raise EOFError
         if len(self._incoming) < end:
             return None

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from cosim.core.files import checked_size
 
-MOST_NPZ_BYTES: Final = 2 << 30
+MAX_NPZ_BYTES: Final = 2 << 30
 """Maximum size of a file, packed or unpacked, in bytes."""
-_MOST_ARRAYS: Final = 4096
+_MAX_ARRAYS: Final = 4096
 """Maximum number of arrays in a file."""
 _ENDING: Final = ".npy"
 _HEADERS: Final = {
@@ -49,17 +49,17 @@ NPZ_ERRORS: Final = (
 
 
 def read_npz(
-    path: Path, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
+    path: Path, only: Collection[str] | None = None, max_bytes: int = MAX_NPZ_BYTES
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file by name.
 
     only: names of the arrays to read; each of them must exist.
     Raises ValueError with the reason: not a regular file, not an .npz, truncated, damaged, pickled
-    objects, or larger than `most_bytes`. Raises OSError.
+    objects, or larger than `max_bytes`. Raises OSError.
     """
-    checked_size(path, most_bytes)
+    checked_size(path, max_bytes)
     with path.open("rb") as file:
-        return read_open_npz(file, only, most_bytes)
+        return read_open_npz(file, only, max_bytes)
 
 
 def npz_names(path: Path) -> list[str]:
@@ -72,18 +72,17 @@ def npz_names(path: Path) -> list[str]:
 
 
 def read_open_npz(
-    file: BinaryIO, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
+    file: BinaryIO, only: Collection[str] | None = None, max_bytes: int = MAX_NPZ_BYTES
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of an open file by name, as `read_npz` does."""
     try:
         with zipfile.ZipFile(file) as held:
             entries = {one.filename.removesuffix(_ENDING): one for one in held.infolist()}
             size = sum(one.file_size for one in held.infolist())
-            if size > most_bytes or len(held.infolist()) > _MOST_ARRAYS:
+            if size > max_bytes or len(held.infolist()) > _MAX_ARRAYS:
                 count = len(held.infolist())
                 raise ValueError(
-                    f"unpacks to {count} arrays of {size} bytes; at most {most_bytes} bytes "
-                    f"are read"
+                    f"unpacks to {count} arrays of {size} bytes; at most {max_bytes} bytes are read"
                 )
             if lacking := sorted({*(only or ())} - entries.keys()):
                 raise ValueError(f"has no array '{lacking[0]}'")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
-_LEAST_SHARE: Final = 0.02
+_MIN_SHARE: Final = 0.02
 """Completed share below which the remaining time is not estimated."""
-_LEAST_S: Final = 5.0
+_MIN_S: Final = 5.0
 """Time in seconds below which the remaining time is not estimated."""
 
 
@@ -26,6 +26,6 @@ def time_left_s(share: float, since_s: float) -> float | None:
     share: completed share, 0 to 1.
     since_s: time that it took, in seconds.
     """
-    if share < _LEAST_SHARE or since_s < _LEAST_S:
+    if share < _MIN_SHARE or since_s < _MIN_S:
         return None
     return since_s * (1.0 - share) / share

@@ -1,7 +1,7 @@
 """Latency of commands: a policy's answer takes effect some ticks after its observation.
 
 Latency is counted from the observation's tick and rounded up to whole ticks of 0.05 s. The robot
-stands until the first command arrives; then the last arrived command holds. Waypoints become a
+is at rest until the first command arrives; then the last arrived command holds. Waypoints become a
 command when they are answered, in the robot's frame at the observation. They are not corrected for
 later motion, as on the robots of GNM, ViNT and NoMaD. A reset of the robot discards pending
 commands.
@@ -34,7 +34,7 @@ class CommandDelay:
         self.last_arrival_tick = 0
         """Tick at which the last command takes effect."""
 
-    def answered(self, tick: int, delay: int, command: Command) -> None:
+    def add(self, tick: int, delay: int, command: Command) -> None:
         """Add a command for the observation of `tick`, which takes effect `delay` ticks later."""
         self.last_arrival_tick = tick + delay
         self._pending.append((self.last_arrival_tick, command))
@@ -51,7 +51,7 @@ class CommandDelay:
             _, self._current = self._pending.popleft()
         return self._current
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Discard pending commands: the robot was reset and is at rest."""
         self._pending.clear()
         self._current = STILL

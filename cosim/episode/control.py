@@ -19,15 +19,15 @@ from cosim.spec.robot import Robot
 
 EPS_M = 1e-8
 """Coordinate in metres below which a waypoint counts as at the robot."""
-MOST_NUMBERS = 100_000
+MAX_NUMBERS = 100_000
 """Maximum number of numbers in a policy's answer."""
 REAL_KINDS = "iuf"
 """numpy's kinds of real numbers: integers, unsigned integers, floats."""
-_MOST_SHOWN = 80
+_MAX_SHOWN = 80
 """Maximum length of an answer in a message, in characters."""
 _COLUMNS = (2, 4)
 """Valid numbers of columns of waypoints."""
-_MOST_RECORDED = 256
+_MAX_RECORDED = 256
 """Maximum number of recorded waypoints of an answer; all up to the followed one are recorded."""
 _LARGEST = float(np.finfo(np.float32).max)
 """Largest float32."""
@@ -38,8 +38,8 @@ def _command_for(x_m: float, y_m: float, heading_rad: float | None, rule: Waypoi
 
     heading_rad: heading of the waypoint, None without one.
 
-    At the robot's own position the command turns to the heading, or stands without one. Exactly at
-    the side it turns by a quarter turn. Otherwise v = x / dt, and w = arctan(y / x) / dt
+    At the robot's own position the command turns to the heading, or stops without one. Exactly at
+    its side it turns by a quarter turn. Otherwise v = x / dt, and w = arctan(y / x) / dt
     (`shipped`) or atan2(y, x) / dt (`atan2`).
     """
     if abs(x_m) < EPS_M and abs(y_m) < EPS_M:
@@ -60,9 +60,9 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
     """Return the clipped command of a policy's answer.
 
     answer: a Command, or waypoints (N, 2) or (N, 4), of which one is followed (the result is a
-        Planned).
+        WaypointCommand).
     Raises PolicyError with the answer for NaN, infinities, too few waypoints, more than
-    MOST_NUMBERS numbers, and anything else than real numbers.
+    MAX_NUMBERS numbers, and anything else than real numbers.
     """
     if isinstance(answer, Command):
         speeds = (answer.v_mps, answer.w_radps)
@@ -75,18 +75,18 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
         command = clipped(Command(*numbers), robot)
         if not isinstance(answer, WaypointCommand):
             return command
-        return _planned(command, _waypoints(answer.waypoints, rule.index), rule.index)
+        return _with_waypoints(command, _waypoints(answer.waypoints, rule.index), rule.index)
     waypoints = _waypoints(answer, rule.index)
     x, y, *turn = waypoints[rule.index].tolist()
     heading_rad = math.atan2(turn[1], turn[0]) if turn else None
     command = clipped(_command_for(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
     waypoints[:, :2] *= rule.unit_m
-    return _planned(command, waypoints, rule.index)
+    return _with_waypoints(command, waypoints, rule.index)
 
 
-def _planned(command: Command, waypoints: Floats, index: int) -> WaypointCommand:
+def _with_waypoints(command: Command, waypoints: Floats, index: int) -> WaypointCommand:
     """Return a command together with its waypoints in metres."""
-    recorded = np.clip(waypoints[: max(_MOST_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
+    recorded = np.clip(waypoints[: max(_MAX_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
         np.float32
     )
     return WaypointCommand(command.v_mps, command.w_radps, recorded, index)
@@ -124,13 +124,13 @@ def _waypoints(answer: object, index: int) -> Floats:
 
 def check_numbers(shape: Sequence[int]) -> None:
     """Raise PolicyError for an array shape with too many numbers."""
-    if (count := math.prod(shape)) > MOST_NUMBERS:
+    if (count := math.prod(shape)) > MAX_NUMBERS:
         shown = ", ".join(map(str, shape[:4])) + (
             ", ..." if len(shape) > 4 else "," * (len(shape) == 1)
         )
         raise PolicyError(
             f"answered an array of shape ({shown}): {count} numbers; an answer holds at most "
-            f"{MOST_NUMBERS}"
+            f"{MAX_NUMBERS}"
         )
 
 
@@ -146,12 +146,12 @@ def _number(value: object) -> float:
 
 def _shown(value: object) -> str:
     """Return an answer for a message: its repr if it is short and stable, else its type."""
-    if isinstance(value, int) and value.bit_length() > _MOST_SHOWN:
+    if isinstance(value, int) and value.bit_length() > _MAX_SHOWN:
         return f"an integer of {value.bit_length()} bits"
     try:
         text = repr(value)
     except Exception:  # noqa: BLE001  a repr may do anything
         return f"a {type(value).__name__}"
     stable = " at 0x" not in text
-    short = len(text) <= _MOST_SHOWN and text.isprintable()
+    short = len(text) <= _MAX_SHOWN and text.isprintable()
     return text if stable and short else f"a {type(value).__name__}"

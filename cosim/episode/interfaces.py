@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from dataclasses import field as filled
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -87,7 +86,7 @@ class Observation:
     camera: Calibration | None = None
     depth: NDArray[np.float32] | None = None
     labels: NDArray[np.uint8] | None = None
-    pictures: Mapping[str, CameraPicture] = filled(default_factory=dict)
+    pictures: Mapping[str, CameraPicture] = field(default_factory=dict)
     scan: Scan | None = None
     imu: Imu | None = None
     people: Tracks | None = None

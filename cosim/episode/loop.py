@@ -80,15 +80,15 @@ class Moment:
     states: tuple[EventState, ...] = ()
 
 
-def begin(scenario: Scenario, parts: EpisodeEngines) -> Moment:
+def begin(scenario: Scenario, engines: EpisodeEngines) -> Moment:
     """Return the first moment, with the robot at rest at its start."""
-    return Moment(0, parts.world.place(scenario.start_pose), parts.crowd.street, 0.0)
+    return Moment(0, engines.world.place(scenario.start_pose), engines.crowd.street, 0.0)
 
 
 def tick(
     scenario: Scenario,
     clock: Clock,
-    parts: EpisodeEngines,
+    engines: EpisodeEngines,
     now: Moment,
     command: Command,
     frame: Frame | None = None,
@@ -97,9 +97,9 @@ def tick(
 
     frame: camera frame of the observation, if the policy was queried at this tick.
     """
-    reply = parts.director.react(query(scenario, clock, now, parts.world.footprint_m))
-    street_after = parts.crowd.step(now.robot, reply)
-    motion = parts.world.step(command, now.street, street_after, clock.substeps)
+    reply = engines.director.react(query(scenario, clock, now, engines.world.footprint_m))
+    street_after = engines.crowd.step(now.robot, reply)
+    motion = engines.world.step(command, now.street, street_after, clock.substeps)
     route_s_after_m = place_on_route(scenario.route_line, motion.robot.pose, now.route_s_m)
     return Step(
         now.tick,
@@ -115,12 +115,12 @@ def tick(
     )
 
 
-def after(step: Step, reset: Reset | None, parts: EpisodeEngines) -> Moment:
+def after(step: Step, reset: Reset | None, engines: EpisodeEngines) -> Moment:
     """Return the moment after a step; a reset puts the robot elsewhere, at rest."""
     robot = step.motion.robot
     route_s_m = step.route_s_after_m
     if reset is not None:
-        robot = parts.world.place(reset.pose)
+        robot = engines.world.place(reset.pose)
         route_s_m = reset.route_s_m
     return Moment(step.tick + 1, robot, step.street_after, route_s_m, step.events.states)
 

@@ -42,14 +42,14 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
         )
     if settled.cameras and settled.camera is None:
         raise UsageError(
-            f"policy '{manifest.name}' has cameras, but no camera: give its manifest one of "
-            f"them as that"
+            f"policy '{manifest.name}' has further cameras, but no main camera: give its manifest "
+            f"one of them as `camera`"
         )
     if kind.needs_camera and settled.camera is None:
         others = ", ".join(one.name for one in GOALS.values() if not one.needs_camera)
         raise UsageError(
             f"policy '{manifest.name}' has no camera, and goal protocol '{settled.goal}' gives "
-            f"what its camera would show: give its manifest a camera, or choose one of {others}"
+            f"pictures of its camera: give its manifest a camera, or choose one of {others}"
         )
     return settled
 

@@ -127,9 +127,9 @@ class Observer:
 
     manifest: manifest with the goal protocol of the run.
     run_seed: seed of goals and odometry errors, each with its own generator.
-    known: returns the simulator state at a moment.
+    privileged_at: returns the simulator state at a moment.
     cameras: further cameras by name.
-    look: takes pictures for picture goals.
+    take_picture: takes pictures for picture goals.
     rays: rays of lidar and tracked people; without them, a manifest with one raises UsageError.
     """
 
@@ -138,9 +138,9 @@ class Observer:
         scenario: Scenario,
         manifest: Manifest,
         run_seed: int,
-        known: Callable[[Moment], Privileged],
+        privileged_at: Callable[[Moment], Privileged],
         cameras: Mapping[str, Camera],
-        look: TakePicture | None = None,
+        take_picture: TakePicture | None = None,
         rays: RangeSensor | None = None,
     ) -> None:
         def draws(purpose: str) -> np.random.Generator:
@@ -150,9 +150,11 @@ class Observer:
         self._episode_id = episode_id_of(run_seed, scenario).episode
         self._robot = robot_called(scenario.robot)
         self._manifest = manifest
-        self._known = known
+        self._privileged_at = privileged_at
         self._cameras = cameras
-        self._goals = goals_for(manifest.goal, scenario, draws("goal"), manifest.picture_size, look)
+        self._goals = goals_for(
+            manifest.goal, scenario, draws("goal"), manifest.picture_size, take_picture
+        )
         self._odometer = odometer_for(
             manifest.odometry, scenario.start_pose, draws("odometry"), self._robot
         )
@@ -169,27 +171,30 @@ class Observer:
         if manifest.imu != "none":
             self._imu = InertialSensor(manifest.imu, draws("imu"))
 
-    def moved(self, step: Step, put_back: bool) -> None:
-        """Record a tick. `put_back` says that the robot is reset to another pose now."""
+    def moved(self, step: Step, is_reset: bool) -> None:
+        """Record a tick.
+
+        is_reset: whether the robot is reset to another pose after the tick.
+        """
         self._odometer.moved(step.robot.pose, step.motion.robot.pose)
         if self._imu is not None:
             self._imu.moved(step.robot, step.motion.robot)
         if self._tracker is not None:
             self._tracker.moved(step.street)
-        if put_back:
-            self._goals.put_back()
+        if is_reset:
+            self._goals.on_reset()
             if self._tracker is not None:
-                self._tracker.put_back()
+                self._tracker.on_reset()
             if self._imu is not None:
-                self._imu.put_back()
+                self._imu.on_reset()
 
     def observed(
-        self, now: Moment, time_s: float, camera: Camera | None, put_back: bool
+        self, now: Moment, time_s: float, camera: Camera | None, was_reset: bool
     ) -> tuple[Observation, Frame | None]:
         """Return the observation of a moment, and its camera frame.
 
         camera: camera of the policy.
-        put_back: whether the robot was reset since the last observation.
+        was_reset: whether the robot was reset since the last observation.
         """
         robot = now.robot
         spec = self._manifest.camera
@@ -203,9 +208,9 @@ class Observer:
             v_mps=robot.v_mps,
             w_radps=robot.w_radps,
             robot=self._robot,
-            privileged=self._known(now) if self._manifest.privileged else None,
+            privileged=self._privileged_at(now) if self._manifest.privileged else None,
             episode=self._episode_id,
-            reset=put_back,
+            reset=was_reset,
             goal=goal,
             odometry=self._odometer.read(robot.pose, time_s),
             camera=self._calibration,

@@ -92,8 +92,8 @@ class PolicyCaller:
         return {}
 
     @property
-    def spent(self) -> bool:
-        """Whether the policy's process has ended, so that the next episode needs a new driver."""
+    def has_exited(self) -> bool:
+        """Whether the policy's process has ended, so that the next episode needs a new caller."""
         return False
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class PolicyCaller:
 
     @classmethod
     def of(cls, policy: Policy) -> PolicyCaller:
-        """Return the driver of a policy: the policy itself if it is one."""
+        """Return the caller of a policy: the policy itself if it is one."""
         return policy if isinstance(policy, PolicyCaller) else cls(policy)
 
     def reset(self, episode_id: str, seed: int) -> None:
@@ -114,15 +114,15 @@ class PolicyCaller:
         self._begun = episode_id
         self._has_answered = False
         self._route = None
-        with self._asked("reset", 0):
+        with self._guarded("reset", 0):
             self._policy.reset(episode_id, seed)
 
     def act(self, observation: Observation) -> Command:
         """Return the policy's command. Raises PolicyError for an exception or an invalid answer."""
-        own = self._own(observation)
+        own = self._copied_observation(observation)
         if own.reset:
             self._call_on_reset(own.episode, own.tick)
-        with self._asked("act" if self._has_answered else "first act", observation.tick):
+        with self._guarded("act" if self._has_answered else "first act", observation.tick):
             answer = self._policy.act(own)
             if self._on_answer is not None:
                 self._on_answer(answer)
@@ -138,8 +138,10 @@ class PolicyCaller:
         """Set a callback for the reasons for which the policy waits. Most policies give none."""
 
     def ended(self) -> None:
-        """End an episode, if one has started, for a policy that serves many. Exceptions are
-        printed."""
+        """End the episode, if one has started, of a policy that can answer for many at once.
+
+        Exceptions are printed.
+        """
         if self._begun and self.batches:
             self._call_ended(self._begun)
         self._begun = ""
@@ -147,34 +149,32 @@ class PolicyCaller:
     def _call_on_reset(self, episode_id: str, tick: int) -> None:
         """Call the policy's `on_reset`, if it has one. Raises PolicyError."""
         if callable(callback := getattr(self._policy, "on_reset", None)):
-            with self._asked("on_reset", tick):
+            with self._guarded("on_reset", tick):
                 callback(*([episode_id] if self.batches else []))
 
     def _call_ended(self, episode_id: str) -> None:
         """Call the policy's `ended`, if it has one; print its exception."""
         try:
             if callable(callback := getattr(self._policy, "ended", None)):
-                with self._asked("ended", 0):
+                with self._guarded("ended", 0):
                     callback(episode_id)
         except PolicyError as error:
             traceback.print_exception(error)
 
     @contextmanager
-    def _asked(self, doing: PolicyCall, tick: int) -> Iterator[None]:
+    def _guarded(self, doing: PolicyCall, tick: int) -> Iterator[None]:
         """Time a call of the policy. Raises PolicyError for any exception."""
         try:
             with policy_call(doing, tick, self._timer, self._passes):
                 yield
         except (PolicyFault, PolicyError) as error:
             fault = error if isinstance(error, PolicyFault) else PolicyFault(error_text(error))
-            during = when(doing if fault.during != "on_reset" else "on_reset", tick)
-            together = (
-                f", asked for {fault.together} episodes together" if fault.together > 1 else ""
-            )
+            during = call_in_words("on_reset" if fault.during == "on_reset" else doing, tick)
+            together = f", for {fault.together} episodes at once" if fault.together > 1 else ""
             words = f"policy '{self.manifest.name}' {fault.words} ({during}{together})"
             raise PolicyError(words) from fault.__cause__ or error
 
-    def _own(self, observation: Observation) -> Observation:
+    def _copied_observation(self, observation: Observation) -> Observation:
         """Return the observation as copies, without what the manifest does not request."""
         known, pictures = observation.privileged, observation.pictures
         return replace(
@@ -225,7 +225,7 @@ def _copied(picture: NDArray[Any] | None) -> NDArray[Any] | None:
     return None if picture is None else picture.copy()
 
 
-def when(doing: PolicyCall, tick: int) -> str:
+def call_in_words(doing: PolicyCall, tick: int) -> str:
     """Return the kind and time of a call as text: "reset", or "act at 3.20 s"."""
     if doing == "on_reset" or doing.endswith("act"):
         return f"{doing.removeprefix('first ')} at {Clock().time_s(tick):.2f} s"

@@ -17,7 +17,7 @@ from cosim.episode.interfaces import RangeSensor
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 from cosim.spec.sensors import (
-    MOST_TRACKS,
+    MAX_TRACKS,
     TRACKING_RANGE_M,
     Imu,
     ImuKind,
@@ -90,7 +90,7 @@ class Tracker:
         """Record the people before a tick, for velocities."""
         self._past.append(before.people)
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Forget all tracks: the robot was put elsewhere."""
         self._tracks.clear()
 
@@ -113,7 +113,7 @@ class Tracker:
         velocities += noise.velocity_mps * errors[2:]
         far = np.hypot(*positions)
         order = np.argsort(far, kind="stable")
-        order = order[seen[order]][:MOST_TRACKS]
+        order = order[seen[order]][:MAX_TRACKS]
         self._keep({people.ids[i] for i in rows.tolist()}, time_s, before_s)
         names = [people.ids[i] for i in rows[order].tolist()]
         ids = self._ids(names, switch[order], positions.T[order], time_s)
@@ -186,11 +186,9 @@ class InertialSensor:
         kind: ImuKind,
         draws: np.random.Generator,
         noise: ImuNoise = ImuNoise(),  # noqa: B008
-        tick_s: float = Clock().tick_s,
     ) -> None:
         self._draws = draws
         self._noise = noise if kind == "noisy" else None
-        self._tick_s = tick_s
         self._time_s = 0.0
         self._motion: tuple[Trunk, Trunk] | None = None
         biases = np.repeat([noise.gyro_bias_radps, noise.accel_bias_mps2], 3)
@@ -202,7 +200,7 @@ class InertialSensor:
         one, two = before.trunk, after.trunk
         self._motion = None if one is None or two is None else (one, two)
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Forget the motion: the robot was put elsewhere, at rest."""
         self._motion = None
 
@@ -211,10 +209,9 @@ class InertialSensor:
         still = (0.0, 0.0, 0.0)
         rotation = _LEVEL if robot.trunk is None else robot.trunk.rotation
         before, after = self._motion or (Trunk(rotation, still, still),) * 2
-        gyro = _turn(before.rotation, after.rotation, self._tick_s)
+        gyro = _turn(before.rotation, after.rotation, _TICK_S)
         pull = [
-            (v - u) / self._tick_s
-            for u, v in zip(before.velocity_mps, after.velocity_mps, strict=True)
+            (v - u) / _TICK_S for u, v in zip(before.velocity_mps, after.velocity_mps, strict=True)
         ]
         pull[2] += _GRAVITY_MPS2
         values = [*gyro, *_inverse_rotated(after.rotation, pull)]

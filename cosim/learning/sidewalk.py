@@ -38,7 +38,7 @@ FREE_UNIT_M: Final = 10.0
 HAND: Final = 6
 """Label of the activity of a person who holds out a hand, see `scenarios/episodes/labels.py`."""
 _WEIGHTS: Final = {**PLAN_WEIGHTS, "near": 0.5, "free": 1.0, "signal": 0.2, "event": 0.2}
-_MOST_WINDOWS: Final = 96
+_MAX_WINDOWS: Final = 96
 """Largest number of held-out windows of an evaluation."""
 _AT_ONCE: Final = 16
 
@@ -112,7 +112,7 @@ def _errors(
     right signals where there is one, and of right events where there is one.
     """
     found, labels = PlanErrors(), _LabelErrors()
-    starts = examples.held_out_starts(_MOST_WINDOWS)
+    starts = examples.held_out_starts(_MAX_WINDOWS)
     with torch.no_grad():
         for part in np.array_split(starts, -(-len(starts) // _AT_ONCE)):
             batch = examples.windows(part, STEPS)

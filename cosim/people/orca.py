@@ -38,8 +38,8 @@ class HalfPlane(NamedTuple):
 
 
 def half_plane(
-    apart_m: _Vector,
-    mine_mps: _Vector,
+    offset_m: _Vector,
+    own_mps: _Vector,
     other_mps: _Vector,
     radius_m: float,
     horizon_s: float,
@@ -48,20 +48,20 @@ def half_plane(
 ) -> HalfPlane:
     """Return the velocities with which a disk does its share to avoid another one, ORCA^tau.
 
-    apart_m: (2,) vector to the other disk.
-    mine_mps, other_mps: (2,) velocities.
+    offset_m: (2,) vector to the other disk.
+    own_mps, other_mps: (2,) velocities.
     radius_m: sum of both radii.
     horizon_s: tau.
     share: own share of the avoidance: 1/2 if both avoid, 1 if the other does not.
     step_s: time in which overlapping disks are separated.
 
     The velocity obstacle VO^tau is the set of relative velocities that lead into the disk of radius
-    `radius_m` at `apart_m` within tau. It is a cone with a round tip: a disk at apart/tau of radius
-    r/tau, and its tangents. u is the smallest change of the relative velocity to the obstacle's
-    boundary; n is the outward normal there.
+    `radius_m` at `offset_m` within tau. It is a cone with a round tip: a disk of radius r/tau at
+    offset/tau, and its tangents. u is the smallest change of the relative velocity to the
+    obstacle's boundary; n is the outward normal there.
     """
-    ax, ay = float(apart_m[0]), float(apart_m[1])
-    mx, my = float(mine_mps[0]), float(mine_mps[1])
+    ax, ay = float(offset_m[0]), float(offset_m[1])
+    mx, my = float(own_mps[0]), float(own_mps[1])
     rx, ry = mx - float(other_mps[0]), my - float(other_mps[1])
     distance_m = math.hypot(ax, ay)
     if distance_m <= radius_m:

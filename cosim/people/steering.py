@@ -40,7 +40,7 @@ TURNS: Final = tuple(
 )
 """Cosine and sine of the turns that are tried to either side, 10 to 110 degrees."""
 
-LEAST_DISTANCE_SHARE: Final = 0.98
+MIN_DISTANCE_SHARE: Final = 0.98
 """Share of their distance that people closer than two radii keep at least."""
 
 _CROSSING: Final = 0.35
@@ -69,8 +69,8 @@ class Neighbour(NamedTuple):
 class _Disk(NamedTuple):
     """Neighbour relative to the steering person: offset, velocity and distance to keep."""
 
-    apart_m: Vector
-    moving_mps: Vector
+    offset_m: Vector
+    velocity_mps: Vector
     keep_m: float
     share: float
     room_m2: float
@@ -78,9 +78,9 @@ class _Disk(NamedTuple):
 
 
 def steered(
-    at_m: Vector,
-    moving_mps: Vector,
-    wanted_mps: Vector,
+    position_m: Vector,
+    velocity_mps: Vector,
+    preferred_mps: Vector,
     neighbours: Sequence[Neighbour],
     *,
     horizon_s: float = HORIZON_S,
@@ -91,33 +91,39 @@ def steered(
 
     It is exactly the preferred velocity if the way is free, or if that is zero.
 
-    at_m: position.
-    moving_mps: current velocity.
-    wanted_mps: preferred velocity.
+    position_m: position.
+    velocity_mps: current velocity.
+    preferred_mps: preferred velocity.
     neighbours: other people; those beyond STEERING_NEAR_M, or behind and not too close, are
         ignored.
     horizon_s: time horizon; shorter for a person who arrives earlier.
     room_m: preferred distance between centres; less for a person in a hurry.
     walls: half-planes of velocities that stay on the permitted ground.
     """
-    speed_mps = math.hypot(*wanted_mps)
+    speed_mps = math.hypot(*preferred_mps)
     if speed_mps < _EPS:
-        return wanted_mps
-    disks = _relevant_disks(at_m, wanted_mps, neighbours, room_m)
-    if not disks and all(_permits(wall, *wanted_mps) for wall in walls):
-        return wanted_mps
+        return preferred_mps
+    disks = _relevant_disks(position_m, preferred_mps, neighbours, room_m)
+    if not disks and all(_permits(wall, *preferred_mps) for wall in walls):
+        return preferred_mps
     if (
-        math.dist(moving_mps, wanted_mps) < _EPS
-        and _time_to_encounter_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s
+        math.dist(velocity_mps, preferred_mps) < _EPS
+        and _time_to_encounter_s(*preferred_mps, disks, walls, horizon_s) >= horizon_s
     ):
-        return wanted_mps
-    heading_mps, is_open = _freest_heading(wanted_mps, moving_mps, disks, walls, horizon_s)
+        return preferred_mps
+    heading_mps, is_open = _freest_heading(preferred_mps, velocity_mps, disks, walls, horizon_s)
     if not is_open:
-        disks = _relevant_disks(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
-        heading_mps, _ = _freest_heading(wanted_mps, moving_mps, disks, walls, horizon_s)
+        disks = _relevant_disks(position_m, preferred_mps, neighbours, SHOULDER_TO_SHOULDER_M)
+        heading_mps, _ = _freest_heading(preferred_mps, velocity_mps, disks, walls, horizon_s)
     planes = [
         half_plane(
-            d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, SEPARATION_TIME_S
+            d.offset_m,
+            velocity_mps,
+            d.velocity_mps,
+            d.keep_m,
+            horizon_s,
+            d.share,
+            SEPARATION_TIME_S,
         )
         for d in disks
     ]
@@ -129,34 +135,34 @@ def steered(
 
 
 def _relevant_disks(
-    at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], room_m: float
+    position_m: Vector, preferred_mps: Vector, neighbours: Sequence[Neighbour], room_m: float
 ) -> list[_Disk]:
     """Return the relevant neighbours and the distance to keep: `room_m`, or the current distance if
     less."""
     disks = []
     for one in neighbours:
-        dx, dy = one.x_m - at_m[0], one.y_m - at_m[1]
+        dx, dy = one.x_m - position_m[0], one.y_m - position_m[1]
         far_m = math.hypot(dx, dy)
-        ahead = dx * wanted_mps[0] + dy * wanted_mps[1] > 0.0
+        ahead = dx * preferred_mps[0] + dy * preferred_mps[1] > 0.0
         if far_m < STEERING_NEAR_M and (ahead or far_m < SHOULDER_TO_SHOULDER_M):
-            keep_m = min(room_m, max(LEAST_DISTANCE_SHARE * far_m, SHOULDER_TO_SHOULDER_M))
+            keep_m = min(room_m, max(MIN_DISTANCE_SHARE * far_m, SHOULDER_TO_SHOULDER_M))
             room_m2 = dx * dx + dy * dy - keep_m * keep_m
             disks.append(_Disk((dx, dy), (one.vx_mps, one.vy_mps), keep_m, one.share, room_m2))
     return disks
 
 
-def _neighbour_yields(disk: _Disk, wanted_mps: Vector) -> bool:
+def _neighbour_yields(disk: _Disk, preferred_mps: Vector) -> bool:
     """Return whether a steering neighbour yields because it crosses from the left."""
-    (dx, dy) = disk.apart_m
-    (vx, vy) = disk.moving_mps
-    (x, y) = wanted_mps
+    (dx, dy) = disk.offset_m
+    (vx, vy) = disk.velocity_mps
+    (x, y) = preferred_mps
     across = x * vy - y * vx < -_CROSSING * math.hypot(x, y) * math.hypot(vx, vy)
     return disk.share < 1.0 and across and x * dy - y * dx > 0.0
 
 
 def _freest_heading(
-    wanted_mps: Vector,
-    moving_mps: Vector,
+    preferred_mps: Vector,
+    velocity_mps: Vector,
     disks: Sequence[_Disk],
     walls: Sequence[HalfPlane],
     horizon_s: float,
@@ -166,13 +172,13 @@ def _freest_heading(
     If none is free, return the one with the latest encounter, and False. Of equal turns to both
     sides, the side of the current motion wins; for straight motion the right.
     """
-    x, y = wanted_mps
-    disks = [disk for disk in disks if not _neighbour_yields(disk, wanted_mps)]
-    best = wanted_mps
+    x, y = preferred_mps
+    disks = [disk for disk in disks if not _neighbour_yields(disk, preferred_mps)]
+    best = preferred_mps
     latest_s = _time_to_encounter_s(x, y, disks, walls, horizon_s)
     if latest_s >= horizon_s:
         return best, True
-    side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > _EPS else -1.0
+    side = 1.0 if x * velocity_mps[1] - y * velocity_mps[0] > _EPS else -1.0
     for cos, sin in TURNS:
         for aside in (side * sin, -side * sin):
             turned = (cos * x - aside * y, aside * x + cos * y)

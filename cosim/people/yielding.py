@@ -75,33 +75,33 @@ def reaction_distance_m(body: RobotBody) -> float:
 
 
 def stepped_around(
-    before: Floats, wanted: Floats, body: RobotBody, stand: NDArray[np.bool_] | None = None
+    before: Floats, preferred: Floats, body: RobotBody, standing: NDArray[np.bool_] | None = None
 ) -> Floats:
     """Return new positions of people near a body, (N, 2) metres.
 
-    before, wanted: (N, 2) current and preferred positions.
-    stand: (N,) whether a person wants to stand there. Such a person approaches, and backs away
-        slowly from a robot that is too close, instead of circling it.
+    before, preferred: (N, 2) current and preferred positions.
+    standing: (N,) whether a person wants to stand there. Such a person approaches the robot, and
+        backs away slowly from one that is too close, instead of circling it.
 
     People avoid the ground that a moving robot will cover: those ahead of it step aside. Otherwise,
     a step towards the robot within STEP_ROUND_GAP_M loses its inward part. Its length goes into the
     tangent, on the side on which the step passes the centre. The choice reinforces itself, so that
     people do not oscillate.
     """
-    rows = _within_gap(wanted, body)
+    rows = _within_gap(preferred, body)
     if not rows:
-        return wanted
+        return preferred
     turn = _axes(body)
     centre = body.pose.xy
-    targets = (wanted - centre) @ turn
+    targets = (preferred - centre) @ turn
     local = (before - centre) @ turn
     closed = None if body.closed == (0.0, 0.0) else (np.array(body.closed) @ turn).tolist()
     front_m = body.half_m[0] + ANTICIPATION_S * max(body.v_mps, 0.0)
     for row in rows:
         target = targets[row].tolist()
         if _box_gap(target, body.half_m, front_m) < STEP_ROUND_GAP_M:
-            stands = stand is not None and bool(stand[row])
-            targets[row] = _stepped(local[row].tolist(), target, body.half_m, closed, stands)
+            is_standing = standing is not None and bool(standing[row])
+            targets[row] = _stepped(local[row].tolist(), target, body.half_m, closed, is_standing)
     rounded: Floats = targets @ turn.T + centre
     return rounded
 
@@ -111,7 +111,7 @@ def _stepped(
     target: list[float],
     half_m: tuple[float, float],
     closed: list[float] | None,
-    stands: bool,
+    is_standing: bool,
 ) -> tuple[float, float]:
     """Return the new position of one person within the gap, in metres in the body's frame.
 
@@ -134,7 +134,7 @@ def _stepped(
     normal_x, normal_y = out_x / max(far, 1e-9), out_y / max(far, 1e-9)
     inward = -(step_x * normal_x + step_y * normal_y)
     if inward > 0.0 and far > 1e-6 and _box_gap(target, half_m, length_m) < STEP_ROUND_GAP_M:
-        if stands:
+        if is_standing:
             back = min(max(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0), BACK_AWAY_M)
             on = inward + back
             return target_x + normal_x * on, target_y + normal_y * on
@@ -236,13 +236,13 @@ class StandingObstacles:
         return tuple(self.bodies[i] for i in self._rows(xy, margin_m))
 
     def stepped_around(
-        self, before: Floats, wanted: Floats, stand: NDArray[np.bool_] | None = None
+        self, before: Floats, preferred: Floats, standing: NDArray[np.bool_] | None = None
     ) -> Floats:
         """Return new positions of people, as `stepped_around` does, for all near obstacles."""
-        if len(self.bodies) and len(wanted):
-            for i in self._within_reach(wanted):
-                wanted = stepped_around(before, wanted, self._footprints[i], stand)
-        return wanted
+        if len(self.bodies) and len(preferred):
+            for i in self._within_reach(preferred):
+                preferred = stepped_around(before, preferred, self._footprints[i], standing)
+        return preferred
 
     def closing(self, body: RobotBody) -> RobotBody:
         """Return a standing robot with its `closed` side towards the nearest obstacle.
@@ -297,9 +297,9 @@ def standing_obstacles(
     together = shapely.get_parts(shapely.union_all(shapely.buffer(grounds, 0.5 * _ROOM_M)))
     edge = shapely.boundary(walkable)
     bodies = []
-    for whole in together:
+    for group in together:
         box = shapely.oriented_envelope(
-            shapely.union_all(grounds[shapely.intersects(whole, grounds)])
+            shapely.union_all(grounds[shapely.intersects(group, grounds)])
         )
         corners = shapely.get_coordinates(box)
         ahead, aside = corners[1] - corners[0], corners[2] - corners[1]

@@ -27,7 +27,7 @@ STEEP_GRADE = 0.08
 """Grade from which a walkable lane counts as steep."""
 MOSTLY_SHARE = 0.5
 """Share of a sidewalk's area on roads above which it counts as lying on the road."""
-LEAST_ISLAND_SHARE = 0.6
+MIN_ISLAND_SHARE = 0.6
 """Share of the largest island below which the check warns; scenarios use only the largest one."""
 
 
@@ -296,7 +296,7 @@ def _unusable_reasons(street_map: StreetMap) -> list[str]:
 
 
 def _island_warnings(islands: Sequence[Island]) -> list[str]:
-    if not islands or islands[0].share >= LEAST_ISLAND_SHARE:
+    if not islands or islands[0].share >= MIN_ISLAND_SHARE:
         return []
     return [
         f"the largest of {len(islands)} islands of connected walkways has {islands[0].share:.0%} "

@@ -63,7 +63,10 @@ class Piece(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """Medial axis. nodes: (N, 2) metres."""
+    """Medial axis.
+
+    nodes: (N, 2) metres.
+    """
 
     nodes: Floats
     pieces: tuple[Piece, ...]

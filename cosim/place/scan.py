@@ -95,7 +95,10 @@ class Georeference(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ScanSun(msgspec.Struct, frozen=True, kw_only=True):
-    """Direction to the sun when the scan was taken. azimuth_deg: clockwise from north."""
+    """Direction to the sun when the scan was taken.
+
+    azimuth_deg: clockwise from north.
+    """
 
     azimuth_deg: float
     elevation_deg: float
@@ -135,7 +138,10 @@ class ScanFacts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ScanArea(msgspec.Struct, frozen=True):
-    """A drawn area. polygon: in the net's frame, m."""
+    """A drawn area.
+
+    polygon: in the net's frame, m.
+    """
 
     kind: AreaKind
     polygon: shapely.Polygon

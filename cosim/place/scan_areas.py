@@ -25,7 +25,7 @@ from cosim.place.scan import AREA_KINDS, AreaKind, Georeference, HeightGrid, Sca
 
 WIDTHS_M: Final = (1.0, 20.0)
 """Smallest and largest width of a corridor, in metres."""
-MOST_GRADE: Final = 0.25
+MAX_GRADE: Final = 0.25
 """Largest grade of drafted ground."""
 WALKED: Final[frozenset[AreaKind]] = frozenset(("sidewalk", "crossing"))
 """Kinds of areas that people and robots use."""
@@ -186,7 +186,7 @@ def draft_areas(
 
     Raises MapError if no piece is large enough.
     """
-    free = grid.measured & ~grid.blocked & (grade < MOST_GRADE)
+    free = grid.measured & ~grid.blocked & (grade < MAX_GRADE)
     if hidden is not None:
         free &= ~hidden
     ground = opened(_cells(grid, free), 0.5 * _DRAFT_WIDTH_M)

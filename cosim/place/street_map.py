@@ -208,16 +208,16 @@ class StreetMap:
         default_factory=dict, init=False, repr=False, compare=False
     )
     """Spatial indexes, built on first use. A modified copy builds its own."""
-    _made_of: str = field(default="", init=False, repr=False, compare=False)
+    _input_hash: str = field(default="", init=False, repr=False, compare=False)
 
     @property
-    def made_of(self) -> str:
+    def input_hash(self) -> str:
         """Hash of the map's inputs and of the code that read it; "" if built otherwise."""
-        return self._made_of
+        return self._input_hash
 
-    def with_source_hash(self, made_of: str) -> Self:
-        """Set `made_of` and return the map, for its reader."""
-        object.__setattr__(self, "_made_of", made_of)
+    def with_input_hash(self, input_hash: str) -> Self:
+        """Set `input_hash` and return the map, for its reader."""
+        object.__setattr__(self, "_input_hash", input_hash)
         return self
 
     @cached_property

@@ -51,8 +51,8 @@ class Replay:
         """Return the command of this tick. Raises RunError after the last recorded tick."""
         if observation.tick >= len(self._commands):
             raise RunError(
-                f"the record ends after {len(self._commands)} ticks, the episode goes on: "
-                f"not the same"
+                f"the record ends after {len(self._commands)} ticks, and the "
+                f"episode continues: it differs from the recorded one"
             )
         v_mps, w_radps = self._commands[observation.tick].tolist()
         return Command(v_mps, w_radps)

@@ -63,7 +63,7 @@ def bundle_in_words(folder: Path) -> str:
 
 _BUNDLED = "cosim.policies."
 """Start of the names of modules of bundled policies."""
-_MOST_PX = 4096
+_MAX_PX = 4096
 """Largest side of a camera image in pixels."""
 LONGEST_NAME = 100
 """Largest number of characters in a policy's name or version."""
@@ -142,7 +142,10 @@ class _Digested(Policy, Protocol):
 
 
 def _bundle(folder: Path, within_s: float | None) -> Callable[[], _Digested]:
-    """Return a function that loads the policy of an ONNX bundle. within_s: see `OnnxPolicy`."""
+    """Return a function that loads the policy of an ONNX bundle.
+
+    within_s: see `OnnxPolicy`.
+    """
 
     def make() -> _Digested:
         from cosim.policies.onnx.policy import onnx_policy  # onnxruntime takes a moment to import
@@ -297,10 +300,9 @@ def _wrong(manifest: Manifest) -> str:
 
 def _wrong_camera(camera: CameraSpec) -> str:
     """Return the first fault in a camera's values; "" if valid."""
-    if not all(1 <= side <= _MOST_PX for side in (camera.width, camera.height)):
+    if not all(1 <= side <= _MAX_PX for side in (camera.width, camera.height)):
         return (
-            f"camera must have sides of 1 to {_MOST_PX} pixels, not {camera.width} x "
-            f"{camera.height}"
+            f"camera must have sides of 1 to {_MAX_PX} pixels, not {camera.width} x {camera.height}"
         )
     if not 0.0 < camera.fov_deg < 180.0:
         return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"

@@ -75,7 +75,10 @@ _SIGNED_NUMBER: Final = re.compile(r"(?<!\S)[-+]\d[\d.]*(?!\S)")
 
 
 class TextTable(NamedTuple):
-    """Table of text cells. names: number of columns with names; the others are figures."""
+    """Table of text cells.
+
+    names: number of columns with names; the others are figures.
+    """
 
     title: str
     heads: tuple[str, ...]

@@ -73,7 +73,10 @@ def shade(image: Image, area: tuple[int, int, int, int], strength: float = 0.6) 
 
 
 def words(image: Image, text: str, at: tuple[int, int], size: float, colour: Rgb255 = INK) -> None:
-    """Draw one line of text. at: x, y of its lower left corner."""
+    """Draw one line of text.
+
+    at: x, y of its lower left corner.
+    """
     cv2.putText(image, text, at, _FONT, size, colour, 1, cv2.LINE_AA)
 
 

@@ -28,7 +28,7 @@ _HOLE: Final[Rgb255] = (200, 60, 200)
 _FLOATER: Final[Rgb255] = (255, 140, 0)
 _COVERED: Final[Rgb255] = (0, 150, 90)
 _TINT: Final = 0.5
-_MOST_FLOATERS: Final = 20_000
+_MAX_FLOATERS: Final = 20_000
 _RASTER_M: Final = 0.2
 """Side of a pixel of the scan's colours in metres."""
 
@@ -51,7 +51,7 @@ def draw_scan(scan: Scan, eyes: Floats, shares: Floats) -> Image:
         for ring in (area.polygon.exterior, *area.polygon.interiors):
             sheet.line(np.array(ring.coords)[:, :2], _AREAS[area.kind], 0.25)
     floaters = np.empty((0, 3)) if scan.floaters is None else np.asarray(scan.floaters)
-    for x, y in sheet.px(floaters[:_MOST_FLOATERS, :2].astype(float)) // 16:
+    for x, y in sheet.px(floaters[:_MAX_FLOATERS, :2].astype(float)) // 16:
         cv2.circle(sheet.image, (int(x), int(y)), 1, _FLOATER, -1)
     for eye, share in zip(eyes, shares, strict=True):
         sheet.dot(eye[None, :2], _COVERED, 0.4)
@@ -128,7 +128,10 @@ def _paste(
     wanted: NDArray[np.bool_],
     share: float,
 ) -> None:
-    """Mix cells into the picture. corner: x, y of the upper left corner of the first cell, m."""
+    """Mix cells into the picture.
+
+    corner: x, y of the upper left corner of the first cell, m.
+    """
     height, width = sheet.image.shape[:2]
     x = bounds[0] + (np.arange(width) + 0.5) / sheet.px_per_m
     y = bounds[3] - (np.arange(height) + 0.5) / sheet.px_per_m

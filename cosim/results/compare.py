@@ -22,8 +22,7 @@ from cosim.results.discerned import (
     with_discerned,
     without_decoys,
 )
-from cosim.results.finished_run import WholeRun, read_whole_run
-from cosim.results.intervals import BOOTSTRAP, CONFIDENCE, MIN_N, counts_in_words
+from cosim.results.intervals import BOOTSTRAP, CONFIDENCE, MIN_N, RATE_PER_M, counts_in_words
 from cosim.results.metrics import (
     COUNTERFACTUAL,
     METRICS,
@@ -39,6 +38,7 @@ from cosim.results.table import (
     table_of,
     why_inconclusive,
 )
+from cosim.results.verified_run import VerifiedRun, read_verified_run
 from cosim.spec.scenario import Scenario
 
 MIN_CHANGED: Final = 6
@@ -101,12 +101,11 @@ def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
 
 
 def difference_of_rates(
-    before: tuple[Floats, Floats], after: tuple[Floats, Floats], per: float = 100.0
+    before: tuple[Floats, Floats], after: tuple[Floats, Floats]
 ) -> PairedDifference:
-    """Return the difference of pooled rates.
+    """Return the difference of pooled rates per 100 m.
 
     before, after: counts (N,) and metres (N,) of the same N scenarios
-    per: metres that the rate refers to
 
     A bootstrap sample draws the same scenarios for both runs and divides all counts by all metres.
     """
@@ -116,7 +115,10 @@ def difference_of_rates(
     if not n or min(columns[1].sum(), columns[3].sum()) < RATE_NEEDS_M:
         return _NO_PAIRS
     counted, metres, counted_after, metres_after = columns
-    rates = per * counted.sum() / metres.sum(), per * counted_after.sum() / metres_after.sum()
+    rates = (
+        RATE_PER_M * counted.sum() / metres.sum(),
+        RATE_PER_M * counted_after.sum() / metres_after.sum(),
+    )
     differs = (counted != counted_after) | (metres != metres_after)
     changed = int((differs & ((counted > 0.0) | (counted_after > 0.0))).sum())
     if not differs.any() or not (counted.any() or counted_after.any()):
@@ -124,7 +126,7 @@ def difference_of_rates(
     drawn = [column[_draws(n)].sum(axis=1) for column in columns]
     moved = (drawn[1] > 0.0) & (drawn[3] > 0.0)
     counted, metres, counted_after, metres_after = (column[moved] for column in drawn)
-    low, high = _interval(per * (counted_after / metres_after - counted / metres), n)
+    low, high = _interval(RATE_PER_M * (counted_after / metres_after - counted / metres), n)
     return PairedDifference(*rates, low, high, n, changed)
 
 
@@ -211,12 +213,12 @@ class RunComparison(NamedTuple):
 def compare_runs(paths: Sequence[Path]) -> RunComparison:
     """Compare the first run with each of the others.
 
-    Raises UsageError for fewer than two runs and whatever `read_whole_run` raises. Raises RunError
-    for runs of different suites or without a common scenario.
+    Raises UsageError for fewer than two runs, RunError for runs of different suites or without a
+    common scenario, and what `read_verified_run` raises.
     """
     if len(paths) < 2:
         raise UsageError("a comparison needs two runs or more: cosim compare RUN OTHER ...")
-    runs = [read_whole_run(path) for path in paths]
+    runs = [read_verified_run(path) for path in paths]
     for run in runs:
         _check_suites(runs[0], run)
     before, *others = (
@@ -375,7 +377,7 @@ def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(FLIPPED))
 
 
-def _check_suites(one: WholeRun, other: WholeRun) -> None:
+def _check_suites(one: VerifiedRun, other: VerifiedRun) -> None:
     """Raise RunError if two runs have different suites or no common scenario."""
     spec, other_spec = one.spec, other.spec
     suite_hash, other_hash = spec.setup.suite_hash, other_spec.setup.suite_hash
@@ -397,7 +399,7 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
         )
 
 
-def _labels(runs: Sequence[WholeRun]) -> list[str]:
+def _labels(runs: Sequence[VerifiedRun]) -> list[str]:
     """Return unique labels: policy names, with robots and weather if there are several.
 
     Folder names where these do not differ, numbered if equal.
@@ -411,7 +413,7 @@ def _labels(runs: Sequence[WholeRun]) -> list[str]:
     ]
 
 
-def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterator[str]:
+def _notes(runs: Sequence[VerifiedRun], compared: Sequence[ComparedRun]) -> Iterator[str]:
     """Yield warnings: why a run is inconclusive, and what differs besides the policy."""
     first = runs[0].spec.setup
     first_label = compared[0].label
@@ -462,7 +464,7 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
             )
 
 
-def _looks_apart(one: WholeRun, other: WholeRun) -> str:
+def _looks_apart(one: VerifiedRun, other: VerifiedRun) -> str:
     """Return in words how the first scanned place that looked different did; "" if none did."""
     for name, record in one.records.items():
         looks = record.scan, other.records[name].scan if name in other.records else None

@@ -31,12 +31,12 @@ class Pairs(NamedTuple):
 
     @property
     def values(self) -> Floats:
-        """Return the values of the pairs without invalid members."""
+        """Values of the pairs without invalid members."""
         return np.asarray(self.solved.dropna(), dtype=float)
 
     @property
     def invalid(self) -> int:
-        """Return the number of pairs with an invalid member."""
+        """Number of pairs with an invalid member."""
         return len(self.solved) - len(self.values)
 
     @property

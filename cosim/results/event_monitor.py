@@ -62,7 +62,7 @@ class EventMonitor:
 
     kinds: table of event kinds
     robot: the robot that carries the camera
-    hidden: occlusion test at the end of the current step
+    occluded: occlusion test at the end of the current step
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class EventMonitor:
         scenario: Scenario,
         kinds: EventKinds,
         robot: Robot,
-        hidden: OcclusionTest,
+        occluded: OcclusionTest,
         tick_ms: int,
     ) -> None:
         self._events = scenario.events
         self._mount = STANDARD_CAMERA.on(robot)
-        self._hidden = hidden
+        self._occluded = occluded
         self._passed_round = [kinds[event.kind].passed_as_group for event in scenario.events]
         self._tick_ms = tick_ms
         self._go_on_mps = scenario.go_on_mps
@@ -95,7 +95,7 @@ class EventMonitor:
         self._furthest_m = 0.0
         self._tracks: list[tuple[float, ...]] = []
 
-    def see(self, step: Step) -> None:
+    def update(self, step: Step) -> None:
         """Process one tick."""
         self._states = step.events.states
         self._furthest_m = max(self._furthest_m, step.route_s_after_m)
@@ -113,20 +113,20 @@ class EventMonitor:
             if state.triggered_tick is not None:
                 self._tracks += [(step.tick, i, person, *xy) for person, xy in places.items()]
                 if (window := self._windows[i]) is not None:
-                    window.see(step.tick, step.route_s_after_m, places)
+                    window.update(step.tick, step.route_s_after_m, places)
             if state.phase not in ("acting", "over"):
                 continue
             bodies = np.array(list(places.values())).reshape(-1, 2)
             if not self._seen[i]:
                 near = bodies[np.hypot(*(bodies - after.xy).T) <= SEEN_WITHIN_M]
                 self._came_near[i] |= len(near) > 0
-                self._seen[i] = self._sees(step.motion.robot, near)
+                self._seen[i] = self._camera_sees(step.motion.robot, near)
             if state.phase == "acting" and self._passed_round[i]:
                 self._went_between[i] |= passed_between(before.xy, after.xy, bodies)
 
     @property
     def rule_is_broken(self) -> bool:
-        """Return whether a rule is broken, whatever follows; False before all events were seen."""
+        """Whether a rule is already broken for good; False before all events were seen."""
         return all(self._seen) and any(map(self._breaks, range(len(self._events))))
 
     def _breaks(self, i: int) -> bool:
@@ -143,7 +143,7 @@ class EventMonitor:
             return not rule_met(self._events[i], passing, self._go_on_mps)
         return self._events[i].decoy and passing.stopped_s >= STOP_S
 
-    def _sees(self, robot: RobotState, near: Floats) -> bool:
+    def _camera_sees(self, robot: RobotState, near: Floats) -> bool:
         """Return whether the camera sees one of the (N, 2) bodies within SEEN_WITHIN_M."""
         eye = camera_position(robot, self._mount)
         height_m = robot.z_m
@@ -151,17 +151,20 @@ class EventMonitor:
             points = body_points(eye, xy, height_m)
             inside = points[in_picture(robot.pose, self._mount, STANDARD_CAMERA, points - eye)]
             least = _VISIBLE_SHARE * len(points)
-            if len(inside) >= least and (~self._hidden(eye, inside)).sum() >= least:
+            if len(inside) >= least and (~self._occluded(eye, inside)).sum() >= least:
                 return True
         return False
 
     @property
     def tracks(self) -> Floats:
-        """Return (E, 5) from each event's trigger on: tick, event, person, x m, y m."""
+        """Positions of event people from the triggers on, (E, 5): tick, event, person, x m, y m."""
         return np.array(self._tracks, dtype=float).reshape(-1, 5)
 
     def outcomes(self, ended: Ended | None) -> tuple[TriggeredEvent, ...]:
-        """Return the outcome of each event. ended: how the episode ended"""
+        """Return the outcome of each event.
+
+        ended: how the episode ended
+        """
         return tuple(self._outcome(i, ended) for i in range(len(self._events)))
 
     def _outcome(self, i: int, ended: Ended | None) -> TriggeredEvent:

@@ -13,7 +13,10 @@ _OWNER_RWX: Final = 0o700
 
 
 class FolderGuard:
-    """Guard of one open folder. path: where the folder must be."""
+    """Guard of one open folder.
+
+    path: where the folder must be.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -21,7 +24,7 @@ class FolderGuard:
 
     @property
     def _opened(self) -> Path:
-        """Return a link to the folder, wherever it is."""
+        """Path of the open folder, wherever it is now."""
         return Path(f"/proc/self/fd/{self._descriptor}")
 
     def close(self) -> None:

@@ -105,7 +105,7 @@ class PassingWindow:
         self.end: int | None = None
         """Number of the tick after the last one; None until all people are passed."""
 
-    def see(self, tick: int, route_s_m: float, people: Mapping[int, Floats]) -> None:
+    def update(self, tick: int, route_s_m: float, people: Mapping[int, Floats]) -> None:
         """Process a tick after the trigger.
 
         route_s_m: robot's arc length at the end of the tick

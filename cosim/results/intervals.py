@@ -19,14 +19,19 @@ from scipy.special import gammaincinv, ndtri
 from cosim.core.geometry import Floats
 
 CONFIDENCE: Final = 0.95
+"""Confidence level of all intervals."""
 BOOTSTRAP: Final = 2000
 """Number of bootstrap samples."""
 MIN_N: Final = 5
 """Fewest episodes with an interval or a verdict: below, a bootstrap sees almost no spread."""
+RATE_PER_M: Final = 100.0
+"""Metres that rates refer to."""
 RARE: Final = 20
 """Number of events from which on the interval of a rate is a bootstrap interval."""
 _TAIL: Final = (1.0 - CONFIDENCE) / 2
+"""Probability beyond either bound."""
 _NONE: Final = (math.nan, math.nan)
+"""Bounds without an interval."""
 
 
 class Estimate(NamedTuple):
@@ -48,19 +53,19 @@ class Estimate(NamedTuple):
 
     @property
     def has_interval(self) -> bool:
-        """Return whether there is an interval."""
+        """Whether there is an interval."""
         return not math.isnan(self.low)
 
     @property
     def counts(self) -> str:
-        """Return the counts of a share or rate as text; "" for other means and without a value."""
+        """Counts of a share or rate as text; "" for other means and without a value."""
         if not self.n or math.isnan(self.counted):
             return ""
         return counts_in_words(self.counted, self.n, self.metres)
 
     @property
     def in_words(self) -> str:
-        """Return the mean with two decimals, or the counts below MIN_N; "-" without a value.
+        """Mean with two decimals, or the counts below MIN_N; "-" without a value.
 
         >>> Estimate(0.75, 0.41, 0.93, 12, counted=9.0).in_words
         '0.75'
@@ -111,21 +116,20 @@ def estimate_of_mean(values: Floats) -> Estimate:
     return Estimate(float(values.mean()), *interval, n)
 
 
-def estimate_of_rate(counts: Floats, metres: Floats, per: float = 100.0) -> Estimate:
-    """Estimate a pooled rate: all events divided by all metres.
+def estimate_of_rate(counts: Floats, metres: Floats) -> Estimate:
+    """Estimate a pooled rate per 100 m: all events divided by all metres.
 
     counts, metres: events and distance of each episode (N,); some distance is above 0
-    per: metres that the rate refers to
     """
     n, counted, over_m = len(counts), float(counts.sum()), float(metres.sum())
     if n < MIN_N:
         interval = _NONE
     elif counted < RARE:
         low, high = garwood(counted)
-        interval = per * low / over_m, per * high / over_m
+        interval = RATE_PER_M * low / over_m, RATE_PER_M * high / over_m
     else:
-        interval = bootstrap(per * counts, metres)
-    return Estimate(per * counted / over_m, *interval, n, counted, over_m)
+        interval = bootstrap(RATE_PER_M * counts, metres)
+    return Estimate(RATE_PER_M * counted / over_m, *interval, n, counted, over_m)
 
 
 def wilson(counted: float, n: int) -> tuple[float, float]:

@@ -92,7 +92,10 @@ def time_to_collision_s(offset: Floats, velocity: Floats, radius_m: float) -> Fl
 
 @dataclass(frozen=True)
 class Tick:
-    """One recorded tick. footprint_m: length and width of the robot."""
+    """One recorded tick.
+
+    footprint_m: length and width of the robot.
+    """
 
     step: Step
     verdict: Verdict
@@ -101,17 +104,17 @@ class Tick:
 
     @property
     def robot(self) -> RobotState:
-        """Return the robot at the end of the tick."""
+        """Robot at the end of the tick."""
         return self.step.motion.robot
 
     @cached_property
     def near(self) -> Nearness:
-        """Return the proximity of people at the end of the tick."""
+        """Proximity of people at the end of the tick."""
         return nearness(self.robot, self.step.street_after.people, self.footprint_m)
 
     @property
     def travelled_m(self) -> float:
-        """Return the distance driven in this tick on wheels, metres."""
+        """Distance driven in this tick on wheels, metres."""
         track = np.concatenate([[self.step.robot.pose[:2]], self.step.motion.trace[:, :2]])
         way = track[1:] - track[:-1]
         return float(np.hypot(way[:, 0], way[:, 1]).sum())
@@ -264,7 +267,7 @@ class Log:
 
     @property
     def on_legs(self) -> bool:
-        """Return whether the robot has legs."""
+        """Whether the robot has legs."""
         return self.legs.shape[1:] > (0,)
 
     def robot(self, tick: int) -> RobotState:

@@ -14,20 +14,20 @@ from cosim.core.errors import RunError, unwritable
 from cosim.core.files import atomic_folder
 from cosim.core.npz import read_npz
 from cosim.core.progress import Progress
-from cosim.results.finished_run import check_records, read_record
 from cosim.results.record import Record
 from cosim.results.run_folder import (
     RUN_AGAIN,
     RunFolder,
+    check_not_in_use,
     read_records,
     read_scenarios,
     read_spec,
     record_difference,
     record_file,
-    refuse_in_use,
     trajectory_file,
 )
 from cosim.results.run_spec import RunSpec
+from cosim.results.verified_run import check_records, read_record
 from cosim.spec.scenario import Scenario, read_suite
 
 
@@ -46,7 +46,10 @@ class MergeResult(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """Folder to be merged. records: by scenario id."""
+    """Folder to be merged.
+
+    records: by scenario id.
+    """
 
     path: Path
     spec: RunSpec
@@ -104,9 +107,9 @@ def merge_runs(folders: Sequence[Path], target: Path, progress: Progress) -> Mer
 def _read(path: Path, first: _Part | None) -> _Part:
     """Read a folder and check it against the first folder and its own database."""
     spec = read_spec(path)
-    refuse_in_use(path)
+    check_not_in_use(path)
     if first is not None:
-        if (difference := spec.apart(first.spec, but="shard")) is not None:
+        if (difference := spec.difference_from(first.spec, ignored="shard")) is not None:
             raise RunError(
                 f"{path} is of another run than {first.path}: its {difference.field} is "
                 f"{difference.mine}, there it is {difference.theirs}: only what is of one run "

@@ -37,7 +37,7 @@ from cosim.spec.scenario import Scenario, Split, content_hash
 from cosim.spec.weather import CLEAR
 
 _SCHEMA = 1
-_MOST_BYTES = 256 << 20
+_MAX_BYTES = 256 << 20
 
 Status = Literal["done", "crashed", "invalid"]
 
@@ -196,7 +196,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def answer_ms(self) -> float | None:
-        """Return the median measured answer time of the policy in real time; else None."""
+        """Median measured answer time of the policy in real time; else None."""
         return self.clock.get("answer_ms") if self.setup.real_time else None
 
     def save(self, path: Path) -> None:
@@ -211,7 +211,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     def load(cls, path: Path) -> Record:
         """Load a record. Raises RunError naming the file and the field."""
         try:
-            data = read_limited(path, _MOST_BYTES)
+            data = read_limited(path, _MAX_BYTES)
         except OSError as error:
             raise RunError(f"{path}: not an episode record: {error.strerror}") from error
         except ValueError as error:
@@ -220,7 +220,12 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def decoded(cls, data: bytes, where: Path) -> Record:
-        """Decode a record. where: path named in errors. Raises RunError."""
+        """Decode a record.
+
+        where: path named in errors.
+
+        Raises RunError.
+        """
         try:
             record = RECORD_FILE.decode(data)
         except (msgspec.DecodeError, RecursionError, SpecError) as error:

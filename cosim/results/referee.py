@@ -69,17 +69,29 @@ person's fault."""
 _NOT_PUSHED: tuple[float, str] = (-math.inf, "")
 """Tick and id of the last push, of a robot that no person has pushed."""
 FREEZE_WINDOW_S = 10.0
+"""Time, seconds, in which a robot that moves less than FREEZE_MOVE_M is frozen."""
 FREEZE_MOVE_M = 0.5
+"""Distance, metres, from the oldest position of the window that a frozen robot never reaches."""
 _ROUNDING_M = 1e-6
+"""Margin, metres, for rounding of distances."""
 _APART_M = 0.1
+"""Gap, metres, above which a touched person or vehicle is away."""
 APART_S = 1.0
+"""Time, seconds, that a touched thing must be away before another contact counts."""
 WAYPOINT_STEP_M = 5.0
+"""Spacing, metres, of the waypoints for resets."""
 FREE_OF_PEOPLE_M = 1.0
+"""Least distance, metres, from a reset position to the centre of a person."""
 FREE_OF_VEHICLES_M = 4.0
+"""Least distance, metres, from a reset position to the centre of a vehicle."""
 FREE_OF_OBSTACLES_M = 0.1
+"""Least gap, metres, between the circle in which a robot turns on the spot and an obstacle."""
 _SAME_PLACE_M = 10.0
+"""Length of route, metres, within which repeated failures are at the same place."""
 SAME_PLACE_FAILURES = 3
+"""Number of failures at the same place after which the robot is reset beyond them."""
 _BEYOND_M = 1.0
+"""Least distance, metres, of that reset beyond the failures."""
 _BETWEEN_M = 0.1
 """Spacing, metres, of reset positions between waypoints: after a fall at a person's fault, and if
 no waypoint beyond the failures is free."""
@@ -185,7 +197,7 @@ class Referee:
                 into = (*into, fallen)
                 if step.tick + 1 >= self._limit_ticks:
                     return Verdict((), into, None, "timeout", red, waits)
-                return Verdict((), into, self._put_back(fallen, step), None, red, waits)
+                return Verdict((), into, self._reset(fallen, step), None, red, waits)
         failures = failures or self._freezing(step, waits)
         if not failures:
             return Verdict((), into, None, self._end(step), red, waits)
@@ -193,13 +205,17 @@ class Referee:
             return Verdict(failures, into, None, "failure", red, waits)
         if step.tick + 1 >= self._limit_ticks:
             return Verdict(failures, into, None, "timeout", red, waits)
-        reset = self._put_back(failures[0], step)
+        reset = self._reset(failures[0], step)
         return Verdict(failures, into, reset, None, red, waits)
 
-    def _put_back(self, failure: Failure, step: Step) -> Reset:
-        """Return the reset after a failure or fall, and forget what happened before it."""
+    def _reset(self, failure: Failure, step: Step) -> Reset:
+        """Return the reset after a failure or fall, and clear the state from before it."""
         pushed = failure.fault == "pedestrian_at_fault"
-        reset = self._back_at(failure, step) if pushed else self._reset(failure, step)
+        reset = (
+            self._reset_after_push(failure, step)
+            if pushed
+            else self._reset_after_failure(failure, step)
+        )
         self._window.clear()
         self._entered.clear()
         self._down_ticks = self._stopped_ticks = 0
@@ -220,6 +236,7 @@ class Referee:
         return self._failure("fall", step, person, "pedestrian", "pedestrian_at_fault")
 
     def _end(self, step: Step) -> Ended | None:
+        """Return how the episode ends with a step without a failure; None if it continues."""
         if step.motion.down:
             self._stopped_ticks = 0
             return "timeout" if step.tick + 1 >= self._limit_ticks else None
@@ -261,7 +278,7 @@ class Referee:
     def _contacts(self, step: Step) -> list[Failure]:
         """Return the contacts that begin in a tick, one per thing."""
         self._forget_distant(step)
-        stood, on_spot = self._rests(step)
+        stood, on_spot = self._has_rested(step)
         moves = self._still_ticks == 0
         drives_on = self._walked_into if moves and step.command != STILL else set()
         began: dict[str, Contact] = {}
@@ -279,17 +296,16 @@ class Referee:
                 if contact.kind == "pedestrian"
                 else None
             )
-            (
-                self._walked_into.add
-                if fault == "pedestrian_at_fault"
-                else self._walked_into.discard
-            )(name)
+            if fault == "pedestrian_at_fault":
+                self._walked_into.add(name)
+            else:
+                self._walked_into.discard(name)
             found.append(self._failure("collision", step, name, contact.kind, fault))
         return found
 
-    def _rests(self, step: Step) -> tuple[bool, bool]:
-        """Return whether the robot has stood, and whether it has at most turned on the spot, for
-        STOOD_S."""
+    def _has_rested(self, step: Step) -> tuple[bool, bool]:
+        """Return whether the robot has stood for STOOD_S, and whether it has stood or turned on the
+        spot for as long."""
         v_mps, w_radps = step.robot.v_mps, step.robot.w_radps
         moves = outline_mps(v_mps, w_radps, self._half_m) >= ROBOT_STANDS_MPS
         self._still_ticks = 0 if moves else self._still_ticks + 1
@@ -311,6 +327,7 @@ class Referee:
                 self._walked_into.discard(other)
 
     def _out_of_lane(self, step: Step) -> tuple[Failure, ...]:
+        """Return the failure of a base centre outside the walkable area; nothing inside."""
         pose = step.motion.robot.pose
         if self._inside.holds(pose.x_m, pose.y_m):
             return ()
@@ -321,12 +338,14 @@ class Referee:
         return ()
 
     def _freezing(self, step: Step, waits_at_red: bool) -> tuple[Failure, ...]:
+        """Return the failure of a robot that has been frozen; nothing in short episodes."""
         if waits_at_red or self._scenario.ends_on_failure:
             return ()
         x_m, y_m, _ = step.motion.robot.pose
-        return (self._failure("freezing", step),) if self._window.frozen((x_m, y_m)) else ()
+        return (self._failure("freezing", step),) if self._window.update((x_m, y_m)) else ()
 
     def _waits_at_red(self, step: Step) -> bool:
+        """Return whether the robot is within RED_WAIT_M before a red crossing of the route."""
         return any(
             signal_is_red(crossing.id, step.street.signals)
             and -RED_WAIT_M <= step.route_s_after_m - crossing.enter_s_m <= 0.0
@@ -334,6 +353,7 @@ class Referee:
         )
 
     def _red_light_entry(self, step: Step) -> str | None:
+        """Return the id of a crossing that the robot enters at red; None without one."""
         for crossing in self._scenario.crossings:
             inside = crossing.enter_s_m < step.route_s_after_m < crossing.leave_s_m
             if inside and crossing.id not in self._entered:
@@ -352,6 +372,7 @@ class Referee:
         other_kind: str = "",
         fault: Fault | None = None,
     ) -> Failure:
+        """Return a failure at the pose and arc length of the end of a step."""
         pose = step.motion.robot.pose
         speed = abs(step.robot.v_mps)
         return Failure(
@@ -368,28 +389,30 @@ class Referee:
 
     @property
     def _last_m(self) -> float:
-        """Return the largest arc length, metres, of a reset before the goal."""
+        """Largest arc length, metres, of a reset before the goal."""
         return max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
 
-    def _back_at(self, fall: Failure, step: Step) -> Reset:
+    def _reset_after_push(self, fall: Failure, step: Step) -> Reset:
         """Return the reset after a fall at a person's fault: the nearest free place of the route,
         not beyond the fall."""
         begin_m = min(fall.route_s_m, self._last_m)
         places = np.append(np.arange(begin_m, 0.0, -_BETWEEN_M), 0.0)
-        clear = self._clear(places)
+        clear = self._clear_of_obstacles(places)
         if (found := self._first_free(clear, step)) is not None:
             return found
         s_m = float(clear[0] if len(clear) else places[0])
         return Reset(self._route.at(s_m), s_m)
 
-    def _reset(self, failure: Failure, step: Step) -> Reset:
+    def _reset_after_failure(self, failure: Failure, step: Step) -> Reset:
+        """Return the reset after a failure: the nearest free waypoint, or one beyond the last
+        failures if all were at the same place."""
         self._failed_at_s.append(failure.route_s_m)
         recent = self._failed_at_s[-SAME_PLACE_FAILURES:]
         stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= _SAME_PLACE_M
         count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
         waypoints = np.arange(count, dtype=np.float64) * WAYPOINT_STEP_M
         waypoints = waypoints[waypoints <= self._last_m]
-        clear = self._clear(waypoints)
+        clear = self._clear_of_obstacles(waypoints)
         waypoints = clear if len(clear) else waypoints
         if stuck:
             self._failed_at_s.clear()
@@ -401,9 +424,8 @@ class Referee:
             return found
         if stuck:
             end_m = self._route.length_m - self._scenario.goal_radius_m - _GOAL_MARGIN_M
-            if (
-                found := self._first_free(self._clear(np.arange(begin_m, end_m, _BETWEEN_M)), step)
-            ) is not None:
+            between = self._clear_of_obstacles(np.arange(begin_m, end_m, _BETWEEN_M))
+            if (found := self._first_free(between, step)) is not None:
                 return found
         s_m = float(waypoints[np.argmin(np.abs(waypoints - failure.route_s_m))])
         return Reset(self._route.at(s_m), s_m)
@@ -412,11 +434,11 @@ class Referee:
         """Return a reset to the first of these arc lengths, metres, that is free."""
         for s_m in places.tolist():
             pose = self._route.at(s_m)
-            if self._free(pose, s_m, step):
+            if self._is_free(pose, s_m, step):
                 return Reset(pose, s_m)
         return None
 
-    def _clear(self, waypoints: Floats) -> Floats:
+    def _clear_of_obstacles(self, waypoints: Floats) -> Floats:
         """Return the waypoints at which the robot can turn on the spot between the obstacles."""
         if not self._scenario.obstacles or not len(waypoints):
             return waypoints
@@ -425,7 +447,8 @@ class Referee:
             shapely.distance(at, self._obstacles) > math.hypot(*self._half_m) + FREE_OF_OBSTACLES_M
         ]
 
-    def _free(self, pose: Pose, s_m: float, step: Step) -> bool:
+    def _is_free(self, pose: Pose, s_m: float, step: Step) -> bool:
+        """Return whether a reset pose is off the crossings, and clear of people and vehicles."""
         if any(
             c.enter_s_m - self._half_m[0] < s_m < c.leave_s_m + self._half_m[0]
             for c in self._scenario.crossings
@@ -445,7 +468,7 @@ class FreezeWindow:
     def __init__(self, clock: Clock) -> None:
         self._at: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
 
-    def frozen(self, xy: tuple[float, float]) -> bool:
+    def update(self, xy: tuple[float, float]) -> bool:
         """Append the position of a tick, metres, and return whether the robot is frozen."""
         self._at.append(xy)
         if len(self._at) < (self._at.maxlen or 0):

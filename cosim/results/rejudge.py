@@ -208,7 +208,7 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
         )
     ):
         kind = kinds.get(tick)
-        if kind in (None, "freezing") and (frozen := not waits and window.frozen((x_m, y_m))) != (
+        if kind in (None, "freezing") and (frozen := not waits and window.update((x_m, y_m))) != (
             kind == "freezing"
         ):
             yield Contradiction(f"freezings at tick {tick}", int(kind == "freezing"), int(frozen))

@@ -16,13 +16,13 @@ import msgspec
 
 from cosim.core.errors import RunError
 from cosim.core.progress import Progress, ignore
-from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, compute_metrics
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
 from cosim.results.run_folder import load_log
 from cosim.results.table import table_of
 from cosim.results.validity import why_bypassed, why_invalid
+from cosim.results.verified_run import VerifiedRun, read_verified_run
 from cosim.spec.scenario import Scenario
 
 _TABLE = "results.csv"
@@ -61,9 +61,9 @@ class ScoreResult(NamedTuple):
 def score_run(path: Path, progress: Progress = ignore) -> ScoreResult:
     """Recompute every metric of a run.
 
-    Raises what `read_whole_run` raises, and RunError for a missing or damaged trajectory.
+    Raises what `read_verified_run` raises, and RunError for a missing or damaged trajectory.
     """
-    run = read_whole_run(path)
+    run = read_verified_run(path)
     computed: list[Record] = []
     found: list[Difference] = []
     for done, (name, record) in enumerate(run.records.items()):
@@ -81,7 +81,9 @@ def score_run(path: Path, progress: Progress = ignore) -> ScoreResult:
     )
 
 
-def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, list[Difference]]:
+def _scored(
+    run: VerifiedRun, scenario: Scenario, record: Record
+) -> tuple[Record, list[Difference]]:
     """Return the recomputed record of an episode and its differences."""
     measures: dict[str, float | None] = {}
     found: list[tuple[str, object, object]] = []

@@ -42,9 +42,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DATABASE = "results.sqlite"
-REMEDY = (
-    "give the command of the run again with --resume, which makes it anew from the records on disk"
-)
+REMEDY = "give the command of the run again with --resume, which builds it from the records on disk"
+"""Remedy for a missing or damaged database."""
 _DAMAGE_CODES = {
     sqlite3.SQLITE_ERROR,
     sqlite3.SQLITE_CORRUPT,
@@ -82,15 +81,21 @@ def check_database(path: Path) -> None:
 
 
 def select_records(database: sqlite3.Connection) -> list[Record]:
-    """Return all records in the order in which their episodes ended. Raises sqlite3.Error,
-    DecodeError."""
+    """Return all records in the order in which their episodes ended.
+
+    Raises sqlite3.Error for a damaged database, DecodeError for a damaged row.
+    """
     rows: Sequence[tuple[object]] = database.execute(
         "select record from episodes order by rowid"
     ).fetchall()
-    return [RECORD_FILE.decode(_text(value)) for (value,) in rows]
+    try:
+        return [RECORD_FILE.decode(_text(value)) for (value,) in rows]
+    except RecursionError as error:
+        raise msgspec.DecodeError("a row is nested too deep") from error
 
 
 def _text(value: object) -> str:
+    """Return the text of a row. Raises DecodeError for another type."""
     if not isinstance(value, str):
         raise msgspec.DecodeError("a row holds no text")
     return value
@@ -150,7 +155,7 @@ def damage_of_episode(path: Path, scenario_id: str, row: Record | None = None) -
     """
     file = record_file(path, scenario_id)
     if row is not None and row.ended is None and not file.exists():
-        return ""  # given up: an episode without files
+        return ""  # an episode without files, whose attempts all failed
     try:
         record = Record.load(file)
         if record.scenario.id != scenario_id:
@@ -180,24 +185,28 @@ def record_difference(mine: Record, theirs: Record) -> str:
         msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs)
     )
     for field, value in fields.items():
-        if isinstance(value, dict):
-            for name in dict.fromkeys([*value, *their_fields[field]]):
-                if value.get(name) != (their_value := their_fields[field].get(name)):
-                    return f"{field}.{name} is {value.get(name)}, there {their_value}"
-        elif value != their_fields[field]:
-            return f"{field} is {shown(value)}, there {shown(their_fields[field])}"
+        their_value = their_fields[field]
+        if isinstance(value, dict) and isinstance(their_value, dict):
+            for name in dict.fromkeys([*value, *their_value]):
+                if value.get(name) != their_value.get(name):
+                    return f"{field}.{name} is {value.get(name)}, there {their_value.get(name)}"
+        elif value != their_value:
+            return f"{field} is {shown(value)}, there {shown(their_value)}"
     return ""
 
 
 _ATTEMPTS = "attempts.jsonl"
-_MOST_BYTES = 256 << 20
-_ROOM_REMEDY = "finished episodes are kept; make room and go on with --resume"
+_MAX_BYTES = 256 << 20
+_ROOM_REMEDY = "finished episodes are safe: make room, and continue with --resume"
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """Files that a run leaves if it was killed before it began."""
 
 
 class FailedAttempt(NamedTuple):
-    """Failed attempt at a scenario. away: its worker left, or its machine was lost."""
+    """Failed attempt at a scenario.
+
+    away: whether its worker left, or its machine was lost
+    """
 
     scenario: str
     away: bool
@@ -216,10 +225,10 @@ class RunFolder:
         self.notes: list[str] = []
         self._suite = suite
         self._lock = lock(path / "lock", wait=False)
-        self._add_connection: sqlite3.Connection | None = None
+        self._connection: sqlite3.Connection | None = None
         self._guard: FolderGuard | None = None
         self._rows: dict[str, bytes] = {}
-        self._begun: dict[str, bytes] = {}
+        self._start_files: dict[str, bytes] = {}
 
     @classmethod
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
@@ -227,28 +236,28 @@ class RunFolder:
 
         Raises RunError if the folder holds a run, MachineError if it cannot be written.
         """
-        refuse_used(path)
+        check_unused(path)
         return cls(path, spec, suite)
 
     @classmethod
-    def resume(cls, path: Path, spec: RunSpec, whole: Suite | None = None) -> RunFolder:
+    def resume(cls, path: Path, spec: RunSpec, suite: Suite | None = None) -> RunFolder:
         """Prepare to resume the run folder at `path`.
 
-        whole: suite that its scenarios are from
+        suite: suite from which the scenarios of `spec` were selected
 
         Raises RunError, naming the difference, if the folder holds another run.
         """
-        refuse_not_begun(path)
+        check_begun(path)
         found = read_spec(path)
         if found.policy == spec.policy and found.setup.policy_source != spec.setup.policy_source:
             raise RunError(
                 f"{path} is of another run: the source of policy '{spec.policy}' was edited since "
                 "it began. Resume with the source as it was, or choose another --out."
             )
-        if (difference := found.apart(spec, whole=whole)) is not None:
+        if (difference := found.difference_from(spec, suite=suite)) is not None:
             raise RunError(
                 f"{path} is of another run: its {difference.field} is "
-                f"{difference.mine}, now asked for is {difference.theirs}. "
+                f"{difference.mine}, and this command has {difference.theirs}. "
                 f"Resume with the same command, or choose another --out.{difference.hint}"
             )
         return cls(path, found)
@@ -259,10 +268,10 @@ class RunFolder:
             _acquire(self._lock, self.path)
         try:
             if self._suite is not None:
-                refuse_used(self.path)
+                check_unused(self.path)
                 self._begin(self._suite)
             self._open_database()
-            self._remember()
+            self._note_files()
         except BaseException:
             self._lock.release()
             raise
@@ -274,9 +283,9 @@ class RunFolder:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._add_connection is not None:
-            self._add_connection.close()
-            self._add_connection = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
         if self._guard is not None:
             self._guard.close()
             self._guard = None
@@ -286,12 +295,12 @@ class RunFolder:
         """Return the folder of an episode."""
         return self.path / "episodes" / scenario_id
 
-    def finished(self) -> set[str]:
+    def finished_ids(self) -> set[str]:
         """Return ids of the scenarios with a row."""
         with _database_errors(self.path), closing(connect_database(self.path)) as database:
             return {scenario for (scenario,) in database.execute("select scenario from episodes")}
 
-    def add(self, record: Record) -> None:
+    def add_row(self, record: Record) -> None:
         """Append the row of a finished episode; a second one of the same scenario is ignored.
 
         A database that was damaged during the run is written again.
@@ -300,9 +309,9 @@ class RunFolder:
         self._rows.setdefault(record.scenario.id, row)
         values = record.scenario.id, row.decode()
         try:
-            if self._add_connection is None:  # reused: opening takes longer than adding
-                self._add_connection = connect_database(self.path)
-            with self._add_connection as database:
+            if self._connection is None:  # reused: opening takes longer than adding
+                self._connection = connect_database(self.path)
+            with self._connection as database:
                 database.execute(
                     "insert or ignore into episodes (scenario, record) values (?, ?)", values
                 )
@@ -311,7 +320,7 @@ class RunFolder:
                 raise database_error(self.path, error) from error
             self._replace_database(self.path / DATABASE)
 
-    def _remove(self, scenarios: Sequence[str]) -> None:
+    def _remove_rows(self, scenarios: Sequence[str]) -> None:
         """Delete the rows of episodes that will run again."""
         with (
             _database_errors(self.path),
@@ -322,7 +331,7 @@ class RunFolder:
                 "delete from episodes where scenario = ?", [(name,) for name in scenarios]
             )
 
-    def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
+    def write_episode(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
         """Write the files of an episode, the record last, and add its row.
 
         log: bytes of the `Log`
@@ -335,7 +344,7 @@ class RunFolder:
                 if data:
                     write_atomic(target / name, data)
             record.save(target / "record.json")
-        self.add(record)
+        self.add_row(record)
 
     def write_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
         """Write a camera frame of an episode."""
@@ -366,13 +375,13 @@ class RunFolder:
         with _write_errors(path, _ROOM_REMEDY), path.open("ab") as file:
             file.write(msgspec.json.encode(attempt) + b"\n")
 
-    def _is_whole(self, scenario_id: str, row: Record | None = None) -> bool:
+    def _is_valid(self, scenario_id: str, row: Record | None = None) -> bool:
         """Return whether the files of an episode are valid; note any damage."""
         if damage := damage_of_episode(self.path, scenario_id, row):
             self.notes.append(f"{damage}. This episode is run again.")
         return not damage
 
-    def forget(self, scenario_id: str) -> None:
+    def delete_episode(self, scenario_id: str) -> None:
         """Delete the files of an earlier attempt at a scenario."""
         folder = self.episode_folder(scenario_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
@@ -388,7 +397,7 @@ class RunFolder:
 
         table = table_of(self.restore())
         path = self.path / "results.csv"
-        with _write_errors(path, "all episodes are kept; make room and add --resume"):
+        with _write_errors(path, "all episodes are safe: make room and add --resume"):
             write_atomic(path, table.to_csv(index=False).encode())
         return table
 
@@ -404,15 +413,15 @@ class RunFolder:
                 return
             for folder in (self.path / "episodes", self.path / "logs"):
                 folder.mkdir(exist_ok=True)
-            for name, data in self._begun.items():
+            for name, data in self._start_files.items():
                 write_atomic(self.path / name, data)
             self._replace_database(database)
 
     def _replace_database(self, database: Path) -> None:
         """Write the database again from the rows of this process."""
-        if self._add_connection is not None:
-            self._add_connection.close()
-            self._add_connection = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
         for end in ("", "-wal", "-shm"):
             database.with_name(DATABASE + end).unlink(missing_ok=True)
         with _database_errors(self.path):
@@ -423,11 +432,11 @@ class RunFolder:
                     [(name, row.decode()) for name, row in self._rows.items()],
                 )
 
-    def _remember(self) -> None:
-        """Note what `mend` restores."""
+    def _note_files(self) -> None:
+        """Read what `mend` restores: the folder, its spec, its scenarios and its rows."""
         self._guard = FolderGuard(self.path)
         for name in ("scenarios.json", "run.json"):
-            self._begun[name] = (self.path / name).read_bytes()
+            self._start_files[name] = (self.path / name).read_bytes()
         for record in read_records(self.path):
             self._rows.setdefault(record.scenario.id, RECORD_FILE.encode(record))
 
@@ -478,20 +487,22 @@ class RunFolder:
             database.replace(database.with_name(DATABASE + ".damaged"))
             check_database(self.path)
         rows = [] if self._suite is not None else read_records(self.path)
-        if invalid := [row.scenario.id for row in rows if not self._is_whole(row.scenario.id, row)]:
-            self._remove(invalid)
+        if invalid := [row.scenario.id for row in rows if not self._is_valid(row.scenario.id, row)]:
+            self._remove_rows(invalid)
         on_disk = {
             p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")
         }
-        without_row = set(self.spec.scenarios) & on_disk.keys() - self.finished() - {*invalid}
+        without_row = set(self.spec.scenarios) & on_disk.keys() - self.finished_ids() - {*invalid}
         restored = [
-            name for name in sorted(without_row, key=on_disk.__getitem__) if self._is_whole(name)
+            name for name in sorted(without_row, key=on_disk.__getitem__) if self._is_valid(name)
         ]
         for name in restored:
-            self.add(Record.load(self.episode_folder(name) / "record.json"))
+            self.add_row(Record.load(self.episode_folder(name) / "record.json"))
         if damage:
-            repair = f"made anew from {len(restored)} records on disk, kept as {DATABASE}.damaged"
-            self.notes.append(f"{database} was damaged ({damage}): {repair}")
+            repair = f"it was built again from {len(restored)} records on disk"
+            self.notes.append(
+                f"{database} was damaged ({damage}): {repair}; the old file is {DATABASE}.damaged"
+            )
 
 
 @contextmanager
@@ -520,14 +531,14 @@ def read_scenarios(path: Path) -> Mapping[str, Scenario]:
 def read_spec(path: Path) -> RunSpec:
     """Load the spec of a run. Raises UsageError, listing nearby runs, if the folder holds none."""
     try:
-        return decode_spec(read_limited(path / "run.json", _MOST_BYTES), path / "run.json")
+        return decode_spec(read_limited(path / "run.json", _MAX_BYTES), path / "run.json")
     except FileNotFoundError:
         near = [
             str(run.parent) for run in (*path.glob("*/run.json"), *path.parent.glob("*/run.json"))
         ]
         if path.is_dir():
-            refuse_not_begun(path)
-            nearby = f"Runs in it and beside it: {listed(str(path), near)}"
+            check_begun(path)
+            nearby = f"Runs in it and next to it: {listed(str(path), near)}"
             raise UsageError(f"{path} is no run folder: it holds no run.json. {nearby}") from None
         raise unknown("run", str(path), near) from None
     except NotADirectoryError:
@@ -541,13 +552,13 @@ def read_spec(path: Path) -> RunSpec:
         ) from error
 
 
-def refuse_not_begun(path: Path) -> None:
+def check_begun(path: Path) -> None:
     """Raise UsageError if a folder to be resumed is missing or was stopped before its run began."""
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= UNFINISHED
     ):
         raise UsageError(
-            f"{path}: no run has begun there, so that nothing is kept: give the command of "
+            f"{path}: no run has begun there, so there is nothing to resume: give the command of "
             f"the run without --resume"
         )
 
@@ -576,13 +587,13 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
         raise RunError(f"{path / DATABASE}: cannot be read: {error.strerror or error}") from error
 
 
-def refuse_in_use(path: Path) -> None:
+def check_not_in_use(path: Path) -> None:
     """Raise RunError, naming the process, while a run is writing to its folder."""
     if is_locked(path / "lock"):
         raise _in_use(path)
 
 
-def refuse_used(path: Path) -> None:
+def check_unused(path: Path) -> None:
     """Raise RunError if a folder holds a run, or files other than the start of one."""
     try:
         if (path / "run.json").exists():

@@ -23,15 +23,17 @@ SCHEMA = 1
 _MAY_DIFFER = {"policy_name", "shared_renderer", "schema"}
 """Keys of run.json that may differ between two starts of the same run."""
 _ARITHMETIC_HINT = (
-    " Of two machines whose arithmetic is apart the processors or C libraries round differently: "
-    "episodes of one are not those of the other to the bit."
+    " The processors or C libraries of the two machines round differently, so that episodes of one "
+    "are not bit-identical to those of the other."
 )
+"""Hint for runs with another `arithmetic` hash in their versions."""
 
 _SUITE_FIELDS = ("suite_version", "suite_hash")
 _SUITE_HINT = (
-    " The suite was edited; or --crowd and the like differ; or, with --map, --robot, --seed, "
-    "--episodes or --event do."
+    " Either the suite was edited, or options of the crowd such as --crowd differ; with --map also "
+    "--robot, --seed, --episodes or --event."
 )
+"""Hint for runs whose suites differ."""
 
 
 class Shard(msgspec.Struct, frozen=True):
@@ -44,28 +46,33 @@ class Shard(msgspec.Struct, frozen=True):
     of: int
 
     @classmethod
-    def called(cls, words: str, scenarios: int) -> Shard:
-        """Parse a shard such as "2/8" for a run of `scenarios` scenarios. Raises UsageError."""
-        found = re.fullmatch(r"([1-9][0-9]{0,5})/([1-9][0-9]{0,5})", words, re.ASCII)
+    def parse(cls, text: str, scenarios: int) -> Shard:
+        """Parse a shard such as "2/8" for a run of `scenarios` scenarios. Raises UsageError.
+
+        >>> Shard.parse("2/8", scenarios=40).in_words
+        '2/8'
+        """
+        found = re.fullmatch(r"([1-9][0-9]{0,5})/([1-9][0-9]{0,5})", text, re.ASCII)
         number, of = (int(part) for part in found.groups()) if found else (0, 0)
         if not 0 < number <= of:
             raise UsageError(
-                f"--shard {words}: give i/n, with i from 1 to n, such as 1/4, 2/4, 3/4 and 4/4"
+                f"--shard {text}: give i/n, with i from 1 to n, such as 1/4, 2/4, 3/4 and 4/4"
             )
         if of > scenarios:
             raise UsageError(
-                f"--shard {words}: the run has {scenarios} scenarios, and more shards than "
+                f"--shard {text}: the run has {scenarios} scenarios, and more shards than "
                 f"that are empty"
             )
         return cls(number, of)
 
     @property
     def in_words(self) -> str:
+        """The shard as in `--shard`."""
         return f"{self.number}/{self.of}"
 
-    def share(self, whole: Sequence[_T]) -> list[_T]:
-        """Return this shard's part of the whole run."""
-        return list(whole[self.number - 1 :: self.of])
+    def select(self, items: Sequence[_T]) -> list[_T]:
+        """Return the items of this shard, in their order."""
+        return list(items[self.number - 1 :: self.of])
 
 
 class SpecDifference(NamedTuple):
@@ -124,21 +131,21 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
         weather = f"weather {self.weather}" if self.weather else ""
         return ", ".join(filter(None, (self.robots_in_words, weather)))
 
-    def apart(
-        self, other: RunSpec, but: str = "", whole: Suite | None = None
+    def difference_from(
+        self, other: RunSpec, ignored: str = "", suite: Suite | None = None
     ) -> SpecDifference | None:
         """Return the first field in which another run differs; None if they are the same run.
 
-        but: a field that may differ
-        whole: suite of both runs, to describe the choice of scenarios
+        ignored: field that may differ
+        suite: suite of both runs, to describe the choice of scenarios
         """
         others = RUN_FILE.flat(other)
         for field, mine in RUN_FILE.flat(self).items():
             theirs = others[field]
-            if mine == theirs or field == but or field in _MAY_DIFFER:
+            if mine == theirs or field == ignored or field in _MAY_DIFFER:
                 continue
             if field == "scenarios":
-                return _choice_difference(self.scenarios, other.scenarios, whole)
+                return _choice_difference(self.scenarios, other.scenarios, suite)
             changed: set[str] = set()
             if isinstance(mine, dict) and isinstance(theirs, dict):
                 changed = {
@@ -146,7 +153,10 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
                     for name in mine.keys() | theirs.keys()
                     if mine.get(name) != theirs.get(name)
                 }
-                mine, theirs = ({n: of.get(n) for n in sorted(changed)} for of in (mine, theirs))
+                mine, theirs = (
+                    {name: values.get(name) for name in sorted(changed)}
+                    for values in (mine, theirs)
+                )
             hint = (
                 _ARITHMETIC_HINT
                 if "arithmetic" in changed
@@ -204,17 +214,17 @@ def _robot_names(spec: RunSpec) -> str:
 
 
 def _choice_difference(
-    mine: Sequence[str], theirs: Sequence[str], whole: Suite | None
+    mine: Sequence[str], theirs: Sequence[str], suite: Suite | None
 ) -> SpecDifference:
     """Describe the different choice of scenarios of two runs of a suite."""
-    if whole is None:
+    if suite is None:
         return SpecDifference(
             "choice of scenarios", _count_in_words(mine, theirs), _count_in_words(theirs, mine), ""
         )
     return SpecDifference(
         "choice of scenarios",
-        selection_in_words(whole, mine),
-        selection_in_words(whole, theirs),
+        selection_in_words(suite, mine),
+        selection_in_words(suite, theirs),
         "",
     )
 
@@ -226,7 +236,9 @@ def _count_in_words(ids: Sequence[str], others: Sequence[str]) -> str:
 
 
 def decode_spec(data: bytes, where: Path) -> RunSpec:
-    """Decode a run.json. where: path named in errors.
+    """Decode a run.json.
+
+    where: path named in errors.
 
     Raises RunError for another schema, ValueError for bytes that are no run.json.
     """

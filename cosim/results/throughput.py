@@ -47,7 +47,7 @@ class Throughput(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def in_words(self) -> str:
-        """Return the figures in one line."""
+        """Figures in one line."""
         busy_s = self.setup_s + self.driving_s
         setup = f", {100.0 * self.setup_s / busy_s:.0f} % of it setting up" if busy_s else ""
         return (

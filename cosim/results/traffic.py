@@ -55,7 +55,7 @@ class TrafficMonitor:
         self._inside = Circle()
         self._off_road_parts: dict[str, shapely.Geometry] = {}
 
-    def see(self, step: Step) -> RoadState:
+    def update(self, step: Step) -> RoadState:
         """Process one tick."""
         pose = step.motion.robot.pose
         if self._inside.holds(pose.x_m, pose.y_m):

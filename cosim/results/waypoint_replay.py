@@ -19,7 +19,7 @@ class WaypointReplay:
     """Waypoints that the robot follows, from the Steps of an episode in order.
 
     The waypoints are those whose command took effect last, at the robot's pose when they were
-    requested. `follows` is the row of `take`'s result that is followed.
+    requested. `follows` is the row of `update`'s result that is followed.
     """
 
     def __init__(self, log: Log) -> None:
@@ -31,7 +31,7 @@ class WaypointReplay:
         self._pending: deque[tuple[int, Floats | None]] = deque()
         self._current: Floats | None = None
 
-    def take(self, step: Step, reset: bool) -> Floats | None:
+    def update(self, step: Step, reset: bool) -> Floats | None:
         """Process a step and return (1 + N, 2) metres in the world; None without waypoints.
 
         The first row is the robot's position at the request, then the waypoints.

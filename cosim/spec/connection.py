@@ -50,7 +50,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
             raise UsageError("one end of a session listens or connects: name one endpoint")
         if self.listen and self.role not in HUBS:
             raise UsageError(
-                f"the role {self.role} listens nowhere, it connects. Those who listen: "
+                f"the role {self.role} connects and does not listen. Roles that listen: "
                 f"{', '.join(HUBS)}."
             )
         protocol, address = _parts(checked_endpoint(self.endpoint, "endpoint"))
@@ -93,19 +93,16 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def _risk(self) -> str:
         if self.connect:
-            return (
-                f"whoever stands between here and {self.connect} may read and change all that is "
-                f"sent"
-            )
+            return f"anyone between here and {self.connect} may read and change all that is sent"
         if self.guests == ("ros2",):
-            return f"whoever can reach {self.listen} may see the sensors and drive the robot"
+            return f"anyone who can reach {self.listen} may see the sensors and drive the robot"
         may = {
-            "coordinator": "watch, inject pedestrians, take episodes and tell their results, and "
+            "coordinator": "watch, inject pedestrians, take episodes and report their results, and "
             "answer as a policy",
-            "director": "ask it",
-            "policy": "ask it and see what it answers to",
+            "director": "query it",
+            "policy": "query it and see its observations",
         }
-        return f"whoever can reach {self.listen} may {may[self.role]}, and read all that is sent"
+        return f"anyone who can reach {self.listen} may {may[self.role]}, and read all that is sent"
 
 
 def listening(role: Role, option: str, endpoint: str, tls: str, insecure: bool) -> Connection:

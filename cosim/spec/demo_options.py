@@ -19,9 +19,9 @@ from cosim.spec.weather import weather_called
 
 RECORDING_CAMERA: Final = "collected"
 """Name of the recording camera when the expert has a camera of its own."""
-_MOST_NOISE: Final = 0.9
+_MAX_NOISE: Final = 0.9
 """Maximum share of the time with disturbed commands."""
-_MOST_WAYPOINTS: Final = 100
+_MAX_WAYPOINTS: Final = 100
 """Maximum number of waypoints in a row."""
 _FASTEST_HZ: Final = 20.0
 """Maximum rate of pictures; a tick takes 0.05 s."""
@@ -72,9 +72,9 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
                 f"a data set has {valid} pictures a second, not {self.rate_hz:g}: choose one "
                 f"of these rates"
             )
-        if not 0.0 <= self.noise <= _MOST_NOISE:
+        if not 0.0 <= self.noise <= _MAX_NOISE:
             raise SpecError(
-                f"noise must be in [0, {_MOST_NOISE:g}], a share of the time, not {self.noise:g}"
+                f"noise must be in [0, {_MAX_NOISE:g}], a share of the time, not {self.noise:g}"
             )
         if self.learner and not self.noise:
             raise SpecError(
@@ -85,8 +85,8 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
             raise SpecError(f"astray must be in [0, 1], a share of the episodes, not {self.astray}")
         for name in self.weathers:
             weather_called(name)
-        if not 1 <= self.waypoints <= _MOST_WAYPOINTS:
-            raise SpecError(f"waypoints must be in [1, {_MOST_WAYPOINTS}], not {self.waypoints}")
+        if not 1 <= self.waypoints <= _MAX_WAYPOINTS:
+            raise SpecError(f"waypoints must be in [1, {_MAX_WAYPOINTS}], not {self.waypoints}")
         if not (
             math.isfinite(self.waypoint_s)
             and 0.0 < self.waypoint_s <= 10.0

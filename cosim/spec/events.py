@@ -60,7 +60,7 @@ class Event(Ranged, frozen=True, kw_only=True):
     decoy: bool = False
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return f"event {shown(self.id)}: "
 
     def contradictions(self) -> Iterator[str]:
@@ -310,7 +310,7 @@ class EventKind:
         if self.blocked is None:
             raise SpecError(f"events of kind '{self.name}' have no decoys")
         if event.free_side == 0:
-            raise SpecError(f"{event.called}its decoy needs free_side -1 or 1, not 0")
+            raise SpecError(f"{event.prefix}its decoy needs free_side -1 or 1, not 0")
         return msgspec.structs.replace(event, free_side=-event.free_side)
 
 

@@ -53,7 +53,7 @@ _GREY: Final = 128
 """Grey value of an example picture."""
 _FARTHEST_M: Final = 10_000.0
 """Largest coordinate of a point in a learner's space, in metres."""
-_MOST_LETTERS: Final = 400
+_MAX_LETTERS: Final = 400
 """Largest length of an instruction in a learner's space, in characters."""
 _NEAREST_M: Final = 5.0
 """Least distance of a sub-goal or random point, in metres."""
@@ -246,7 +246,7 @@ class Instruction(TurningGoal, frozen=True, tag="instruction"):
 
     @classmethod
     def space(cls, size: tuple[int, int]) -> TextSpace:
-        return TextSpace(_MOST_LETTERS, string.ascii_letters + string.digits + " .,")
+        return TextSpace(_MAX_LETTERS, string.ascii_letters + string.digits + " .,")
 
     @classmethod
     def example(cls, size: tuple[int, int]) -> Instruction:
@@ -362,7 +362,7 @@ class Goals(Protocol):
     def at(self, pose: Pose, route_s_m: float) -> Goal | None:
         """Return the goal of a robot at this pose and arc length of the route."""
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Discard state that is invalid after the robot was reset to another pose."""
 
 
@@ -371,13 +371,13 @@ class GoalSource(NamedTuple):
 
     draws: generator of all random draws.
     size: width and height of the policy's pictures, 0 without a camera.
-    look: takes the camera's picture at a pose, for goals that are pictures.
+    take_picture: takes the camera's picture at a pose, for goals that are pictures.
     """
 
     scenario: Scenario
     draws: np.random.Generator
     size: tuple[int, int] = (0, 0)
-    look: TakePicture | None = None
+    take_picture: TakePicture | None = None
 
 
 class GoalKind(NamedTuple):
@@ -438,7 +438,7 @@ class _PositionGoals:
     def at(self, pose: Pose, route_s_m: float) -> Goal | None:
         return self._goal(pose, route_s_m)
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Nothing to forget."""
 
 
@@ -462,16 +462,16 @@ class _RandomPoints:
             goal = PointGoal(ahead, aside)
         return goal
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         self._point = None
 
 
 class _ImageGoals:
     """Pictures at the sub-goals along the route, taken when a sub-goal is selected."""
 
-    def __init__(self, route: Polyline, look: TakePicture) -> None:
+    def __init__(self, route: Polyline, take_picture: TakePicture) -> None:
         self._route = route
-        self._look = look
+        self._take_picture = take_picture
         self._subgoals = SubGoals(route.length_m)
         self._taken_s_m = math.nan
         self._goal = ImageGoal(np.zeros((0, 0, 3), np.uint8))
@@ -479,10 +479,10 @@ class _ImageGoals:
     def at(self, pose: Pose, route_s_m: float) -> ImageGoal:
         s_m = self._subgoals.after(route_s_m)
         if s_m != self._taken_s_m:
-            self._taken_s_m, self._goal = s_m, ImageGoal(self._look(self._route.at(s_m)))
+            self._taken_s_m, self._goal = s_m, ImageGoal(self._take_picture(self._route.at(s_m)))
         return self._goal
 
-    def put_back(self) -> None:
+    def on_reset(self) -> None:
         """Nothing to discard: the sub-goals detect a reset themselves."""
 
 
@@ -537,8 +537,8 @@ def _final_points(source: GoalSource) -> Goals:
 
 
 def _images(source: GoalSource) -> Goals:
-    assert source.look is not None, "image goals need a camera"
-    return _ImageGoals(source.scenario.route_line, source.look)
+    assert source.take_picture is not None, "image goals need a camera"
+    return _ImageGoals(source.scenario.route_line, source.take_picture)
 
 
 def _random_images(source: GoalSource) -> Goals:
@@ -643,10 +643,10 @@ def goals_for(
     scenario: Scenario,
     draws: np.random.Generator,
     size: tuple[int, int] = (0, 0),
-    look: TakePicture | None = None,
+    take_picture: TakePicture | None = None,
 ) -> Goals:
     """Return the goals of a scenario. The arguments are those of `GoalSource`."""
-    return GOALS[protocol].draw(GoalSource(scenario, draws, size, look))
+    return GOALS[protocol].draw(GoalSource(scenario, draws, size, take_picture))
 
 
 def decoded_goal(fields: Mapping[str, Any]) -> Goal:
@@ -666,7 +666,7 @@ def protocols_of(*types: type[AnyGoal]) -> tuple[GoalProtocol, ...]:
     )
 
 
-def most_goal_bytes(size: tuple[int, int]) -> int:
+def max_goal_bytes(size: tuple[int, int]) -> int:
     """Return the size of the largest goal array in bytes.
 
     size: width and height of the policy's pictures.

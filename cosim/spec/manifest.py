@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field as filled
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from cosim.core.errors import SpecError
@@ -44,10 +43,10 @@ class WaypointRule:
     def __post_init__(self) -> None:
         if isinstance(self.index, bool) or not isinstance(self.index, int) or self.index < 0:
             raise SpecError(f"waypoints index must be a whole number from 0, not {self.index!r}")
-        for field in ("unit_m", "dt_s"):
-            value = getattr(self, field)
+        for name in ("unit_m", "dt_s"):
+            value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise SpecError(f"waypoints {field} must be a positive number, not {value}")
+                raise SpecError(f"waypoints {name} must be a positive number, not {value}")
         if self.rule not in get_args(WaypointRuleName):
             raise SpecError(
                 f"waypoints rule must be one of {', '.join(get_args(WaypointRuleName))}, not "
@@ -91,7 +90,7 @@ class Manifest:
     waypoints: WaypointRule = WaypointRule()
     goal: GoalProtocol = "none"
     odometry: OdometryKind = "none"
-    cameras: Mapping[str, CameraSpec] = filled(default_factory=dict)
+    cameras: Mapping[str, CameraSpec] = field(default_factory=dict)
     goals: tuple[GoalProtocol, ...] = ()
     scan: ScanSpec | None = None
     imu: ImuKind = "none"

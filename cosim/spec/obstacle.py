@@ -53,7 +53,7 @@ class Obstacle(Ranged, frozen=True, kw_only=True):
     form: Annotated[int, Within(0, OBSTACLE_FORMS - 1)] = 0
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return f"obstacle {shown(self.kind)} at ({self.x_m:.2f}, {self.y_m:.2f}): "
 
     @property

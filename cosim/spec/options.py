@@ -16,7 +16,7 @@ from cosim.spec.goal import GoalProtocol, goal_called
 from cosim.spec.injection import Injected, LiveAddress
 from cosim.spec.ros2 import Ros2Settings
 from cosim.spec.run_config import (
-    MOST_LATENCY_MS,
+    MAX_LATENCY_MS,
     POLICY_MEMORY_GB,
     Appearance,
     CameraChoice,
@@ -114,9 +114,9 @@ class RendererAddress(msgspec.Struct, frozen=True, kw_only=True):
     appearance: Appearance = "splats"
 
 
-LEAST_PACE = 0.1
+MIN_PACE = 0.1
 """Minimum pace in multiples of real time. A slower one would look like a hanging engine."""
-MOST_PACE = 100.0
+MAX_PACE = 100.0
 """Maximum pace in multiples of real time."""
 
 
@@ -170,7 +170,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     collecting: DemoOptions | None = None
 
     @classmethod
-    def asked(cls, config: RunConfig) -> EpisodeOptions:
+    def from_config(cls, config: RunConfig) -> EpisodeOptions:
         """Return the options that a run's config requests. Raises UsageError."""
         return cls(
             seed=config.seed,
@@ -191,19 +191,19 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
         check_seed(self.seed)
         if self.weather and self.weather not in WEATHERS:
             raise unknown("weather", self.weather, WEATHERS)
-        if not (math.isfinite(self.latency_ms) and 0.0 <= self.latency_ms <= MOST_LATENCY_MS):
+        if not (math.isfinite(self.latency_ms) and 0.0 <= self.latency_ms <= MAX_LATENCY_MS):
             raise UsageError(
-                f"latency_ms must be from 0 to {MOST_LATENCY_MS:g} ms, not {self.latency_ms:g}"
+                f"latency_ms must be from 0 to {MAX_LATENCY_MS:g} ms, not {self.latency_ms:g}"
             )
-        if self.pace and not LEAST_PACE <= self.pace <= MOST_PACE:
+        if self.pace and not MIN_PACE <= self.pace <= MAX_PACE:
             raise UsageError(
-                f"pace must be from {LEAST_PACE:g} to {MOST_PACE:g} times real time, or 0 for as "
+                f"pace must be from {MIN_PACE:g} to {MAX_PACE:g} times real time, or 0 for as "
                 f"fast as possible, not {self.pace:g}"
             )
         if self.real_time and self.latency_ms:
             raise UsageError("real_time measures the latency of every answer: leave latency_ms out")
 
-    def scenario(self, scenario: Scenario) -> Scenario:
+    def apply_to(self, scenario: Scenario) -> Scenario:
         """Return a scenario with the robot and the weather of these options. Raises UsageError,
         SpecError."""
         return scenario.driven_by(self.robot).in_weather(self.weather)

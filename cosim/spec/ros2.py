@@ -39,7 +39,7 @@ LARGEST_DOMAIN: Final = 232
 """Largest ROS_DOMAIN_ID."""
 ORIGIN_S: Final = 1
 """Time of /clock at the start of an episode in seconds: ROS reads 0 as no time."""
-SENT: Final[Mapping[str, str]] = MappingProxyType(
+PUBLISHED_TOPICS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "/clock": "rosgraph_msgs/msg/Clock",
         "/cosim/episode": "std_msgs/msg/String",
@@ -60,7 +60,7 @@ SENT: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 """Type of each published topic, in the order in which those of a tick are sent."""
-SENT_WITH: Final[Mapping[str, str]] = MappingProxyType(
+TOPIC_OPTIONS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "/cosim/instruction": "--goal instruction",
         "/cosim/goal": "--goal with a point",
@@ -77,14 +77,14 @@ SENT_WITH: Final[Mapping[str, str]] = MappingProxyType(
 """Options of a run on which it depends whether a topic has messages."""
 CMD_VEL: Final = "/cmd_vel"
 PLAN: Final = "/plan"
-TAKEN: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+COMMAND_TOPICS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         CMD_VEL: ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"),
         PLAN: ("nav_msgs/msg/Path",),
     }
 )
 """Types of each topic that is read."""
-LARGEST_B: Final = 1 << 20
+MAX_MESSAGE_B: Final = 1 << 20
 """Largest message in bytes that is read: a plan of 10,000 poses fits."""
 _CAMERA: Final = re.compile(r"(\d{1,4})x(\d{1,4})(?:@(\d{1,3}(?:\.\d+)?))?")
 _SCAN: Final = re.compile(r"(\d{1,5})(?:x(\d{1,3}))?(?:@(\d{1,3}(?:\.\d+)?))?")

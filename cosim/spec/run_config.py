@@ -37,7 +37,7 @@ POLICY_MEMORY_GB = 16.0
 """Default limit of the memory of a process of an isolated policy, in GB."""
 MEASURED = "measured"
 """Value of `--latency` that measures the latency before the run."""
-MOST_LATENCY_MS = 10_000.0
+MAX_LATENCY_MS = 10_000.0
 """Maximum latency of a command in milliseconds."""
 LONGEST_WAIT_S = 240.0
 """Maximum timeout of a director in seconds; processes that are silent for much longer count as
@@ -598,9 +598,9 @@ class RunConfig:
             raise UsageError(
                 f"--latency '{self.latency}': give milliseconds, like 200, or 'measured'"
             ) from None
-        if not 0.0 <= latency_ms <= MOST_LATENCY_MS:
+        if not 0.0 <= latency_ms <= MAX_LATENCY_MS:
             raise UsageError(
-                f"--latency {self.latency}: milliseconds must be from 0 to {MOST_LATENCY_MS:g}"
+                f"--latency {self.latency}: milliseconds must be from 0 to {MAX_LATENCY_MS:g}"
             )
         return latency_ms
 

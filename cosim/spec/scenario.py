@@ -130,19 +130,19 @@ class RouteCrossing(Ranged, frozen=True, kw_only=True):
     signalised: bool
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return f"crossing {shown(self.id)}: "
 
     def contradictions(self) -> Iterator[str]:
         if self.enter_s_m > self.leave_s_m:
-            yield f"{self.called}enter_s_m {self.enter_s_m} comes after leave_s_m {self.leave_s_m}"
+            yield f"{self.prefix}enter_s_m {self.enter_s_m} comes after leave_s_m {self.leave_s_m}"
 
 
 DEFAULT_PERSONS = 50
 """Default number of persons around the robot."""
-MOST_PERSONS = 1000
+MAX_PERSONS = 1000
 """Maximum number of persons; SUMO would be too slow for more."""
-MOST_PER_1000_M2 = 150.0
+MAX_PER_1000_M2 = 150.0
 """Maximum density in persons per 1000 m2. Denser crowds have no space to enter 1.5 m apart."""
 
 
@@ -157,12 +157,12 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     added: whether the crowd was requested in place of the suite's own.
     """
 
-    persons: Annotated[int, Within(0, MOST_PERSONS)] = DEFAULT_PERSONS
+    persons: Annotated[int, Within(0, MAX_PERSONS)] = DEFAULT_PERSONS
     radius_m: Annotated[float, Within(20, 500)] = 80.0
     vehicles: Annotated[int, Within(0, 200)] = 20
     density: Annotated[
         float | None,
-        Within(0, MOST_PER_1000_M2, words="must be in {range} per 1000 m2, not {value}"),
+        Within(0, MAX_PER_1000_M2, words="must be in {range} per 1000 m2, not {value}"),
     ] = None
     residents: Annotated[int, Within(0, 60)] = 0
     groups: Annotated[float, SHARE] = 0.0
@@ -171,7 +171,7 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     added: bool = False
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "crowd "
 
     @property
@@ -279,7 +279,7 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     schema: int = _SCHEMA
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "scenario " if FOLDER.refusal("id", self.id) else f"scenario '{self.id}': "
 
     def __post_init__(self) -> None:
@@ -294,41 +294,41 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
                 f"{_SCHEMA}"
             )
         if self.weather is not msgspec.UNSET:
-            yield _weather_fault(self.called, self.weather, self.light)
+            yield _weather_fault(self.prefix, self.weather, self.light)
         if len(self.route) < 2:
-            yield f"{self.called}route needs two points or more"
+            yield f"{self.prefix}route needs two points or more"
             return
         for field, (x, y), end in (
             ("start", self.start[:2], self.route[0]),
             ("goal", self.goal, self.route[-1]),
         ):
             if not abs(x - end[0]) + abs(y - end[1]) <= 1e-6:
-                yield f"{self.called}{field} {(x, y)} is not the route's end {end}"
-        yield HEADING_RAD.refusal(f"{self.called}start's heading", self.start[2])
+                yield f"{self.prefix}{field} {(x, y)} is not the route's end {end}"
+        yield HEADING_RAD.refusal(f"{self.prefix}start's heading", self.start[2])
         length_m = float(np.hypot(*np.diff(self.route, axis=0).T).sum())
         yield Within(_SHORTEST_M, _LONGEST_M).refusal(
-            f"{self.called}the length of the route, m,", length_m
+            f"{self.prefix}the length of the route, m,", length_m
         )
         if length_m <= 2.0 * self.goal_radius_m:
             yield (
-                f"{self.called}goal_radius_m must be less than half of the route's {length_m:g} m, "
+                f"{self.prefix}goal_radius_m must be less than half of the route's {length_m:g} m, "
                 f"not {self.goal_radius_m}"
             )
         places = [
-            (crossing.called, "leave_s_m", crossing.leave_s_m, _SLACK_M)
+            (crossing.prefix, "leave_s_m", crossing.leave_s_m, _SLACK_M)
             for crossing in self.crossings
         ]
         places += [
-            (event.called, "route_s_m", event.route_s_m, EVENT_BEYOND_M) for event in self.events
+            (event.prefix, "route_s_m", event.route_s_m, EVENT_BEYOND_M) for event in self.events
         ]
-        for called, field, s_m, beyond_m in places:
+        for prefix, field, s_m, beyond_m in places:
             if s_m > length_m + beyond_m:
-                yield f"{self.called}{called}{field} is {s_m:g}, but the route ends at {length_m:g}"
+                yield f"{self.prefix}{prefix}{field} is {s_m:g}, but the route ends at {length_m:g}"
         if self.go_on_mps > 0.0 and (not self.events or self.ends_at == "stop"):
-            yield f"{self.called}go_on_mps needs an event to pass, and ends_at 'goal'"
+            yield f"{self.prefix}go_on_mps needs an event to pass, and ends_at 'goal'"
         names = Counter(name for event in self.events for name in event.names)
         if twice := sorted(name for name, count in names.items() if count > 1):
-            yield f"{self.called}two events have a pedestrian '{twice[0]}': give one another id"
+            yield f"{self.prefix}two events have a pedestrian '{twice[0]}': give one another id"
 
     @property
     def start_pose(self) -> Pose:
@@ -382,13 +382,13 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         return Polyline(self.route)
 
 
-def _weather_fault(called: str, weather: str, light: Light) -> str:
+def _weather_fault(prefix: str, weather: str, light: Light) -> str:
     """Return the error of a weather in a light; "" without one."""
     if fault := weather_fault(weather):
-        return f"{called}{fault}"
+        return f"{prefix}{fault}"
     if light.hdri:
         return (
-            f"{called}weather '{weather}' contradicts light.hdri, a photographed sky with its own "
+            f"{prefix}weather '{weather}' contradicts light.hdri, a photographed sky with its own "
             f"weather: leave one of them out"
         )
     return ""
@@ -414,7 +414,7 @@ class Suite(Ranged, frozen=True, kw_only=True):
         decoys = {one.id for one in self.scenarios if one.decoy_of}
         for one in self.scenarios:
             if one.decoy_of in decoys:
-                yield f"{one.called}decoy_of names another decoy: {shown(one.decoy_of)}"
+                yield f"{one.prefix}decoy_of names another decoy: {shown(one.decoy_of)}"
 
     @property
     def content_hash(self) -> str:
@@ -455,26 +455,26 @@ def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Ite
         if not fewest <= event.people <= most:
             allowed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
             yield (
-                f"{event.called}people of '{event.kind}' must be {allowed}, not "
+                f"{event.prefix}people of '{event.kind}' must be {allowed}, not "
                 f"{shown(event.people)} - at `{at}`"
             )
         if event.decoy and kinds[event.kind].decoy is None:
-            yield f"{event.called}'{event.kind}' has no behaviour of decoys - at `{at}.decoy`"
+            yield f"{event.prefix}'{event.kind}' has no behaviour of decoys - at `{at}.decoy`"
         if event.free_side and not kinds[event.kind].has_free_side:
-            yield f"{event.called}free_side of '{event.kind}' must be 0 - at `{at}.free_side`"
+            yield f"{event.prefix}free_side of '{event.kind}' must be 0 - at `{at}.free_side`"
         if (kinds[event.kind].layout is None) != (event.half_length_m > 0.0):
             crossings = " and ".join(
                 f"'{kind.name}'" for kind in kinds.values() if kind.layout is None
             )
             yield (
-                f"{event.called}half_length_m is the crosswalk's: of {crossings}, and of no "
+                f"{event.prefix}half_length_m is the crosswalk's: of {crossings}, and of no "
                 f"other - at `{at}`"
             )
     stops = [kind.name for kind in kinds.values() if kind.ends_at == "stop"]
     if scenario.ends_at == "stop" and not any(event.kind in stops for event in scenario.events):
         needed = " or ".join(f"'{name}'" for name in stops)
         yield (
-            f"{scenario.called}ends_at 'stop' needs an event {needed}: somebody to stop for - at "
+            f"{scenario.prefix}ends_at 'stop' needs an event {needed}: somebody to stop for - at "
             f"`{place}`"
         )
 
@@ -485,7 +485,7 @@ def decoy_faults(suite: Suite) -> Iterator[str]:
     for i, one in enumerate(suite.scenarios):
         if one.decoy_of and one.decoy_of not in events:
             yield (
-                f"{one.called}decoy_of names no scenario of the suite: {shown(one.decoy_of)} - at "
+                f"{one.prefix}decoy_of names no scenario of the suite: {shown(one.decoy_of)} - at "
                 f"`$.scenarios[{i}].decoy_of`"
             )
 

@@ -22,8 +22,8 @@ GOAL_POSITIONS: Final[tuple[Position, ...]] = ("goal", "share")
 """Positions that need the distance to the goal, so the protocol `final_point`."""
 BEST_BLIND: Final = "best blind schedule found"
 """Name of the row of a suite's exploitability in tables."""
-MOST_STOPS: Final = 5
-MOST_LANES: Final = 4
+MAX_STOPS: Final = 5
+MAX_LANES: Final = 4
 
 _AT: Final = Within(0, 100_000)
 _SPEED_MPS: Final = Within(0, 5)
@@ -60,7 +60,10 @@ class Stop(Part, frozen=True, kw_only=True):
 
 
 class LaneChange(Part, frozen=True, kw_only=True):
-    """Change to another lane. to_m: lateral offset from the way, left positive."""
+    """Change to another lane.
+
+    to_m: lateral offset from the way, left positive.
+    """
 
     to_m: Annotated[float, Within(-20, 20)]
 
@@ -87,25 +90,25 @@ class Schedule(Ranged, frozen=True, kw_only=True):
 
     name: Annotated[str, PathName("a schedule")]
     v_mps: Annotated[float, _SPEED_MPS] = 1.2
-    stops: Annotated[tuple[Stop, ...], ItemCount(0, MOST_STOPS)] = ()
-    lanes: Annotated[tuple[LaneChange, ...], ItemCount(0, MOST_LANES)] = ()
+    stops: Annotated[tuple[Stop, ...], ItemCount(0, MAX_STOPS)] = ()
+    lanes: Annotated[tuple[LaneChange, ...], ItemCount(0, MAX_LANES)] = ()
     speeds: Annotated[tuple[SpeedChange, ...], ItemCount(0, 1)] = ()
     goal: ScheduleGoal = "none"
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return f"schedule '{self.name}': "
 
     def contradictions(self) -> Iterator[str]:
         if len(self.name) > 80:
-            yield f"{self.called}name must have at most 80 characters"
+            yield f"{self.prefix}name must have at most 80 characters"
         if self.goal == "final_point":
             return
         for kind, parts in (("stops", self.stops), ("lanes", self.lanes), ("speeds", self.speeds)):
             for number, part in enumerate(parts):
                 if part.by in GOAL_POSITIONS:
                     yield (
-                        f"{self.called}{kind}[{number}] is placed by '{part.by}', which needs "
+                        f"{self.prefix}{kind}[{number}] is placed by '{part.by}', which needs "
                         f'"goal": "final_point", not "{self.goal}"'
                     )
 

@@ -11,12 +11,12 @@ from cosim.spec.scenario import Scenario, Split, Suite
 
 STATIC: Final = "static"
 """Structure of `reactive` scenarios without an event, selectable like an event kind."""
-_MOST_NAMED: Final = 3
+_MAX_NAMED: Final = 3
 """Maximum number of scenarios that are listed by name, if no other options select them."""
 
 
 def select_scenarios(
-    whole: Suite,
+    suite: Suite,
     ids: Sequence[str] = (),
     episodes: int | None = None,
     kinds: Sequence[str] = (),
@@ -31,22 +31,22 @@ def select_scenarios(
     split: val or test; None for both.
     decoys: whether decoys are selected.
     """
-    by_id = {scenario.id: scenario for scenario in whole.scenarios}
+    by_id = {scenario.id: scenario for scenario in suite.scenarios}
     for scenario_id in ids:
         if scenario_id not in by_id:
             raise unknown("scenario", scenario_id, by_id)
-    picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
+    picked = [by_id[i] for i in dict.fromkeys(ids)] or list(suite.scenarios)
     if not decoys:
         picked = [s for s in picked if not s.decoy_of]
         if not picked:
             raise UsageError(
-                f"--no-decoys: only decoys of suite '{whole.name}' are chosen: leave it out"
+                f"--no-decoys: only decoys of suite '{suite.name}' are chosen: leave it out"
             )
     available = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
     for kind in kinds:
         if kind not in available and not available:
             raise UsageError(
-                f"--event {kind}: suite '{whole.name}' has no events among these scenarios: "
+                f"--event {kind}: suite '{suite.name}' has no events among these scenarios: "
                 f"leave it out"
             )
         if kind not in available:
@@ -57,7 +57,7 @@ def select_scenarios(
         picked = [s for s in picked if s.split == split]
         if not picked:
             raise UsageError(
-                f"suite '{whole.name}' has no scenarios of split '{split}' among those chosen"
+                f"suite '{suite.name}' has no scenarios of split '{split}' among those chosen"
             )
     first = {s.id for pair in pairs_of(picked)[:episodes] for s in pair}
     return tuple(s for s in picked if s.id in first)
@@ -71,7 +71,7 @@ def pairs_of(scenarios: Sequence[Scenario]) -> list[tuple[Scenario, ...]]:
     return [*map(tuple, groups.values())]
 
 
-def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
+def selection_in_words(suite: Suite, ids: Sequence[str]) -> str:
     """Return how many scenarios of a suite are selected, and the options of `cosim run` for them.
 
     >>> from cosim.spec.scenario import City
@@ -85,36 +85,36 @@ def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
     >>> selection_in_words(Suite(name="s", version="1", scenarios=(one, other)), ["a"])
     '1 of 2 (--episodes 1)'
     """
-    words = " ".join(_options_for(whole, ids)) or (
-        "all" if len(ids) == len(whole.scenarios) else "by --scenario"
+    words = " ".join(_options_for(suite, ids)) or (
+        "all" if len(ids) == len(suite.scenarios) else "by --scenario"
     )
-    return f"{len(ids)} of {len(whole.scenarios)} ({words})"
+    return f"{len(ids)} of {len(suite.scenarios)} ({words})"
 
 
-def _options_for(whole: Suite, ids: Sequence[str]) -> list[str]:
+def _options_for(suite: Suite, ids: Sequence[str]) -> list[str]:
     """Return the fewest options that select exactly these scenarios; none if all are, or no options
     do."""
-    picked = [scenario for scenario in whole.scenarios if scenario.id in {*ids}]
+    picked = [scenario for scenario in suite.scenarios if scenario.id in {*ids}]
     each = [_kinds_of(scenario) for scenario in picked]
     known = [
-        *dict.fromkeys(kind for scenario in whole.scenarios for kind in sorted(_kinds_of(scenario)))
+        *dict.fromkeys(kind for scenario in suite.scenarios for kind in sorted(_kinds_of(scenario)))
     ]
     every = tuple(kind for kind in known if any(kind in kinds for kinds in each))
     common = [(kind,) for kind in known if all(kind in kinds for kinds in each)]
     no_decoys = (
-        (False, True) if any(scenario.decoy_of for scenario in whole.scenarios) else (False,)
+        (False, True) if any(scenario.decoy_of for scenario in suite.scenarios) else (False,)
     )
     choices = product(
         (None, *get_args(Split)), ((), *common, every), (None, len(pairs_of(picked))), no_decoys
     )
     for split, kinds, episodes, without in sorted(choices, key=lambda one: sum(map(bool, one))):
         try:
-            found = select_scenarios(whole, (), episodes, kinds, split, not without)
+            found = select_scenarios(suite, (), episodes, kinds, split, not without)
         except UsageError:
             continue
         if {scenario.id for scenario in found} == {*ids}:
             return _as_options(kinds, split, episodes, without)
-    return [f"--scenario {name}" for name in ids] if len(ids) <= _MOST_NAMED else []
+    return [f"--scenario {name}" for name in ids] if len(ids) <= _MAX_NAMED else []
 
 
 def _as_options(

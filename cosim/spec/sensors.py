@@ -46,7 +46,7 @@ PEOPLE: Final[Mapping[str, str]] = MappingProxyType(
 """Kinds of tracked people and their descriptions."""
 
 
-MOST_RETURNS: Final = 2**17
+MAX_RETURNS: Final = 2**17
 """Largest number of distances in a scan."""
 
 
@@ -88,7 +88,7 @@ class ScanSpec(Ranged, frozen=True, dict=True):
     noise_m: Annotated[float, Within(0, 1)] = 0.02
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "scan "
 
     def contradictions(self) -> Iterator[str]:
@@ -106,10 +106,10 @@ class ScanSpec(Ranged, frozen=True, dict=True):
                 f"scan elevation_deg is {low:g} to {high:g}, and one ring has one elevation: give "
                 "rings, or the same value twice"
             )
-        if self.rings * self.rays > MOST_RETURNS:
+        if self.rings * self.rays > MAX_RETURNS:
             yield (
                 f"scan rings x rays is {self.rings * self.rays}, and a scan has at most "
-                f"{MOST_RETURNS} distances"
+                f"{MAX_RETURNS} distances"
             )
 
     @property
@@ -223,7 +223,7 @@ class Tracks(msgspec.Struct, frozen=True, eq=False):
 TRACKING_RANGE_M: Final = 15.0
 """Horizontal range in metres within which people are tracked, in all directions."""
 
-MOST_TRACKS: Final = 256
+MAX_TRACKS: Final = 256
 """Largest number of tracks in an observation; the farthest people are left out."""
 
 

@@ -14,15 +14,15 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import msgspec
 
 from cosim.core.errors import SpecError, nearest
-from cosim.spec.validation import MOST_SHOWN, Ranged, field_error, one_line, rules_of, shown
+from cosim.spec.validation import MAX_SHOWN, Ranged, field_error, one_line, rules_of, shown
 
-MOST_BYTES: Final = 1_000_000_000
+MAX_BYTES: Final = 1_000_000_000
 """Maximum size of a file in bytes."""
-MOST_LISTED_FAULTS: Final = 5
+MAX_LISTED_FAULTS: Final = 5
 """Maximum number of errors that a message lists."""
-MOST_COUNTED: Final = 1000
+MAX_COUNTED: Final = 1000
 """Maximum number of errors that are counted."""
-MOST_FAULT_LETTERS: Final = 400
+MAX_FAULT_LETTERS: Final = 400
 """Maximum length of one error in characters."""
 _PLACE: Final = re.compile(r" - at `(key in )?\$[^`]*`$")
 """Place that msgspec appends to an error."""
@@ -38,30 +38,30 @@ def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
     """Load the spec of a JSON file.
 
     Raises SpecError with the file, and the place and valid values of each error, one a line. At
-    most MOST_LISTED_FAULTS errors are listed.
+    most MAX_LISTED_FAULTS errors are listed.
     """
     try:
         if path.exists() and not path.is_file():
             raise SpecError(f"{path}: is no file")
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise SpecError(f"{path}: holds {size} bytes; at most {MOST_BYTES} are read")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise SpecError(f"{path}: holds {size} bytes; at most {MAX_BYTES} are read")
         data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
     try:
         return msgspec.json.decode(data, type=kind)
     except _REFUSED as error:
-        faults = list(islice(_faults(data, kind, error), MOST_COUNTED))
+        faults = list(islice(_faults(data, kind, error), MAX_COUNTED))
         raise SpecError(f"{path}: {join_faults(faults)}") from error
 
 
-def join_faults(faults: Sequence[str], most: int = MOST_LISTED_FAULTS) -> str:
+def join_faults(faults: Sequence[str], most: int = MAX_LISTED_FAULTS) -> str:
     """Join errors to a message: one as it is; of several, their number and the first `most`, one a
     line."""
     if len(faults) == 1:
         return faults[0]
     count = (
-        f"{len(faults)} faults" if len(faults) < MOST_COUNTED else f"{MOST_COUNTED} faults or more"
+        f"{len(faults)} faults" if len(faults) < MAX_COUNTED else f"{MAX_COUNTED} faults or more"
     )
     which = f"; the first {most}" if len(faults) > most else ""
     return "\n  ".join([f"{count}{which}:", *faults[:most]])
@@ -141,7 +141,7 @@ def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
         if isinstance(tree, str):
             message = message.replace(f"'{tree}'", shown(tree))
         yield (
-            f"{one_line(_PLACE.sub('', message), MOST_FAULT_LETTERS)} - at "
+            f"{one_line(_PLACE.sub('', message), MAX_FAULT_LETTERS)} - at "
             f"`{place}`{_choices(kind, tree)}"
         )
 
@@ -157,7 +157,7 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
         fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
         for name in sorted(tree.keys() - fields.keys() - {kind.__struct_config__.tag_field}):
             yield (
-                f"Object contains unknown field `{one_line(name, MOST_SHOWN)}` - at "
+                f"Object contains unknown field `{one_line(name, MAX_SHOWN)}` - at "
                 f"`{place}`{_listed(fields, name)}"
             )
         for name, field in fields.items():
@@ -167,7 +167,7 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
                 yield f"Object missing required field `{name}` - at `{place}`"
     elif isinstance(tree, dict) and get_origin(kind) is dict:
         for name, item in tree.items():
-            yield from faults_in(item, get_args(kind)[1], f"{place}.{one_line(name, MOST_SHOWN)}")
+            yield from faults_in(item, get_args(kind)[1], f"{place}.{one_line(name, MAX_SHOWN)}")
     elif isinstance(tree, list) and get_origin(kind) in (tuple, list):
         parts = get_args(kind) if get_origin(kind) is tuple else (*get_args(kind), ...)
         if parts[-1] is not Ellipsis and len(parts) != len(tree):

@@ -21,7 +21,7 @@ from cosim.core.errors import SpecError
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 """Names that are valid in paths and keys."""
-MOST_SHOWN: Final = 60
+MAX_SHOWN: Final = 60
 """Maximum length of a value in a message, in characters."""
 
 
@@ -137,10 +137,10 @@ class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         refusals = (
             field_error(field, rule, getattr(self, field)) for field, rule in rules_of(type(self))
         )
-        return [self.called + refusal for refusal in refusals if refusal]
+        return [self.prefix + refusal for refusal in refusals if refusal]
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         """Prefix of field names in messages."""
         return f"{type(self).__name__.lower()} "
 
@@ -168,9 +168,9 @@ def field_error(field: str, rule: Rule, value: Any) -> str:
 def shown(value: object) -> str:
     """Return a value for a message: on one line, quoted if it is text, cut if it is long."""
     return (
-        f"'{one_line(value, MOST_SHOWN)}'"
+        f"'{one_line(value, MAX_SHOWN)}'"
         if isinstance(value, str)
-        else one_line(repr(value), MOST_SHOWN)
+        else one_line(repr(value), MAX_SHOWN)
     )
 
 

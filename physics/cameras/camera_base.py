@@ -43,7 +43,10 @@ class WorldCamera(ABC):
 
     @abstractmethod
     def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
-        """Draw a shot. body: the robot's own body is in the picture."""
+        """Draw a shot.
+
+        body: the robot's own body is in the picture.
+        """
 
     def render(self, robot: RobotState, street: Street) -> Frame:
         """Render the robot's view from its mount, through its lens.

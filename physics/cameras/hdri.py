@@ -18,7 +18,7 @@ _Image = NDArray[np.float32]
 
 ROWS_MAX = 512
 """Rows above which pictures are averaged down; a sky appears blurred anyway."""
-_MOST_BYTES = 1 << 30
+_MAX_BYTES = 1 << 30
 _SPOT_RAD = math.radians(4.0)
 
 
@@ -31,7 +31,7 @@ def read_hdri(path: str) -> _Image:
     if not file.is_file():
         raise SpecError(f"hdri '{path}' does not exist")
     try:
-        data = np.frombuffer(read_limited(file, _MOST_BYTES), np.uint8)
+        data = np.frombuffer(read_limited(file, _MAX_BYTES), np.uint8)
     except (OSError, ValueError) as error:
         raise SpecError(
             f"hdri '{path}' cannot be read: {getattr(error, 'strerror', error)}"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
-from cosim.core.state import Frame, RobotState
+from cosim.core.state import Frame, RobotState, write_protect
 from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.robot import Mount
 from physics.textures.layers import LINEAR_OF_SRGB_BYTE, linear_to_srgb
@@ -64,8 +64,8 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
     robot: state for motion blur and skew
     seed, tick: of the noise
 
-    Motion is that of the ground plane and of walls at both sides.
-    People and vehicles blur as if they stood still.
+    Motion is that of the ground plane and of walls at both sides. People and vehicles blur as if
+    they stood still.
     """
     lens = spec.lens
     if lens == _NONE:
@@ -97,10 +97,10 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
         if len(moments) == 1:
             rgb = _moved(rgb, spec, source, flow, read, cv2.INTER_LINEAR)
         else:
-            open_ = LINEAR_OF_SRGB_BYTE[rgb]
+            linear = LINEAR_OF_SRGB_BYTE[rgb]
             light = np.zeros((spec.height, spec.width, 3), np.float32)
             for moment in moments:
-                light += _moved(open_, spec, source, flow, read + moment, cv2.INTER_LINEAR)
+                light += _moved(linear, spec, source, flow, read + moment, cv2.INTER_LINEAR)
             light /= np.float32(len(moments))
     if toned:
         light = _sensed(LINEAR_OF_SRGB_BYTE[rgb] if light is None else light, spec, seed, tick)
@@ -114,8 +114,8 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
 def exposure_gain(light: NDArray[np.floating[Any]], range_ev: float) -> float:
     """Return the auto-exposure gain of a linear picture (H, W, 3).
 
-    The gain moves the mean to GREY, within +-`range_ev` stops.
-    It depends on this picture alone, so that a picture stays a function of the state.
+    The gain moves the mean to GREY, within +-`range_ev` stops. It depends on this picture alone,
+    so that a picture is a function of the state.
     """
     mean = float(light.mean(axis=(0, 1)) @ np.array([0.2126, 0.7152, 0.0722]))
     return float(np.clip(GREY / max(mean, 1e-6), 2.0**-range_ev, 2.0**range_ev))
@@ -124,9 +124,7 @@ def exposure_gain(light: NDArray[np.floating[Any]], range_ev: float) -> float:
 def _sensed(
     light: NDArray[np.floating[Any]], spec: CameraSpec, seed: int, tick: int
 ) -> NDArray[np.floating[Any]]:
-    """Apply vignetting, sensor noise and gain; linear in and out. The gain amplifies the noise
-    too.
-    """
+    """Apply vignetting, sensor noise and gain to linear light. The gain amplifies the noise."""
     lens = spec.lens
     if lens.vignette:
         light = light * _falloff(spec)[..., None]
@@ -154,15 +152,15 @@ def _moved(
     source: CameraSpec,
     flow: Map | None,
     time_s: Map,
-    how: int,
+    interpolation: int,
 ) -> NDArray[Any]:
     """Warp a source picture by the lens and motion, each row at its time; `time_s` is (H, 1)."""
     if flow is None:
-        one, two = _still(spec, source, how)
+        one, two = _fixed_maps(spec, source, interpolation)
     else:
         x, y = _rays(spec)
         one, two = _pixels(spec, source, x - flow[..., 0] * time_s, y - flow[..., 1] * time_s)
-    return np.asarray(cv2.remap(picture, one, two, how, borderMode=cv2.BORDER_REPLICATE))
+    return np.asarray(cv2.remap(picture, one, two, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _pixels(spec: CameraSpec, source: CameraSpec, x: Map, y: Map) -> tuple[Map, Map]:
@@ -174,12 +172,16 @@ def _pixels(spec: CameraSpec, source: CameraSpec, x: Map, y: Map) -> tuple[Map, 
 
 
 @lru_cache(maxsize=8)
-def _still(spec: CameraSpec, source: CameraSpec, how: int) -> tuple[NDArray[Any], NDArray[Any]]:
+def _fixed_maps(
+    spec: CameraSpec, source: CameraSpec, interpolation: int
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the lens distortion as OpenCV's fixed-point maps, which are faster to apply."""
-    whole: tuple[NDArray[Any], NDArray[Any]] = cv2.convertMaps(
-        *_pixels(spec, source, *_rays(spec)), cv2.CV_16SC2, nninterpolation=how == cv2.INTER_NEAREST
+    maps: tuple[NDArray[Any], NDArray[Any]] = cv2.convertMaps(
+        *_pixels(spec, source, *_rays(spec)),
+        cv2.CV_16SC2,
+        nninterpolation=interpolation == cv2.INTER_NEAREST,
     )
-    return whole
+    return maps
 
 
 def _focal_px(spec: CameraSpec) -> float:
@@ -215,13 +217,13 @@ def _rays(spec: CameraSpec) -> tuple[Map, Map]:
             )
         scale = np.where(bent > 1e-9, r / np.maximum(bent, 1e-9), 1.0)
         x, y = x * scale, y * scale
-    return _locked(x), _locked(y)
+    return _read_only(x), _read_only(y)
 
 
 @lru_cache(maxsize=2)
 def _noise(seed: int, size: int) -> Map:
     """Return normal noise of a scenario; each picture takes `size` values at its own offset."""
-    return _locked(
+    return _read_only(
         np.random.default_rng([seed, 0x1E45]).standard_normal(size + _OFFSETS, dtype=np.float32)
     )
 
@@ -232,7 +234,7 @@ def _falloff(spec: CameraSpec) -> Map:
     of 1.
     """
     x, y = _rays(spec)
-    return _locked(1.0 - spec.lens.vignette * (1.0 - (1.0 + x**2 + y**2) ** -2.0))
+    return _read_only(1.0 - spec.lens.vignette * (1.0 - (1.0 + x**2 + y**2) ** -2.0))
 
 
 @lru_cache(maxsize=8)
@@ -260,7 +262,7 @@ def _flows(spec: CameraSpec) -> tuple[Map, Map]:
     flows = []
     for speed, turn in ((ahead, np.zeros(3)), (swing, up)):
         moved = -speed * near[..., None] - np.cross(turn, rays)
-        flows.append(_locked(moved[..., :2] - rays[..., :2] * moved[..., 2:]))
+        flows.append(_read_only(moved[..., :2] - rays[..., :2] * moved[..., 2:]))
     return flows[0], flows[1]
 
 
@@ -269,7 +271,6 @@ def _flow(spec: CameraSpec, robot: RobotState) -> Map:
     return ahead * np.float32(robot.v_mps) + turn * np.float32(robot.w_radps)
 
 
-def _locked(field: NDArray[np.floating[Any]]) -> Map:
-    whole = np.ascontiguousarray(field, dtype=np.float32)
-    whole.flags.writeable = False
-    return whole
+def _read_only(field: NDArray[np.floating[Any]]) -> Map:
+    """Return an array as write-protected contiguous float32."""
+    return write_protect(np.ascontiguousarray(field, dtype=np.float32))

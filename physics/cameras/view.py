@@ -87,13 +87,13 @@ class Shot:
 
     @property
     def steep_rad(self) -> float:
-        """Return the angle of the view below the horizon."""
+        """Angle of the view below the horizon."""
         x, y, z = self._way
         return math.atan2(-z, math.hypot(x, y))
 
     @property
     def half_picture(self) -> tuple[float, float]:
-        """Return the tangents of the angles from the middle to the right and to the upper edge."""
+        """Tangents of the angles from the middle to the right and to the upper edge."""
         tall = math.tan(math.radians(0.5 * self.fov_deg))
         return tall * self.size[0] / self.size[1], tall
 
@@ -117,7 +117,7 @@ class Shot:
 
     @cached_property
     def axes(self) -> Floats:
-        """Return (3, 3) unit vectors right, up in the picture, ahead.
+        """Unit vectors (3, 3): right, up in the picture, ahead.
 
         A view straight down has north at the top.
         """

@@ -17,7 +17,7 @@ from cosim.spec.robot import Legs, Robot
 from cosim.spec.scenario import Barrier
 from physics.dynamics.bullet import p
 from physics.dynamics.client import UPRIGHT, BulletClient
-from physics.dynamics.drive import BodyNow, Motors, Vector
+from physics.dynamics.drive import MeasuredBody, Motors, Vector
 from physics.dynamics.movers import Mover, TickPoses
 from physics.ground.mesh import Mesh, join
 from physics.ground.tiles import CURB_M
@@ -42,7 +42,9 @@ PARKED_Z_M: Final = -50.0
 _SEARCH_STEP_M: Final = 0.5
 """Distance in metres that the robot moves before nearby static bodies are searched again."""
 _NO_CHANGE: Final = (0.0, 0.0, 0.0)
+"""Change of the pose of a mover at rest."""
 _UNKNOWN: Final = (math.inf, math.inf, math.inf)
+"""Position before the first one is known."""
 _BODY_FRICTION: Final = 0.4
 """Friction coefficient of a robot's links that do not carry it."""
 _FOOT_FRICTION: Final = 1.0
@@ -60,7 +62,9 @@ or with the friction cone, skid turns are jerky.
 """
 
 BodyKind = Literal["pedestrian", "vehicle", "wall", "object"]
-Moving = Literal["pedestrian", "vehicle"]
+"""Kinds of bodies in contacts."""
+MoverKind = Literal["pedestrian", "vehicle"]
+"""Kinds of bodies that move."""
 Box = tuple[tuple[float, float, float], float, tuple[float, float, float]]
 """Foot of an upright box's centre, its heading in radians, and length, width and height."""
 
@@ -73,7 +77,7 @@ class Bodies(BulletClient):
 
     grip: factor of the friction of the ground
     at_m: position of the robot's base frame
-    watched: bodies that `robot_contacts` checks
+    contact_candidates: bodies that `robot_contacts` checks
 
     Inactive bodies of people and vehicles are parked far below the ground and reused.
     """
@@ -85,13 +89,16 @@ class Bodies(BulletClient):
         self._legs = robot.drive if isinstance(robot.drive, Legs) else None
         self._identities: dict[int, tuple[BodyKind, str]] = {}
         self._idle: dict[Any, list[int]] = {}
-        self._active: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
-        self._paths: dict[Moving, list[tuple[int, list[_Placement]]]] = {}
+        self._active: dict[MoverKind, dict[str, tuple[int, Any]]] = {
+            "pedestrian": {},
+            "vehicle": {},
+        }
+        self._paths: dict[MoverKind, list[tuple[int, list[_Placement]]]] = {}
         self._final_poses: dict[int, tuple[float, float, float]] = {}
         self.at_m = _UNKNOWN
         self._searched_at_m = _UNKNOWN
         self._static_near: dict[int, Any] = {}
-        self.watched: list[int] = []
+        self.contact_candidates: list[int] = []
         self._target_radps: list[float] = []
         self._angles: tuple[float, ...] = ()
         self._speeds: tuple[float, ...] = ()
@@ -212,10 +219,10 @@ class Bodies(BulletClient):
             self.remove_body(body)
             self._identities.pop(body, None)
 
-    def show(self, kind: Moving, movers: Sequence[Mover]) -> None:
+    def activate(self, kind: MoverKind, movers: Sequence[Mover]) -> None:
         """Activate a body for exactly these people or vehicles.
 
-        A body stays at its place until `lead` moves it.
+        A body stays at its place until `set_paths` moves it.
         """
         shown = self._active[kind]
         ids = [mover.id for mover in movers]
@@ -234,14 +241,16 @@ class Bodies(BulletClient):
                 self._identities[body] = (kind, mover.id)
         self._active[kind] = {name: shown[name] for name in ids}
 
-    def stands(self, kind: Moving, mover: Mover) -> bool:
-        """Return whether an active body is at rest where `lead` last put it."""
+    def is_at_rest(self, kind: MoverKind, mover: Mover) -> bool:
+        """Return whether an active body is at rest where `set_paths` last put it."""
         return (
             mover.change == _NO_CHANGE
             and self._final_poses.get(self._active[kind][mover.id][0]) == mover.start
         )
 
-    def lead(self, kind: Moving, ways: Mapping[Mover, TickPoses], z_m: Sequence[float]) -> None:
+    def set_paths(
+        self, kind: MoverKind, ways: Mapping[Mover, TickPoses], z_m: Sequence[float]
+    ) -> None:
         """Set the poses of active bodies for each substep of the next tick; all others stay.
 
         ways: poses after each substep
@@ -258,14 +267,14 @@ class Bodies(BulletClient):
             ]
             self._paths[kind].append((body, placements))
 
-    def place_led(self, substep: int) -> None:
-        """Put the bodies of `lead` where they are after a substep.
+    def place_on_paths(self, substep: int) -> None:
+        """Put the bodies of `set_paths` where they are after a substep.
 
-        People that are not watched cannot touch the robot: they move at the end of the tick.
+        People that are not candidates cannot touch the robot: they move at the end of the tick.
         """
         for kind, led in self._paths.items():
             for body, way in led:
-                if kind == "vehicle" or substep + 1 == len(way) or body in self.watched:
+                if kind == "vehicle" or substep + 1 == len(way) or body in self.contact_candidates:
                     p.resetBasePositionAndOrientation(body, *way[substep], self._client)
 
     def _park(self, body: int) -> None:
@@ -316,7 +325,7 @@ class Bodies(BulletClient):
         substep: index within the tick, from 0
         motors: values for the joints, in the order of the drive's joints
         """
-        self.place_led(substep)
+        self.place_on_paths(substep)
         if motors.limits_nm is None:  # PyBullet forgets torques after a substep
             p.setJointMotorControlArray(
                 self._robot,
@@ -354,13 +363,13 @@ class Bodies(BulletClient):
             self._speeds = tuple([state[1] for state in states])
         return x, y, math.atan2(m[3], m[0])
 
-    def body_now(self) -> BodyNow:
+    def measured_body(self) -> MeasuredBody:
         """Return the measured state of the base link and the joints."""
         linear, angular = self._velocity
-        return BodyNow(self.at_m, self._rotation, linear, angular, self._angles, self._speeds)
+        return MeasuredBody(self.at_m, self._rotation, linear, angular, self._angles, self._speeds)
 
-    def trunk_on_ground(self) -> bool:
-        """Return whether a link of the trunk touches anything that is not watched."""
+    def trunk_touches_ground(self) -> bool:
+        """Return whether a link of the trunk touches the ground, which alone has no identity."""
         return any(
             contact[8] <= 0.0 and contact[2] not in self._identities
             for link in self._trunk
@@ -391,8 +400,8 @@ class Bodies(BulletClient):
         roll, pitch = math.atan2(m[7], m[8]), math.asin(min(max(-m[6], -1.0), 1.0))
         return replace(state, legs=LegState(roll, pitch, self._angles))
 
-    def watch(self, reach_m: float, movers: Iterable[tuple[Moving, Mover]]) -> None:
-        """Select the bodies for contact checks.
+    def select_candidates(self, reach_m: float, movers: Iterable[tuple[MoverKind, Mover]]) -> None:
+        """Select the candidates for contacts with the robot.
 
         These are the given movers, and static bodies within reach of the robot.
         """
@@ -411,18 +420,18 @@ class Bodies(BulletClient):
                 body: p.getAABB(body, -1, self._client) for body in sorted(standing)
             }
             self._searched_at_m = self.at_m
-        self.watched = [
+        self.contact_candidates = [
             body
             for body, ((x0, y0, _), (x1, y1, _)) in self._static_near.items()
             if x0 - reach_m <= x <= x1 + reach_m and y0 - reach_m <= y <= y1 + reach_m
         ]
-        self.watched += [self._active[kind][mover.id][0] for kind, mover in movers]
+        self.contact_candidates += [self._active[kind][mover.id][0] for kind, mover in movers]
 
     def robot_contacts(self) -> list[tuple[BodyKind, str]]:
-        """Return kind and id of each watched body that the robot touches."""
+        """Return kind and id of each candidate that the robot touches."""
         return [
             self._identities[body]
-            for body in self.watched
+            for body in self.contact_candidates
             if any(
                 c[8] <= 0.0
                 for c in p.getContactPoints(self._robot, body, physicsClientId=self._client)

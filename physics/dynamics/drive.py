@@ -34,7 +34,7 @@ _INTEGRAL_MAX_RADPS: Final = 2.0
 """Limit of the integral term in rad/s."""
 
 
-class BodyNow(NamedTuple):
+class MeasuredBody(NamedTuple):
     """Measured state of a robot's base link and joints.
 
     at_m: position of the base frame in the world.
@@ -53,7 +53,7 @@ class BodyNow(NamedTuple):
 
 
 class Motors(NamedTuple):
-    """What the motors of all joints do in a substep.
+    """Values for the motors of all joints in a substep.
 
     values: target speeds in rad/s, or torques in Nm.
     limits_nm: limits of the torques that reach the target speeds; None if `values` are torques.
@@ -68,7 +68,7 @@ class Drive(Protocol):
 
     @property
     def reads_joints(self) -> bool:
-        """Whether `BodyNow` must have the joints."""
+        """Whether `MeasuredBody` must have the joints."""
 
     @property
     def cycle_s(self) -> float:
@@ -77,7 +77,7 @@ class Drive(Protocol):
     def reset(self) -> None:
         """Reset the controller to rest."""
 
-    def step(self, command: Command, body: BodyNow) -> Motors:
+    def step(self, command: Command, body: MeasuredBody) -> Motors:
         """Return the motors' values for the next substep. Call once per substep.
 
         command: within the robot's limits (see `cosim.episode.control`)
@@ -107,7 +107,7 @@ class SkidDrive:
         self._w_radps = 0.0
         self._integral_radps = 0.0
 
-    def step(self, command: Command, body: BodyNow) -> Motors:
+    def step(self, command: Command, body: MeasuredBody) -> Motors:
         """Return wheel speeds in rad/s, in the order of `Skid.joints`."""
         return Motors(self._joint_speeds(command, body.spin_radps[2]), self._limits_nm)
 

@@ -10,7 +10,10 @@ from physics.dynamics.legs.network_gait import NetworkSetup
 
 
 def drive_of(robot: Robot, dt_s: float) -> Drive:
-    """Return the drive of a robot. dt_s: duration of a substep."""
+    """Return the drive of a robot.
+
+    dt_s: duration of a substep.
+    """
     if isinstance(robot.drive, Legs):
         return LegDrive(robot, robot.drive, dt_s)
     return SkidDrive(robot, robot.drive, dt_s)

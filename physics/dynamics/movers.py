@@ -36,12 +36,12 @@ class Mover(NamedTuple):
     start: Pose
     change: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def passes(self, x_m: float, y_m: float, reach_m: float) -> bool:
+    def may_come_within(self, x_m: float, y_m: float, reach_m: float) -> bool:
         """Return whether any part may come within `reach_m` of a point during the tick."""
         way_m = math.hypot(*self.change[:2]) + 0.5 * math.hypot(*self.size_m)
         return math.hypot(self.start.x_m - x_m, self.start.y_m - y_m) <= way_m + reach_m
 
-    def way(self, substeps: int) -> TickPoses:
+    def poses(self, substeps: int) -> TickPoses:
         """Return the pose after each substep."""
         (x, y, heading) = self.start
         (dx, dy, turn) = self.change

@@ -1,7 +1,7 @@
 """Physics world of one episode: the robot among ground, buildings, props, barriers and traffic.
 
 Only nearby bodies are in the engine: the tiles around the robot, and people and vehicles within
-    reach. Images are rendered from the same values by `physics.cameras`.
+reach. Images are rendered from the same values by `physics.cameras`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from cosim.core.state import (
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, Legs, Robot
 from cosim.spec.scenario import Barrier
-from physics.dynamics.bodies import Bodies, Moving
+from physics.dynamics.bodies import Bodies, MoverKind
 from physics.dynamics.drive import SUBSTEP_S, Drive
 from physics.dynamics.drives import drive_of
-from physics.dynamics.legs.watch import LegWatch
+from physics.dynamics.legs.leg_monitor import LegMonitor
 from physics.dynamics.movers import Mover, TickPoses, movers_near
 from physics.ground.tiles import Key, tile_distance, tile_distances_within, tiles_within
 from physics.street.surface import Surface, grounded_obstacles
@@ -91,7 +91,7 @@ class BulletWorld:
         self.obstacles = tuple(obstacles)
         self._drive = drive
         self._grip = grip
-        self._watch: LegWatch | None = None
+        self._leg_monitor: LegMonitor | None = None
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
         self._loaded_at_m = (0.0, 0.0)
@@ -103,7 +103,7 @@ class BulletWorld:
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Return length and width of the robot in metres."""
+        """Length and width of the robot in metres."""
         return self.robot.footprint_m
 
     def __enter__(self) -> Self:
@@ -137,14 +137,14 @@ class BulletWorld:
         """Put the robot at rest at a pose, with its wheels or feet on the ground."""
         bodies = self._engine
         self._load_tiles(pose.x_m, pose.y_m)
-        self._own_drive().reset()
-        if self._watch is not None:
-            self._watch.reset()
+        self._ensured_drive().reset()
+        if self._leg_monitor is not None:
+            self._leg_monitor.reset()
         z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
         bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
         return bodies.robot_state()
 
-    def hidden(self, eye_m: Floats, points_m: Floats) -> NDArray[np.bool_]:
+    def occluded(self, eye_m: Floats, points_m: Floats) -> NDArray[np.bool_]:
         """Return which of (N, 3) points are occluded from the robot's eye (3,), both in metres.
 
         Bodies within _SIGHT_MARGIN_M of either end of a line of sight are ignored. Occluders
@@ -152,68 +152,70 @@ class BulletWorld:
         """
         rays = points_m - eye_m
         far_m = np.sqrt((rays**2).sum(axis=1))
-        hidden = np.zeros(len(points_m), dtype=bool)
+        occluded = np.zeros(len(points_m), dtype=bool)
         long = far_m > 2 * _SIGHT_MARGIN_M
         if long.any():
             inset = _SIGHT_MARGIN_M * rays[long] / far_m[long, None]
-            hidden[long] = self._engine.lines_blocked(eye_m + inset, points_m[long] - inset)
-        return hidden
+            occluded[long] = self._engine.lines_blocked(eye_m + inset, points_m[long] - inset)
+        return occluded
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
         """Run one tick of physics; people and vehicles move uniformly from `before` to `after`."""
-        bodies, drive = self._engine, self._own_drive()
+        bodies, drive = self._engine, self._ensured_drive()
         x, y, _ = pose = bodies.at_m
         self._load_tiles(x, y)
-        near: dict[Moving, list[Mover]] = {
+        near: dict[MoverKind, list[Mover]] = {
             "pedestrian": movers_near(before.people, after.people, x, y, PEOPLE_REACH_M),
             "vehicle": movers_near(before.vehicles, after.vehicles, x, y, _VEHICLE_REACH_M),
         }
         for kind, movers in near.items():
-            bodies.show(kind, movers)
+            bodies.activate(kind, movers)
             ways = {
-                mover: mover.way(substeps) for mover in movers if not bodies.stands(kind, mover)
+                mover: mover.poses(substeps)
+                for mover in movers
+                if not bodies.is_at_rest(kind, mover)
             }
-            bodies.lead(kind, ways, self._foot_heights(kind, ways) if ways else [])
-        close = self._watch_near(near, x, y)
+            bodies.set_paths(kind, ways, self._foot_heights(kind, ways) if ways else [])
+        close = self._select_candidates(near, x, y)
         trace: list[float] = []
         found: set[Contact] = set()
         for k in range(substeps):
             if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
                 x, y, _ = pose
-                close |= self._watch_near(near, x, y)
-            pose = bodies.step(k, drive.step(command, bodies.body_now()))
+                close |= self._select_candidates(near, x, y)
+            pose = bodies.step(k, drive.step(command, bodies.measured_body()))
             trace += pose
-            if self._watch is not None:
-                self._watch.add(bodies.speeds())
-            if bodies.watched:
+            if self._leg_monitor is not None:
+                self._leg_monitor.add(bodies.speeds())
+            if bodies.contact_candidates:
                 found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
         poses = write_protected_copy(trace, shape=(substeps, 3))
         for kind, mover in close:
             found.update(self._overlaps(kind, mover, poses))
         contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
-        if self._watch is None:
+        if self._leg_monitor is None:
             return Motion(bodies.robot_state(), poses, contacts)
         if not all(map(math.isfinite, pose)):
             raise EngineError(f"PyBullet: the robot with legs is at {pose} (m, m, rad)")
         ground_m = float(self.surface.heights(np.array([bodies.at_m[:2]]))[0])
-        touches = bodies.trunk_on_ground()
-        robot, down = self._watch.judged(bodies.robot_state(), ground_m, touches)
+        touches = bodies.trunk_touches_ground()
+        robot, down = self._leg_monitor.assess(bodies.robot_state(), ground_m, touches)
         return Motion(robot, poses, contacts, down)
 
-    def _watch_near(
-        self, near: Mapping[Moving, Sequence[Mover]], x_m: float, y_m: float
-    ) -> set[tuple[Moving, Mover]]:
+    def _select_candidates(
+        self, near: Mapping[MoverKind, Sequence[Mover]], x_m: float, y_m: float
+    ) -> set[tuple[MoverKind, Mover]]:
         """Select contact candidates for a robot near a point; return the movers among them."""
         close = {
             (kind, mover)
             for kind, movers in near.items()
             for mover in movers
-            if mover.passes(x_m, y_m, self._reach_m)
+            if mover.may_come_within(x_m, y_m, self._reach_m)
         }
-        self._engine.watch(self._reach_m, close)
+        self._engine.select_candidates(self._reach_m, close)
         return close
 
-    def _foot_heights(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
+    def _foot_heights(self, kind: MoverKind, ways: Mapping[Mover, TickPoses]) -> list[float]:
         """Return the ground height in metres under each mover at the end of the tick."""
         end = np.array([way[-1] for way in ways.values()])
         if kind == "pedestrian":
@@ -222,10 +224,10 @@ class BulletWorld:
             z_m = self.surface.road(end[:, :2], end[:, 2], [mover.size_m for mover in ways])[:, 0]
         return list(map(float, z_m))
 
-    def _overlaps(self, kind: Moving, mover: Mover, trace: Floats) -> list[Contact]:
+    def _overlaps(self, kind: MoverKind, mover: Mover, trace: Floats) -> list[Contact]:
         """Return overlaps of the robot's footprint with a mover, independent of the engine."""
         half = 0.5 * np.array(self.footprint_m)
-        way = np.array(mover.way(len(trace)))[:, None]
+        way = np.array(mover.poses(len(trace)))[:, None]
         if kind == "pedestrian":
             hit = box_disk_gap(trace, half[0], half[1], way[:, :, :2]) < PERSON_RADIUS_M
         else:
@@ -254,12 +256,12 @@ class BulletWorld:
         self._loaded_at_m = (x_m, y_m)
         self._reload_after_m = min(to_load_m + to_unload_m) - _ROUNDING_M
 
-    def _own_drive(self) -> Drive:
+    def _ensured_drive(self) -> Drive:
         """Return the drive; cameras of a world need none, nor the weights of its gait."""
         if self._drive is None:
             self._drive = drive_of(self.robot, SUBSTEP_S)
-        if self._watch is None and isinstance(self.robot.drive, Legs):
-            self._watch = LegWatch(self.robot.drive, self._drive.cycle_s, SUBSTEP_S)
+        if self._leg_monitor is None and isinstance(self.robot.drive, Legs):
+            self._leg_monitor = LegMonitor(self.robot.drive, self._drive.cycle_s, SUBSTEP_S)
         return self._drive
 
     @property

@@ -9,7 +9,7 @@ from dataclasses import replace
 from physics.people.companions import bar, elbow_of
 from physics.people.families import man_rest_m
 from physics.people.figure import LIMB, SMALL, Build, Sleeve
-from physics.people.lofted_mesh import Joints, Piece, Ring, ball
+from physics.people.lofted_mesh import Joints, Piece, Ring, ball, scaled_vector
 from physics.people.skeleton import INDEX, REACH_RAD
 
 Holds = Mapping[str, tuple[float, float, float] | None]
@@ -97,7 +97,11 @@ def _holding(
     skin = bar("skin", [at for at, _ in keys[1:]], 0.031 * f, chest)
     bent = bar("top", [at for at, _ in keys], 1.0, chest)
     rings = tuple(
-        replace(ring, ahead=_times(ring.ahead, r * f + more), side=_times(ring.side, r * f + more))
+        replace(
+            ring,
+            ahead=scaled_vector(ring.ahead, r * f + more),
+            side=scaled_vector(ring.side, r * f + more),
+        )
         for ring, (_, r) in zip(bent.rings, keys, strict=True)
     )
     shown = rings if sleeve == "long" else rings[:2]
@@ -108,10 +112,6 @@ def _holding(
     if sleeve == "short":
         pieces.append(replace(skin, sides=LIMB, rings_kept=(7, 4, 3, 3)))
     return pieces
-
-
-def _times(vector: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    return vector[0] * factor, vector[1] * factor, vector[2] * factor
 
 
 def _hand(side: str, left: float) -> list[Piece]:

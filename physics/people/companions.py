@@ -68,7 +68,10 @@ def bar(coat: str, points: Sequence[_Point], radius_m: float, joints: Joints = _
 
 
 def wheel(at: _Point, radius_m: float, wide_m: float = 0.012) -> list[Piece]:
-    """Return a wheel that rolls ahead: a tyre and spokes. wide_m: half its thickness."""
+    """Return a wheel that rolls ahead: a tyre and spokes.
+
+    wide_m: half its thickness.
+    """
     x, y, z = at
     turns = 2.0 * np.pi * np.arange(15) / 14
     rim = [
@@ -97,7 +100,10 @@ def wheel(at: _Point, radius_m: float, wide_m: float = 0.012) -> list[Piece]:
 def _box(
     coat: str, keys: Sequence[tuple[float, float, float, float]], joints: Joints = _ON_GROUND
 ) -> Piece:
-    """Return a boxy loft upwards. keys: z, x, half depth, half width."""
+    """Return a boxy loft upwards.
+
+    keys: z, x, half depth, half width.
+    """
     rings = [upright_loft((x, 0.0, z), deep, 1.0, wide, joints, 3.4) for z, x, deep, wide in keys]
     count = len(rings)
     return Piece(coat, tuple(rings), (16, 8, 6, 4), (count, count, count, count))

@@ -172,11 +172,11 @@ def _rim(hem: Ring, up_m: float, size: float) -> Ring:
     )
 
 
-def _tails(build: Build, loose: float, hem_m: float = 0.50) -> list[Ring]:
+def _tails(build: Build, loose: float) -> list[Ring]:
     """Return the part of a skirt or coat below the hips; it follows both thighs."""
     w, b = build.woman, build.belly_m
     rings = []
-    for z, share in ((hem_m, 0.72), (hem_m + 0.11, 0.66), (0.74, 0.52), (0.84, 0.30), (0.90, 0.10)):
+    for z, share in ((0.50, 0.72), (0.50 + 0.11, 0.66), (0.74, 0.52), (0.84, 0.30), (0.90, 0.10)):
         flare = max(0.90 - z, 0.0) / 0.4
         ahead = 0.112 + 0.052 * flare + loose + 0.6 * b
         wide = 0.166 + 0.014 * w + 0.062 * flare + loose + 0.4 * b
@@ -220,7 +220,10 @@ def _seat(build: Build) -> Piece:
 
 
 def legs(build: Build, kind: Legs, bare: bool, loose: float = 0.0) -> list[Piece]:
-    """Return both legs and shoes. bare: skin shows below the cloth of shorts or skirts."""
+    """Return both legs and shoes.
+
+    bare: skin shows below the cloth of shorts or skirts.
+    """
     pieces: list[Piece] = []
     for side, left in (("left", 1.0), ("right", -1.0)):
         hip, knee, ankle = f"{side}_hip", f"{side}_knee", f"{side}_ankle"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from physics.people.families import man_rest_m
 from physics.people.figure import SMALL, Build, upright_loft
-from physics.people.lofted_mesh import Piece, Ring, ball
+from physics.people.lofted_mesh import Piece, Ring, ball, scaled_vector
 from physics.people.skeleton import INDEX
 
 
@@ -96,8 +96,8 @@ def about_head(piece: Piece, factor: float) -> Piece:
         at = tuple(float(c + f * (v - c)) for c, v in zip(centre, ring.at, strict=True))
         return Ring(
             (at[0], at[1], at[2]),
-            _times(ring.ahead, f),
-            _times(ring.side, f),
+            scaled_vector(ring.ahead, f),
+            scaled_vector(ring.side, f),
             ring.joints,
             ring.back,
             ring.square,
@@ -106,7 +106,3 @@ def about_head(piece: Piece, factor: float) -> Piece:
     return Piece(
         piece.coat, tuple(scaled(ring) for ring in piece.rings), piece.sides, piece.rings_kept
     )
-
-
-def _times(vector: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    return vector[0] * factor, vector[1] * factor, vector[2] * factor

@@ -126,7 +126,7 @@ class Tube:
 
     @property
     def corners(self) -> Floats:
-        """Return (V, 3) approximate positions of the corners without turning."""
+        """Approximate positions of the corners without turning, (V, 3)."""
         return np.asarray(
             self.middle + self.ring[:, 2:3] * self.ahead + self.ring[:, 3:4] * self.side
         )
@@ -212,6 +212,11 @@ def _sheet(rings: int, sides: int, open_: bool = False, capped: bool = True) -> 
 def _shares(rows: Floats) -> Floats:
     weights = np.maximum(rows[:, :_JOINTS], 0.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def scaled_vector(vector: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+    """Return a vector times a factor."""
+    return vector[0] * factor, vector[1] * factor, vector[2] * factor
 
 
 def ball(

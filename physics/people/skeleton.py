@@ -84,14 +84,18 @@ REACH_RAD: Final = np.deg2rad(74.0)
 
 @dataclass(frozen=True, slots=True)
 class Skeleton:
-    """Joint positions of a body at rest. rest_m: (24, 3); height_m: from sole to crown."""
+    """Joint positions of a body at rest.
+
+    rest_m: (24, 3)
+    height_m: from sole to crown.
+    """
 
     rest_m: Floats
     height_m: float
 
     @property
     def offsets_m(self) -> Floats:
-        """Return (24, 3) offsets of joints from their parents, and of the pelvis from the
+        """Offsets (24, 3) of joints from their parents, and of the pelvis from the
         ground.
         """
         rest = self.rest_m

@@ -37,7 +37,10 @@ _ACROSS = (1.5707963, 0.0, 0.0)
 
 
 def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]:
-    """Return one leg. ahead, left: 1 or -1."""
+    """Return one leg.
+
+    ahead, left: 1 or -1.
+    """
     aside_m = left * THIGH_ASIDE_M
     half_m = 0.5 * SEGMENT_M
     links = [

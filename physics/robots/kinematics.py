@@ -29,7 +29,10 @@ _ZERO: Final[Triple] = (0.0, 0.0, 0.0)
 
 
 class TreeJoint(NamedTuple):
-    """Joint between two links. axis: unit vector in the child's frame."""
+    """Joint between two links.
+
+    axis: unit vector in the child's frame.
+    """
 
     name: str
     parent: str
@@ -39,7 +42,10 @@ class TreeJoint(NamedTuple):
 
 
 class LinkTree(NamedTuple):
-    """Links of a robot, each joint after those of its parents. base: name of the base link."""
+    """Links of a robot, each joint after those of its parents.
+
+    base: name of the base link.
+    """
 
     base: str
     joints: tuple[TreeJoint, ...]

@@ -83,7 +83,7 @@ class Model(NamedTuple):
 
     @property
     def mass_kg(self) -> float:
-        """Return the mass of all links."""
+        """Mass of all links."""
         return sum(link.mass_kg for link in self.links)
 
     def inertia_kgm2(self, link: Link) -> Triple:

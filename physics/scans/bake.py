@@ -13,7 +13,7 @@ from physics.textures.layers import LINEAR_OF_SRGB_BYTE, linear_to_srgb
 
 EDGE_M: Final = 0.1
 """Length in metres above which edges are split, unless there would be too many triangles."""
-MOST_TRIANGLES: Final = 1_000_000
+MAX_TRIANGLES: Final = 1_000_000
 """Number of triangles of a mesh above which edges are left longer."""
 _PLACES: Final = (
     *((0.94, 0.03, 0.03), (0.7, 0.25, 0.05), (0.7, 0.05, 0.25)),
@@ -27,7 +27,10 @@ _ROUNDS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Baked:
-    """A mesh with colours of vertices. edge_m: longest edge that was left, metres."""
+    """A mesh with colours of vertices.
+
+    edge_m: longest edge that was left, metres.
+    """
 
     vertices: Floats
     triangles: NDArray[np.int64]
@@ -41,18 +44,20 @@ def bake_texture(
     uv: Floats,
     pixels: NDArray[np.uint8],
     unit_m: float,
-    most: int = MOST_TRIANGLES,
 ) -> Baked:
     """Return a mesh whose vertices have the mean colour of the texture around them.
+
+    Edges are left longer where the mesh would have more than MAX_TRIANGLES triangles.
 
     uv: (V, 2) texture coordinates, v up; they repeat outside of 0 to 1.
     pixels: (H, W, 3) uint8 sRGB.
     unit_m: metres per unit of the vertices.
-    most: number of triangles above which edges are left longer.
     """
     edge_m = EDGE_M
     areas = _areas(vertices, triangles) * unit_m * unit_m
-    while (areas / (0.25 * edge_m * edge_m)).sum() + len(triangles) > max(most, len(triangles) + 1):
+    while (areas / (0.25 * edge_m * edge_m)).sum() + len(triangles) > max(
+        MAX_TRIANGLES, len(triangles) + 1
+    ):
         edge_m *= 1.25
     joined = np.column_stack([vertices, uv])
     joined, triangles = split_edges(joined, triangles, edge_m / unit_m)

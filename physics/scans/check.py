@@ -20,21 +20,21 @@ from physics.scans.mesh_distance import MeshDistance, areas_of, unit_normals
 from physics.scans.ordering import take_splats
 from physics.scans.read_splats import QuaternionOrder, RawSplats
 
-MOST_TILT_DEG: Final = 5.0
+MAX_TILT_DEG: Final = 5.0
 """Largest angle between the ground's normal and the stated up axis, in degrees."""
 SIZES_M: Final = (5.0, 3000.0)
 """Plausible lengths of a scan in metres."""
-MOST_HEIGHT_M: Final = 250.0
+MAX_HEIGHT_M: Final = 250.0
 """Largest plausible height of a scan in metres."""
 WAY_HEIGHTS_M: Final = (-0.3, 3.0)
 """Plausible heights of a walked way, or of its cameras, over the ground in metres."""
-LEAST_COVERED: Final = 0.98
+MIN_COVERED: Final = 0.98
 """Share of the walkable area with measured ground below which a warning is given."""
 REFUSED_COVERED: Final = 0.5
 """Share of an area with measured ground below which the scan is refused."""
 MEDIAN_GAP_M: Final = 0.05
 """Largest median distance of opaque splats to the mesh without a warning, in metres."""
-MOST_GAP_M: Final = 0.25
+MAX_GAP_M: Final = 0.25
 """Largest distance of 95 % of the opaque splats to the mesh without a warning, in metres."""
 GROUND_BIAS_M: Final = 0.03
 """Largest median height of ground splats over the mesh without a warning, in metres."""
@@ -145,7 +145,7 @@ def check_up(
     if ground.support < 0.4 * overall.support:
         ground = overall
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, float(ground.normal[2])))))
-    if tilt <= MOST_TILT_DEG:
+    if tilt <= MAX_TILT_DEG:
         words = f"the ground's normal is {tilt:.1f} degrees off the up axis"
         return [note(words), *_winding(ground)]
     said = f"the stated up axis {up}" if up else "the z axis after the transform"
@@ -185,7 +185,7 @@ def check_scale(mesh: ScanMesh) -> list[Finding]:
     low, high = np.percentile(mesh.vertices.astype(np.float64), [0.5, 99.5], axis=0)
     length_m, height_m = float((high - low)[:2].max()), float((high - low)[2])
     words = f"scale: the scan is {length_m:.4g} m long and {height_m:.4g} m high"
-    if SIZES_M[0] <= length_m <= SIZES_M[1] and height_m <= MOST_HEIGHT_M:
+    if SIZES_M[0] <= length_m <= SIZES_M[1] and height_m <= MAX_HEIGHT_M:
         return [note(words)]
     small = length_m < SIZES_M[0]
     fits = [
@@ -197,7 +197,7 @@ def check_scale(mesh: ScanMesh) -> list[Finding]:
     return [
         refusal(
             f"{words}; plausible are {SIZES_M[0]:g} to {SIZES_M[1]:g} m and at most "
-            f"{MOST_HEIGHT_M:g} m: give the metres per unit with --scale{advice}"
+            f"{MAX_HEIGHT_M:g} m: give the metres per unit with --scale{advice}"
         )
     ]
 
@@ -246,10 +246,10 @@ def check_areas(areas: Sequence[ScanArea], heights: HeightGrid) -> list[Finding]
                 )
     share = ground_share(walkable, heights)
     words = f"holes: {share:.1%} of the walkable area has measured ground"
-    if share < LEAST_COVERED:
+    if share < MIN_COVERED:
         findings.append(
             warning(
-                f"{words}, and {LEAST_COVERED:.0%} should: heights are interpolated in holes; scan "
+                f"{words}, and {MIN_COVERED:.0%} should: heights are interpolated in holes; scan "
                 "the ground again, or draw areas around them"
             )
         )
@@ -281,10 +281,10 @@ def lattice_points(area: BaseGeometry, step_m: float) -> Floats:
     return np.column_stack([grid_x[inside], grid_y[inside]])
 
 
-def opaque_sample(splats: Splats, most: int = _MEASURED) -> Splats:
-    """Return opaque splats, evenly over their order."""
+def opaque_sample(splats: Splats) -> Splats:
+    """Return about _MEASURED opaque splats, evenly over their order."""
     opaque = np.flatnonzero(splats.rgba[:, 3] >= _OPAQUE)
-    return take_splats(splats, opaque[:: max(1, math.ceil(len(opaque) / most))])
+    return take_splats(splats, opaque[:: max(1, math.ceil(len(opaque) / _MEASURED))])
 
 
 def check_alignment(
@@ -307,7 +307,7 @@ def check_alignment(
     median, most = (float(one) for one in np.percentile(gaps, [50, 95]))
     words = (
         f"splats to mesh: {median:.3f} m (median), 95 % within {most:.2f} m; should be "
-        f"{MEDIAN_GAP_M:g} and {MOST_GAP_M:g} m"
+        f"{MEDIAN_GAP_M:g} and {MAX_GAP_M:g} m"
     )
     if median > REFUSED_GAP_M:
         return [
@@ -319,7 +319,7 @@ def check_alignment(
     shift = best_shift(_balanced(sample, heights), distance)
     if shift is not None:
         return [shift]
-    fine = median <= MEDIAN_GAP_M and most <= MOST_GAP_M
+    fine = median <= MEDIAN_GAP_M and most <= MAX_GAP_M
     advice = ": people may be hidden wrongly by what the mesh lacks"
     return [
         note(words) if fine else warning(words + advice),

@@ -16,7 +16,7 @@ from cosim.place import overlay
 from cosim.place.scan import HeightGrid, ScanArea, ScanMesh, Splats
 from physics.scans.ordering import take_splats
 
-LEAST_OPACITY: Final = 0.02
+MIN_OPACITY: Final = 0.02
 """Opacity below which a splat is removed."""
 LARGEST_M: Final = 2.0
 """Standard deviation in metres above which a splat near the walkable ground is removed."""
@@ -36,7 +36,7 @@ GROUND_M: Final = 0.12
 
 RULES: Final = {
     "sky": f"over {SKY_M:g} m from the mesh: sky, which is drawn otherwise",
-    "faint": f"opacity under {LEAST_OPACITY:g}",
+    "faint": f"opacity under {MIN_OPACITY:g}",
     "large": f"over {LARGEST_M:g} m in size within {NEAR_M:g} m of walkable ground",
     "alone": f"fewer than {NEIGHBOURS} neighbours within {NEIGHBOUR_M:g} m",
     "below": f"over {BELOW_M:g} m below the ground",
@@ -131,7 +131,7 @@ def _removed(
         far = (splats.centres < low - SKY_M) | (splats.centres > high + SKY_M)
         return np.asarray(far.any(axis=1))
     if rule == "faint":
-        return np.asarray(splats.rgba[:, 3] < LEAST_OPACITY * 255.0)
+        return np.asarray(splats.rgba[:, 3] < MIN_OPACITY * 255.0)
     if rule == "large":
         large = largest_m(splats) > LARGEST_M
         large[large] = _within(walkable, splats.centres[large], NEAR_M)

@@ -10,7 +10,7 @@ from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats
 from cosim.place.scan import HeightGrid, Splats
-from physics.scans.check import LEAST_COVERED, lattice_points
+from physics.scans.check import MIN_COVERED, lattice_points
 from physics.scans.clean import above_ground
 from physics.scans.findings import Finding, note, warning
 
@@ -61,11 +61,11 @@ def check_coverage(splats: Splats, eyes: Floats) -> list[Finding]:
         f"coverage: {mean:.0%} of the view below the horizon is opaque, {shares[worst]:.0%} at "
         f"({eyes[worst, 0]:.0f}, {eyes[worst, 1]:.0f})"
     )
-    if mean >= LEAST_COVERED:
+    if mean >= MIN_COVERED:
         return [note(words)]
     return [
         warning(
-            f"{words}; {LEAST_COVERED:.0%} should be: pictures show holes; run with --appearance "
+            f"{words}; {MIN_COVERED:.0%} should be: pictures show holes; run with --appearance "
             "mesh, or train with closed ground"
         )
     ]

@@ -78,7 +78,10 @@ class SurfaceSplats(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Triangles of one look. layer: texture layer of the ground, -1 without."""
+    """Triangles of one look.
+
+    layer: texture layer of the ground, -1 without.
+    """
 
     mesh: Mesh
     colour: Floats

@@ -21,7 +21,7 @@ STEPS_M: Final = (0.1, 0.25)
 """Smallest and largest distance of lattice points, in metres."""
 STANDING_M: Final = (0.2, 1.8)
 """Heights above the ground between which an obstacle blocks a lattice point, in metres."""
-_MOST_POINTS: Final = 40_000_000
+_MAX_POINTS: Final = 40_000_000
 """Largest number of lattice points: 600 x 600 m at 0.1 m."""
 _FACING_UP: Final = 0.5
 """Least vertical component of a unit normal of ground, 60 degrees from vertical."""
@@ -37,7 +37,7 @@ _RISE_M: Final = 0.2
 """Rise in metres that belongs to the ground at any window: curbs, noise."""
 _HILL: Final = 0.12
 """Grade of hills, which stay ground under large windows."""
-_MOST_RISE_M: Final = 1.2
+_MAX_RISE_M: Final = 1.2
 _OPAQUE: Final = 128
 """Least opacity of splats that count as a surface, of 255."""
 _SPLATS: Final = 3
@@ -51,7 +51,10 @@ _BASE_M: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Holes:
-    """Closed holes of the measured ground. area_m2: of all of them together."""
+    """Closed holes of the measured ground.
+
+    area_m2: of all of them together.
+    """
 
     count: int
     area_m2: float
@@ -59,7 +62,10 @@ class Holes:
 
 @dataclass(frozen=True, slots=True)
 class _Lattice:
-    """Lattice over a mesh. shape: rows and columns."""
+    """Lattice over a mesh.
+
+    shape: rows and columns.
+    """
 
     origin: Floats
     step_m: float
@@ -145,7 +151,7 @@ def _lattice(corners: Floats, step_m: float) -> _Lattice:
     low, high = corners[..., :2].min(axis=(0, 1)), corners[..., :2].max(axis=(0, 1))
     origin = np.floor(low / step_m) * step_m
     columns, rows = (np.ceil((high - origin) / step_m).astype(int) + 1).tolist()
-    if rows * columns > _MOST_POINTS:
+    if rows * columns > _MAX_POINTS:
         raise MapError(
             f"the scan is {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, too large for a step "
             f"of {step_m:g} m: cut it, or use a larger step"
@@ -279,7 +285,7 @@ def _ground_of(low: Floats, step_m: float) -> Floats:
             np.where(np.isinf(eroded), -np.inf, eroded), window, mode="nearest"
         )
         opened = np.where(np.isinf(opened), surface, opened)
-        rise_m = min(_RISE_M + _HILL * (window_m - before_m), _MOST_RISE_M)
+        rise_m = min(_RISE_M + _HILL * (window_m - before_m), _MAX_RISE_M)
         with np.errstate(invalid="ignore"):
             above = surface - opened > rise_m
         ground[above] = np.nan

@@ -12,7 +12,7 @@ from cosim.place.scan import ScanMesh
 
 _SPACING_M: Final = 0.25
 """Distance in metres of the samples of large triangles, unless there would be too many."""
-_MOST_SAMPLES: Final = 2_000_000
+_MAX_SAMPLES: Final = 2_000_000
 _NEAREST: Final = 6
 """Number of samples whose triangles are measured exactly."""
 
@@ -79,7 +79,7 @@ def _samples(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
     longest = np.sqrt((edges * edges).sum(axis=2).max(axis=1))
     spacing_m = _SPACING_M
     while (np.maximum(np.ceil(longest / spacing_m), 1.0) ** 2).sum() > max(
-        _MOST_SAMPLES, 1.2 * len(corners)
+        _MAX_SAMPLES, 1.2 * len(corners)
     ):
         spacing_m *= 1.4
     parts = np.maximum(np.ceil(longest / spacing_m), 1.0).astype(np.int64)

@@ -21,9 +21,9 @@ from physics.scans.frame import move
 from physics.scans.sources import read_ply_header, stem_and_ending
 from physics.textures.layers import as_uint8, linear_to_srgb
 
-MOST_TRIANGLES: Final = 6_000_000
+MAX_TRIANGLES: Final = 6_000_000
 """Maximum number of triangles of a scan."""
-MOST_DROPPED_SHARE: Final = 0.01
+MAX_DROPPED_SHARE: Final = 0.01
 """Share of triangles with invalid numbers above which a file is refused."""
 GREY: Final = (128, 128, 128)
 """sRGB colour of meshes without colours."""
@@ -230,10 +230,10 @@ def _whole(
     finite = np.asarray(np.isfinite(vertices).all(axis=1))
     valid = np.asarray(finite[triangles].all(axis=1))
     if dropped := int(len(valid) - np.count_nonzero(valid)):
-        if dropped > MOST_DROPPED_SHARE * len(valid):
+        if dropped > MAX_DROPPED_SHARE * len(valid):
             raise MapError(
                 f"{path}: {dropped} of {len(valid)} triangles ({dropped / len(valid):.1%}) have "
-                f"NaN or infinite corners; at most {MOST_DROPPED_SHARE:.0%} are dropped: export "
+                f"NaN or infinite corners; at most {MAX_DROPPED_SHARE:.0%} are dropped: export "
                 "the scan again"
             )
         words = f"{path.name}: {dropped} of {len(valid)} triangles with NaN or infinite corners"

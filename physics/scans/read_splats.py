@@ -25,9 +25,9 @@ from physics.scans.sources import read_ply_header, stem_and_ending
 
 SH_C0: Final = 0.28209479177387814
 """Value of the spherical harmonic of degree 0."""
-MOST_SPLATS: Final = 20_000_000
+MAX_SPLATS: Final = 20_000_000
 """Maximum number of splats in a file."""
-MOST_DROPPED_SHARE: Final = 0.01
+MAX_DROPPED_SHARE: Final = 0.01
 """Share of splats with invalid numbers above which a file is refused."""
 _SPLAT_ROW: Final = np.dtype(
     [("centre", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
@@ -232,9 +232,9 @@ def _check_length(path: Path, size: int, count: int, row: int, *, exact: bool = 
     """Check the number of splats and the size of their rows in bytes. Raises MapError."""
     if count == 0:
         raise MapError(f"{path}: holds 0 splats: export the scan again")
-    if count > MOST_SPLATS:
+    if count > MAX_SPLATS:
         raise MapError(
-            f"{path}: holds {count} splats; at most {MOST_SPLATS} are read: reduce it, for "
+            f"{path}: holds {count} splats; at most {MAX_SPLATS} are read: reduce it, for "
             "example in SuperSplat"
         )
     if size < count * row or (exact and size != count * row):
@@ -264,10 +264,10 @@ def _whole(
     valid &= (scales >= 0.0).all(axis=1)
     if dropped := int(len(valid) - np.count_nonzero(valid)):
         words = f"{path.name}: {dropped} of {len(valid)} splats with NaN, infinite or zero numbers"
-        if dropped > MOST_DROPPED_SHARE * len(valid):
+        if dropped > MAX_DROPPED_SHARE * len(valid):
             raise MapError(
                 f"{path}: {dropped} of {len(valid)} splats ({dropped / len(valid):.1%}) have NaN, "
-                f"infinite or zero numbers; at most {MOST_DROPPED_SHARE:.0%} are dropped: the "
+                f"infinite or zero numbers; at most {MAX_DROPPED_SHARE:.0%} are dropped: the "
                 "training has failed, train or export again"
             )
         findings.append(warning(f"{words} dropped: export the scan again if they matter"))

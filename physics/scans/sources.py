@@ -11,7 +11,7 @@ from typing import Final, Literal
 from cosim.core.errors import MapError
 from cosim.core.files import read_limited
 
-MOST_BYTES: Final = 4 << 30
+MAX_BYTES: Final = 4 << 30
 """Maximum size of a file in bytes."""
 _HEAD_BYTES: Final = 64 << 10
 """Number of bytes at the start of a .ply file in which its header must end."""
@@ -77,7 +77,7 @@ def read_source(path: Path) -> bytes:
     Raises MapError if it cannot be read or unpacked, or is a Git LFS pointer or a web page.
     """
     try:
-        data = read_limited(path, MOST_BYTES)
+        data = read_limited(path, MAX_BYTES)
     except OSError as error:
         raise MapError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:

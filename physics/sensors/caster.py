@@ -301,7 +301,10 @@ def _rows_within(people: People, robot: RobotState, range_m: float) -> NDArray[n
 
 
 def _cylinders(people: People, rows: NDArray[np.intp], feet: Floats) -> Floats:
-    """Return the bodies of people. feet: (N,) heights of the ground under them."""
+    """Return the bodies of people.
+
+    feet: (N,) heights of the ground under them.
+    """
     xy = people.xy[rows]
     radius = np.full(len(rows), PERSON_RADIUS_M)
     return np.stack([xy[:, 0], xy[:, 1], radius, feet, feet + PERSON_HEIGHT_M])

@@ -20,11 +20,11 @@ from physics.dynamics.bullet import p
 from physics.dynamics.client import UPRIGHT
 from physics.ground.mesh import Mesh
 
-_MOST_VERTICES: Final = 131_072
+_MAX_VERTICES: Final = 131_072
 """Largest number of vertices of a body; Bullet leaves out further ones without an error."""
-_MOST_CORNERS: Final = 524_288
+_MAX_CORNERS: Final = 524_288
 """Largest number of corners of triangles of a body, likewise."""
-_MOST_RAYS: Final = 8_192
+_MAX_RAYS: Final = 8_192
 """Number of rays of a call; Bullet fails above twice of it."""
 
 _API_VERSION: Final = 202010061
@@ -71,10 +71,10 @@ class TriangleRays:
 
     def add(self, mesh: Mesh) -> int:
         """Add a body of triangles; return its id. Raises EngineError for too large a mesh."""
-        if len(mesh.vertices) > _MOST_VERTICES or 3 * len(mesh) > _MOST_CORNERS:
+        if len(mesh.vertices) > _MAX_VERTICES or 3 * len(mesh) > _MAX_CORNERS:
             raise EngineError(
                 f"Bullet: a body has {len(mesh.vertices)} vertices and {len(mesh)} triangles, "
-                f"but it may have {_MOST_VERTICES} and {_MOST_CORNERS // 3}"
+                f"but it may have {_MAX_VERTICES} and {_MAX_CORNERS // 3}"
             )
         call, client = self._call, self._client
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
@@ -114,8 +114,8 @@ class TriangleRays:
         begin_m, end_m: (N, 3) contiguous ends of the lines.
         """
         parts = [
-            self._hit_shares(begin_m[i : i + _MOST_RAYS], end_m[i : i + _MOST_RAYS])
-            for i in range(0, len(begin_m), _MOST_RAYS)
+            self._hit_shares(begin_m[i : i + _MAX_RAYS], end_m[i : i + _MAX_RAYS])
+            for i in range(0, len(begin_m), _MAX_RAYS)
         ]
         return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0), *parts])
 

@@ -85,7 +85,7 @@ class Building:
 
     @property
     def polygon(self) -> shapely.Polygon:
-        """Return the outline on the ground."""
+        """Outline on the ground."""
         if self.outline is not None:
             return self.outline
         along = (

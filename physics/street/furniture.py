@@ -301,17 +301,17 @@ class Prop:
 
     @property
     def size_m(self) -> Size:
-        """Return length, depth and height."""
+        """Length, depth and height."""
         return KINDS[self.kind].size_m(self.variant)
 
     @property
     def form(self) -> tuple[str, int, int]:
-        """Return the arguments of `parts_of`; props with equal forms share meshes."""
+        """Arguments of `parts_of`; props with equal forms share meshes."""
         return self.kind, self.variant, self.paint if KINDS[self.kind].grown else 0
 
     @property
     def drawn_heading_rad(self) -> float:
-        """Return the heading of the drawn parts."""
+        """Heading of the drawn parts."""
         return self.heading_rad + self.turned_rad
 
 
@@ -323,11 +323,11 @@ def obstacle_prop(obstacle: Obstacle, number: int) -> Prop:
     return Prop(f"obstacle:{number}:{obstacle.kind}", kind.name, obstacle.variant, *at, paint)
 
 
-def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.object_]:
-    """Return the (N,) ground rectangles of props, enlarged by a margin."""
+def footprints(props: Sequence[Prop]) -> NDArray[np.object_]:
+    """Return the (N,) ground rectangles of props."""
     if not props:
         return np.zeros(0, dtype=object)
-    half = 0.5 * np.array([prop.size_m[:2] for prop in props]) + margin_m
+    half = 0.5 * np.array([prop.size_m[:2] for prop in props])
     heading = np.array([prop.heading_rad for prop in props])
     along = half[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
     aside = half[:, 1:] * np.column_stack([-np.sin(heading), np.cos(heading)])

@@ -61,7 +61,7 @@ class MappedObjects:
 
     @property
     def all_props(self) -> tuple[Prop, ...]:
-        """Return the props of all tiles."""
+        """Props of all tiles."""
         return tuple(prop for props in self._props.values() for prop in props)
 
     def props(self, key: Key) -> Sequence[Prop]:

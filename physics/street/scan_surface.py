@@ -50,7 +50,10 @@ _SURFACE_LABELS: Final = {kind: surface_look(kind)[0] for kind in (*_KINDS, _GRO
 
 
 class ScanSurface(PlaceSurface):
-    """Surface of a scanned place. scan: with or without its splats."""
+    """Surface of a scanned place.
+
+    scan: with or without its splats.
+    """
 
     scan: Scan
 

@@ -61,9 +61,9 @@ class _TileFields(msgspec.Struct, array_like=True):
 
 def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache:
     """Return the cache of a map's tiles."""
-    key_text = f"{street_map.made_of} {seed} {roughness!r} {SOURCES_KEY}"
+    key_text = f"{street_map.input_hash} {seed} {roughness!r} {SOURCES_KEY}"
     return ArrayCache(
-        "tiles", hashlib.sha256(key_text.encode()).hexdigest()[:32] if street_map.made_of else ""
+        "tiles", hashlib.sha256(key_text.encode()).hexdigest()[:32] if street_map.input_hash else ""
     )
 
 

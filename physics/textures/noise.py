@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.state import write_protect
+
 Field = NDArray[np.floating[Any]]
 """(S, S) values."""
 
@@ -190,7 +192,5 @@ def _resized(grid: Field, size: int) -> Field:
 
 
 def _read_only(field: NDArray[np.floating]) -> Field:
-    """Return a read-only float32 copy."""
-    whole = np.ascontiguousarray(field, dtype=np.float32)
-    whole.flags.writeable = False
-    return whole
+    """Return an array as write-protected contiguous float32."""
+    return write_protect(np.ascontiguousarray(field, dtype=np.float32))

@@ -73,7 +73,7 @@ def remote_director(
     with _connected(outside, waiting) as session:
         key = keys.director(outside.run, keys.chunk(episode))
         yield RemoteDirector(
-            session, key, by=behaviour_version(), wait_s=outside.wait_s, waiting=waiting
+            session, key, version=behaviour_version(), wait_s=outside.wait_s, waiting=waiting
         )
 
 

@@ -102,7 +102,7 @@ class Episode:
         renderer: RendererAddress | None = None,
         commands: CommandLog | None = None,
     ) -> None:
-        self.scenario = scenario = options.scenario(scenario)
+        self.scenario = scenario = options.apply_to(scenario)
         manifest = with_goal(manifest, options.goal)
         self.manifest = manifest
         self.options = options
@@ -221,7 +221,7 @@ class Episode:
     @property
     def footprint_m(self) -> tuple[float, float]:
         """Return length and width of the robot."""
-        return self._open.parts.world.footprint_m
+        return self._open.engines.world.footprint_m
 
     @property
     def entrances(self) -> Entrances:
@@ -246,7 +246,7 @@ class Episode:
                 "this Episode has begun: an episode cannot be begun again, make another "
                 "Episode for that"
             )
-        self._now = begin(self.scenario, stage.parts)
+        self._now = begin(self.scenario, stage.engines)
         return self._observe(stage, self._now, True)
 
     def advance(
@@ -277,22 +277,22 @@ class Episode:
         self._took_ms.append(took_ms)
         if delay is None:
             delay = whole_ticks(latency_ms, self.clock.tick_ms)
-        self._commands.answered(now.tick, delay, command)
+        self._commands.add(now.tick, delay, command)
         if self._command_log is not None:
             self._command_log.commanded(TimedCommand(now.tick, delay, command))
         free_again = self._commands.last_arrival_tick if setup.real_time else 0
         while True:
             step = tick(
-                self.scenario, self.clock, stage.parts, now, self._commands.at(now.tick), frame
+                self.scenario, self.clock, stage.engines, now, self._commands.at(now.tick), frame
             )
             self._verdict = verdict = stage.scorer.score(step)
             for watch in self._watches:
                 watch(step, verdict)
-            self._now = now = after(step, verdict.reset, stage.parts)
+            self._now = now = after(step, verdict.reset, stage.engines)
             self._was_reset |= verdict.reset is not None
             stage.observer.moved(step, verdict.reset is not None)
             if verdict.reset is not None:
-                self._commands.put_back()
+                self._commands.on_reset()
             asks = self.clock.acts(now.tick) and now.tick >= free_again
             if self.over or asks or now.tick == until_tick:
                 return self._observe(stage, now, asks)
@@ -327,7 +327,7 @@ class Episode:
         was_reset = self._was_reset
         self._was_reset = was_reset and not asks
         time_s = self.clock.time_s(now.tick)
-        camera = stage.parts.camera
+        camera = stage.engines.camera
         seen, self._frame = stage.observer.observed(now, time_s, camera, was_reset)
         self._asked_s = time.perf_counter()
         return seen

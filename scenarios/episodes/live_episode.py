@@ -68,7 +68,7 @@ class LiveEpisode:
         if news := self._news(step, verdict):
             topics["events"] = news
         for topic, content in topics.items():
-            self._session.tell(f"{self._prefix}/{topic}", msgspec.json.encode(content))
+            self._session.publish_lossy(f"{self._prefix}/{topic}", msgspec.json.encode(content))
 
     def _news(self, step: Step, verdict: Verdict) -> list[str]:
         """Return the failures, begun events and the end of a tick in words, and log them."""

@@ -28,7 +28,7 @@ class Scorer:
 
     kinds: table of event kinds.
     area: where the robot may drive.
-    hidden: see `EventMonitor`.
+    occluded: see `EventMonitor`.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Scorer:
         street_map: StreetMap,
         area: WalkableArea,
         robot: Robot,
-        hidden: OcclusionTest,
+        occluded: OcclusionTest,
         clock: Clock,
     ) -> None:
         self._scenario = scenario
@@ -47,7 +47,7 @@ class Scorer:
         self._referee = Referee(scenario, area, footprint_m, clock)
         self._cycle_s = robot.drive.cycle_s
         self._recorder = Recorder(clock.tick_s, footprint_m, cycle_s=self._cycle_s)
-        self._monitor = EventMonitor(scenario, kinds, robot, hidden, clock.tick_ms)
+        self._monitor = EventMonitor(scenario, kinds, robot, occluded, clock.tick_ms)
         self._traffic = TrafficMonitor(street_map, clock.tick_s)
         self._failures: list[Failure] = []
         self._walked_into: list[Failure] = []
@@ -89,8 +89,8 @@ class Scorer:
             if self._hashes:
                 self._recorder.add(step, verdict)
             return verdict
-        self._recorder.add(step, verdict, self._traffic.see(step))
-        self._monitor.see(step)
+        self._recorder.add(step, verdict, self._traffic.update(step))
+        self._monitor.update(step)
         self._failures += verdict.failures
         self._walked_into += verdict.walked_into
         if verdict.red_light_entry is not None:

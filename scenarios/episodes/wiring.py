@@ -79,7 +79,7 @@ class StagedScenario:
     entrances: arrivals and departures of the crowd.
     """
 
-    parts: EpisodeEngines
+    engines: EpisodeEngines
     robot: Robot
     renderer: str
     gait_hash: str
@@ -165,13 +165,13 @@ def staged(
             return waits_before(street_map, scenario.route_line, scenario.crossings, robot)
 
         yield StagedScenario(
-            parts=EpisodeEngines(world, crowd, directed, camera),
+            engines=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
             renderer=renderer,
             gait_hash="" if gait is None else gait.digest,
             scan=_look_of(street, renderer, options) if camera is not None or cameras else None,
             scorer=Scorer(
-                scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock
+                scenario, kinds, street_map, WalkableArea(walkable), robot, world.occluded, clock
             ),
             observer=Observer(
                 scenario,
@@ -275,15 +275,15 @@ def _look_of(surface: Surface, renderer: str, options: EpisodeOptions) -> ScanLo
     )
 
 
-def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd | EmptyStreet:
+def crowd_of(scenario: Scenario, recorded: Entrances | None = None) -> SumoCrowd | EmptyStreet:
     """Create the crowd and traffic of a scenario, not started.
 
-    before: recorded arrivals and departures, used in place of random ones.
+    recorded: recorded arrivals and departures, used in place of random ones.
     """
     net_path, street_map = place(scenario.place)
     robot = robot_called(scenario.robot)
     start_xy = scenario.start[:2]
-    if needs_no_sumo(street_map, scenario.crowd, before):
+    if needs_no_sumo(street_map, scenario.crowd, recorded):
         return EmptyStreet(street_map, scenario.seed, start_xy)
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
     return sumo_crowd(
@@ -294,7 +294,7 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd |
         closed,
         start_xy,
         robot.footprint_m,
-        before,
+        recorded,
         pedestrian_obstacles(scenario, street_map),
         scenario.conditions,
     )
@@ -308,8 +308,8 @@ def sumo_crowd(
     closed: frozenset[Port],
     start_xy: tuple[float, float],
     footprint_m: tuple[float, float] = COURIER.footprint_m,
-    before: Entrances | None = None,
-    standing: StandingObstacles | None = None,
+    recorded: Entrances | None = None,
+    obstacles: StandingObstacles | None = None,
     weather: Weather = WEATHERS[CLEAR],
 ) -> SumoCrowd:
     """Create the crowd and traffic of a net by SUMO, not started. Raises MachineError if SUMO
@@ -320,7 +320,16 @@ def sumo_crowd(
         raise MachineError(f"SUMO cannot be loaded: {error}. `cosim doctor` says more") from error
 
     return SumoCrowd(
-        net_path, street_map, spec, seed, closed, start_xy, footprint_m, before, standing, weather
+        net_path,
+        street_map,
+        spec,
+        seed,
+        closed,
+        start_xy,
+        footprint_m,
+        recorded,
+        obstacles,
+        weather,
     )
 
 

@@ -56,15 +56,15 @@ def gate_faults(
     right_m, left_m = open_interval_m(kind, event)
     mirrored = open_interval_m(kind, kind.decoy_of(event))
     if left_m - right_m < robot_width_m + OPEN_ROOM_M:
-        yield f"{event.called}the free side is only {left_m - right_m:.2f} m wide"
+        yield f"{event.prefix}the free side is only {left_m - right_m:.2f} m wide"
     if closed_m(kind, event) > robot_width_m - CLOSED_LESS_M:
-        yield f"{event.called}the closed side is {closed_m(kind, event):.2f} m wide"
+        yield f"{event.prefix}the closed side is {closed_m(kind, event):.2f} m wide"
     common_m = min(left_m, mirrored[1]) - max(right_m, mirrored[0])
     if common_m >= robot_width_m:
-        yield f"{event.called}{common_m:.2f} m are free in the event and in its mirror"
+        yield f"{event.prefix}{common_m:.2f} m are free in the event and in its mirror"
 
 
 def _blocked_m(kind: EventKind, event: Event) -> tuple[float, float]:
     if kind.blocked is None or event.free_side == 0:
-        raise ValueError(f"{event.called}has no free side")
+        raise ValueError(f"{event.prefix}has no free side")
     return kind.blocked(event)

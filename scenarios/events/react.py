@@ -123,7 +123,7 @@ def _acts(kind: EventKind, event: Event) -> EventKind | Decoy:
     if not event.decoy:
         return kind
     if kind.decoy is None:
-        raise SpecError(f"{event.called}'{event.kind}' has no behaviour of decoys")
+        raise SpecError(f"{event.prefix}'{event.kind}' has no behaviour of decoys")
     return kind.decoy
 
 

@@ -57,7 +57,7 @@ class ChildProcess:
     entry_point: function that the worker runs, as module:name.
     kind: kind of the process, for messages.
     descriptors: further descriptors to pass on.
-    max_message_bytes: size limit of a message from it.
+    max_bytes: size limit of a message from it.
     sandbox: sandbox in which it runs, without the memory of the pending call.
     open: whether it is not known to have ended.
     """
@@ -68,7 +68,7 @@ class ChildProcess:
         entry_point: str,
         kind: str,
         descriptors: tuple[int, ...] = (),
-        max_message_bytes: int = MAX_MESSAGE_BYTES,
+        max_bytes: int = MAX_MESSAGE_BYTES,
         sandbox: Sandbox | None = None,
     ) -> None:
         self.log = str(log)
@@ -80,7 +80,7 @@ class ChildProcess:
         self.in_engine = False
         self.in_policy = False
         ours, theirs = socket.socketpair()
-        self.wire = MessageSocket(ours, max_message_bytes)
+        self.wire = MessageSocket(ours, max_bytes)
         call = () if sandbox is not None else (self._memory.descriptor,)
         inherited = (theirs.fileno(), *call, *descriptors)
         path = [str(Path(entry).absolute()) for entry in sys.path]

@@ -10,7 +10,7 @@ import struct
 import time
 from typing import Final, NamedTuple, get_args
 
-from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCall, when
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCall, call_in_words
 from scenarios.ipc.shared_memory import SharedMemory
 
 _CALL_KINDS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
@@ -69,7 +69,7 @@ class PendingCall(NamedTuple):
     @property
     def when(self) -> str:
         """Return the call in words: "reset", or "act at 3.2 s"."""
-        return when(self.kind, self.tick)
+        return call_in_words(self.kind, self.tick)
 
 
 class PendingCallMemory(SharedMemory):

@@ -16,9 +16,9 @@ from typing import Any, Final, Self
 import numpy as np
 
 from bridge.policy_server import PackedArray, unpack_array
-from cosim.spec.goal import most_goal_bytes
+from cosim.spec.goal import max_goal_bytes
 from cosim.spec.manifest import Manifest
-from cosim.spec.sensors import MOST_TRACKS
+from cosim.spec.sensors import MAX_TRACKS
 
 HEAD_BYTES: Final = 64
 """Bytes of the header."""
@@ -95,10 +95,10 @@ def observation_bytes(manifest: Manifest | None) -> int:
         return 0
     first = [] if manifest.camera is None else [manifest.camera]
     sizes = [math.prod(camera.size) for camera in (*first, *manifest.cameras.values())]
-    goal = most_goal_bytes(manifest.picture_size)
+    goal = max_goal_bytes(manifest.picture_size)
     spec = manifest.scan
     scan = 0 if spec is None else 4 * spec.rings * spec.rays
-    tracks = 0 if manifest.people == "none" else _PER_TRACK_BYTES * MOST_TRACKS
+    tracks = 0 if manifest.people == "none" else _PER_TRACK_BYTES * MAX_TRACKS
     return (
         _PER_PIXEL_BYTES * sum(sizes) + goal + scan + tracks + _ALIGNED_BYTES * (3 * len(sizes) + 5)
     )

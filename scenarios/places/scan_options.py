@@ -69,7 +69,7 @@ class ScanOptions(Ranged, frozen=True, kw_only=True):
     width_m: Annotated[float, Within(1, 20)] = 3.0
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return ""
 
     def contradictions(self) -> Iterator[str]:

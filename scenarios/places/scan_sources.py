@@ -32,7 +32,7 @@ from physics.scans.frame import (
 )
 from physics.scans.mesh_distance import MeshDistance
 from physics.scans.ordering import order_mesh, order_splats, take_splats
-from physics.scans.read_mesh import MOST_TRIANGLES, RawMesh, read_mesh
+from physics.scans.read_mesh import MAX_TRIANGLES, RawMesh, read_mesh
 from physics.scans.read_splats import RawSplats, read_splats
 from physics.scans.sources import kind_of_source, read_source, stem_and_ending
 from scenarios.places.scan_options import OPTIONS_FILE, ScanOptions, Up, read_transform
@@ -155,9 +155,9 @@ def _load_mesh(found: _Found, options: ScanOptions, progress: Progress) -> Loade
     triangles: NDArray[np.int64] = np.concatenate(
         [raw.triangles + start for (_, _, raw), start in zip(meshes, starts, strict=False)]
     )
-    if len(triangles) > MOST_TRIANGLES:
+    if len(triangles) > MAX_TRIANGLES:
         raise MapError(
-            f"the mesh has {len(triangles)} triangles; at most {MOST_TRIANGLES} are imported: "
+            f"the mesh has {len(triangles)} triangles; at most {MAX_TRIANGLES} are imported: "
             "simplify it, for example in MeshLab or Blender"
         )
     progress("ordering the mesh")

@@ -304,12 +304,12 @@ def no_answer(hello: Hello, allowed_s: float) -> str:
     return f"policy '{hello.manifest.name}' gave no answer for {allowed_s:g} s"
 
 
-def new_output(log: Path, begin: int, most_bytes: int) -> tuple[bytes, int]:
+def new_output(log: Path, begin: int, max_bytes: int) -> tuple[bytes, int]:
     """Return the last bytes of a log that were added after byte `begin`, and the log's size."""
     try:
         with log.open("rb") as file:
             size = file.seek(0, 2)
-            file.seek(max(begin, size - most_bytes))
-            return file.read(most_bytes), size
+            file.seek(max(begin, size - max_bytes))
+            return file.read(max_bytes), size
     except OSError:
         return b"", begin

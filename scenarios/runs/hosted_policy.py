@@ -170,12 +170,12 @@ class HostedDriver(PolicyCaller):
     def ended(self) -> None:
         if self._begun:
             # A server has a second to reply; an isolated policy is timed like any call.
-            with self._asked("ended", 0) if self._isolated else nullcontext():
+            with self._guarded("ended", 0) if self._isolated else nullcontext():
                 self._hosted.report_ended()
         self._begun = ""
 
     @property
-    def spent(self) -> bool:
+    def has_exited(self) -> bool:
         return self._isolated and self._hosted.lost
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from cosim.episode.interfaces import Policy
 from cosim.episode.manifest_checks import check_camera, with_goal
 from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.user_module import importable_name
-from cosim.results.run_folder import RunFolder, read_spec, refuse_not_begun
+from cosim.results.run_folder import RunFolder, check_begun, read_spec
 from cosim.results.run_setup import RunSetup
 from cosim.results.run_spec import RunSpec, Shard
 from cosim.spec.episode_id import random_run_seed
@@ -63,7 +63,7 @@ class PlannedRun(NamedTuple):
         """Return the scenarios that are run here."""
         if self.shard is None:
             return self.selected
-        return [one for pair in self.shard.share(pairs_of(self.selected)) for one in pair]
+        return [one for pair in self.shard.select(pairs_of(self.selected)) for one in pair]
 
     @property
     def spec(self) -> RunSpec:
@@ -89,14 +89,14 @@ def planned_run(
     options: in place of the config's.
     Raises UsageError, MachineError.
     """
-    options = EpisodeOptions.asked(config) if options is None else options
+    options = EpisodeOptions.from_config(config) if options is None else options
     resumed = config.out if config.resume else None
     name = (
         importable_name(config.policy)
         if policy is None
         else f"{type(policy).__module__}:{type(policy).__qualname__}"
     )
-    part = Shard.called(config.shard, len(pairs_of(selected))) if config.shard else None
+    part = Shard.parse(config.shard, len(pairs_of(selected))) if config.shard else None
     if part is not None and options.seed is None and resumed is None:
         raise UsageError(
             "--shard needs --seed: shards are of one run, which has one seed: give the same to each"
@@ -138,7 +138,7 @@ def locked_run(plan: PlannedRun, folder: Path) -> Iterator[LockedRun]:
         patience=plan.patience,
     )
     with run_folder:
-        done = run_folder.finished()
+        done = run_folder.finished_ids()
         todo = [one for one in plan.scenarios if one.id not in done]
         yield LockedRun(run_folder, hello, plan.scenarios, todo)
 
@@ -220,5 +220,5 @@ def seed_of_run(requested: int | None, resumed: Path | None) -> int:
         return requested
     if resumed is None:
         return random_run_seed()
-    refuse_not_begun(resumed)
+    check_begun(resumed)
     return read_spec(resumed).setup.seed

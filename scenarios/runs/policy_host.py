@@ -10,7 +10,7 @@ import msgspec
 
 from bridge.policy_server import ActRequest, EndRequest, PackedArray, ResetRequest, pack_array
 from cosim.core.errors import UsageError
-from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer, when
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer, call_in_words
 from cosim.policies.load import REMOTE_SCHEME, load_policy
 from cosim.policies.user_module import importable_name
 from cosim.spec.connection import Connection
@@ -116,7 +116,7 @@ class _RendererCarrier:
 
     def exchange(self, request: ResetRequest | ActRequest) -> bytes:
         if isinstance(request, ActRequest):
-            return self._linked().exchange(request, when("act", request.tick))
+            return self._linked().exchange(request, call_in_words("act", request.tick))
         self._link = link_to(self._address)
         return self._link.exchange(request, "reset")
 

@@ -115,7 +115,7 @@ class _Pool:
         idle = (worker for worker, job in self._workers.items() if job is None)
         worker = next(idle, None) or self._transport.start(self._hello)
         self._workers[worker] = scenario
-        self._folder.forget(scenario.id)
+        self._folder.delete_episode(scenario.id)
         last, second_half = (
             self._queue.on_last_attempt(scenario),
             self._queue.in_second_half(scenario),
@@ -195,7 +195,7 @@ class _Pool:
         elif done.again:
             self._failed(scenario, failure_of_result(record.status, record.reason))
         else:
-            self._folder.keep(record, done.log, done.demonstration)
+            self._folder.write_episode(record, done.log, done.demonstration)
             self._over(scenario, record.status)
 
     def _record_of(self, scenario: Scenario, data: bytes) -> Record | None:
@@ -247,7 +247,7 @@ class _Pool:
         else:
             worker.cancel()
             del self._workers[worker]
-        self._folder.keep(record, done.log)
+        self._folder.write_episode(record, done.log)
         self._over(scenario, record.status)
         return "kept"
 
@@ -274,7 +274,7 @@ class _Pool:
         if record is None:
             manifest = with_goal(self._hello.manifest, self._options.goal)
             record = Record.begun(scenario, manifest, self._setup)
-        self._folder.keep(
+        self._folder.write_episode(
             msgspec.structs.replace(
                 record, status=status, reason=reason, ended=None, measures={}, clock={}
             )

@@ -121,7 +121,7 @@ class PolicyServers:
             if outcome in ("answered", "refused"):
                 return payload
             now_s = time.monotonic()
-            if outcome == "late":
+            if outcome == "timeout":
                 unreached_since_s = None
                 continue
             unreached_since_s = now_s if unreached_since_s is None else unreached_since_s
@@ -141,8 +141,8 @@ class PolicyServers:
         assert self._server is not None
         kind = str(request.__struct_config__.tag)
         key = f"{policy_key(DOMAIN, self.name, self._server.info.server)}/{kind}"
-        reply = self._server.session.ask_once(key, encode_message(request), timeout_s=timeout_s)
-        return reply.how, reply.payload
+        reply = self._server.session.query_once(key, encode_message(request), timeout_s=timeout_s)
+        return reply.outcome, reply.payload
 
     def _lost(self) -> PolicyServerLost:
         assert self._server is not None
@@ -166,7 +166,7 @@ class PolicyServers:
                     if endpoint.endpoint not in self._sessions:
                         self._sessions[endpoint.endpoint] = open_session(endpoint)
                     session = self._sessions[endpoint.endpoint]
-                    replies = session.answers(key, timeout_s=2.0)
+                    replies = session.query_all(key, timeout_s=2.0)
                     infos = [_info(payload) for payload in replies.values()]
                     hub = session.hub
                     found += [

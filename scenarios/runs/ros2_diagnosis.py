@@ -9,7 +9,7 @@ from bridge.ros2 import messages
 from bridge.ros2.commands import COMMAND_TYPES, hash_fault
 from bridge.ros2.node import Ros2Node
 from bridge.ros2.wire import Endpoint, full_topic, type_hash
-from cosim.spec.ros2 import CMD_VEL, SENT, SENT_WITH, Ros2Distro, Ros2Settings
+from cosim.spec.ros2 import CMD_VEL, PUBLISHED_TOPICS, TOPIC_OPTIONS, Ros2Distro, Ros2Settings
 
 _MOST_NAMED: Final = 8
 """Largest number of nodes or topics that a message names."""
@@ -80,8 +80,8 @@ def unreadable(end: Endpoint, distro: Ros2Distro) -> str:
 def _faults_of_subscriptions(node: Ros2Node, distro: Ros2Distro) -> Iterator[str]:
     """Yield why subscriptions to topics of the run get no message."""
     for topic, end in node.subscriptions():
-        if end.type != SENT[topic]:
-            yield f"{end.in_words} subscribes to {end.topic} as {end.type}, it is {SENT[topic]}"
+        if end.type != (published := PUBLISHED_TOPICS[topic]):
+            yield f"{end.in_words} subscribes to {end.topic} as {end.type}, it is {published}"
         elif words := _fault_of_hash(end, distro):
             yield words
 
@@ -91,9 +91,9 @@ def _silent_topics(node: Ros2Node, sent: Set[str]) -> Iterator[str]:
     read = node.subscriptions()
     if sent and not any(topic in sent for topic, _ in read):
         for topic, end in read:
-            if topic in SENT_WITH:
+            if topic in TOPIC_OPTIONS:
                 nothing = f"subscribes to {end.topic}, and this run sends nothing there"
-                yield f"{end.in_words} {nothing}: see {SENT_WITH[topic]}"
+                yield f"{end.in_words} {nothing}: see {TOPIC_OPTIONS[topic]}"
 
 
 def _fault_of_hash(end: Endpoint, distro: Ros2Distro) -> str:

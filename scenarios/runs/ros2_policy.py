@@ -49,7 +49,7 @@ from cosim.episode.interfaces import Observation
 from cosim.episode.policy_caller import PolicyCaller, Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.options import PolicyHost, PolicyProcess
-from cosim.spec.ros2 import CMD_VEL, PLAN, ROS2_SCHEME, TAKEN, Ros2Settings
+from cosim.spec.ros2 import CMD_VEL, COMMAND_TOPICS, PLAN, ROS2_SCHEME, Ros2Settings
 from scenarios.runs.ros2_diagnosis import diagnosis, two_publishers, unreadable
 
 JOINED_S: Final = 1.0
@@ -262,7 +262,7 @@ class Ros2Policy:
 
     def _wanted_hash(self, name: str, topic: str) -> str:
         """Return the hash of a type that is read on a topic, else ""."""
-        return type_hash(name, self.settings.distro) if name in TAKEN[topic] else ""
+        return type_hash(name, self.settings.distro) if name in COMMAND_TOPICS[topic] else ""
 
     def _fault_of_form(self, got: Received, topic: str) -> Fault | None:
         wanted_hash = self._wanted_hash(got.type, topic)

@@ -21,7 +21,7 @@ from cosim.core.progress import Progress, ignore
 from cosim.core.units import milliseconds
 from cosim.episode.interfaces import Policy
 from cosim.episode.policy_caller import PolicyCaller
-from cosim.results.run_folder import read_spec, refuse_not_begun, refuse_used
+from cosim.results.run_folder import check_begun, check_unused, read_spec
 from cosim.spec.connection import Connection
 from cosim.spec.injection import LiveAddress
 from cosim.spec.options import DirectorAddress, EpisodeOptions, PolicyHost
@@ -207,7 +207,7 @@ def execute_run(
     if config.robot:
         check_robot(robot_called(config.robot))
     if config.out is not None:
-        (refuse_not_begun if config.resume else refuse_used)(config.out)
+        (check_begun if config.resume else check_unused)(config.out)
     suite = _loaded(config, objects, reporter)
     selected = select_scenarios(
         suite,

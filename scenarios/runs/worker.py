@@ -95,7 +95,7 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
         except (UsageError, MachineError):
             break  # a new process says whether the policy can be loaded there, and runs the job
         done, failed = _run(job, drivers, send, hello, commands)
-        if failed or drivers.spent:
+        if failed or drivers.has_exited:
             drivers.close()
             drivers = None  # loaded again for the next job
         send(done)
@@ -188,8 +188,8 @@ class WorkerDrivers:
     learner: PolicyCaller | None
 
     @property
-    def spent(self) -> bool:
-        return self.policy.spent
+    def has_exited(self) -> bool:
+        return self.policy.has_exited
 
     def close(self) -> None:
         self.policy.close()

@@ -156,10 +156,10 @@ class ZenohWorkers:
     def open(self) -> None:
         """Start to answer workers."""
         for act in ("claim", "report"):
-            self._session.collect(keys.job(self.run, act), self._queued(act))
-        self._session.collect(keys.status(self.run), self._queued("status"), found=True)
-        self._session.collect(keys.net(self.run, "*"), self._queued("net"))
-        self._session.watch(keys.worker(self.run, "*"), self._seen)
+            self._session.serve_later(keys.job(self.run, act), self._queued(act))
+        self._session.serve_later(keys.status(self.run), self._queued("status"), found=True)
+        self._session.serve_later(keys.net(self.run, "*"), self._queued("net"))
+        self._session.watch_tokens(keys.worker(self.run, "*"), self._seen)
 
     def room(self, busy: int) -> int:
         return len(self._claims) if time.monotonic() >= self._opens_at else 0

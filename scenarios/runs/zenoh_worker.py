@@ -113,7 +113,7 @@ def work(
         over = ""
         over_s = 0.0
         while not leaving.signal:
-            runs = [key.split("/")[1] for key in session.answers(keys.EVERY_RUN, timeout_s=5.0)]
+            runs = [key.split("/")[1] for key in session.query_all(keys.EVERY_RUN, timeout_s=5.0)]
             if not runs or (runs[0] == over and time.monotonic() - over_s < _PARTING_S):
                 contact.missing(f"waits for a run at {connection.endpoint}")
                 leaving.wait([], _RETRY_S)
@@ -203,7 +203,7 @@ class _Service:
     def serve(self) -> bool:
         """Work until the run is over (True), another one takes its place, or this process is to
         leave."""
-        leave = self._session.stand(keys.worker(self._run, self._name))
+        leave = self._session.declare_token(keys.worker(self._run, self._name))
         self._say(f"works for run {self._run} as {self._name}")
         try:
             while not self._leaving.signal:
@@ -244,7 +244,7 @@ class _Service:
             self._replies.put((client, request, payload, error))
             self._leaving.ring()
 
-        self._session.send(request.key, request.payload, replied, timeout_s=request.timeout_s)
+        self._session.send_query(request.key, request.payload, replied, timeout_s=request.timeout_s)
 
     def _take(
         self,
@@ -269,7 +269,7 @@ class _Service:
             return False
         self._contact.missing("the coordinator does not answer: waits for it")
         self._next_look_s = time.monotonic() + 1.0
-        runs = [key.split("/")[1] for key in self._session.answers(keys.EVERY_RUN, timeout_s=2.0)]
+        runs = [key.split("/")[1] for key in self._session.query_all(keys.EVERY_RUN, timeout_s=2.0)]
         return bool(runs) and self._run not in runs
 
     def _hand_back(self) -> None:

@@ -15,7 +15,7 @@ from cosim.place.barriers import outline
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.spec.obstacle import footprint
 from cosim.spec.robot import ROBOTS, robot_called
-from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite, event_faults
+from cosim.spec.scenario import MAX_PERSONS, Place, RouteCrossing, Scenario, Suite, event_faults
 from cosim.spec.spec_file import join_faults
 from physics.cameras.hdri import read_hdri
 from scenarios.events import EVENT_KINDS
@@ -181,11 +181,11 @@ def _excessive_crowd(scenario: Scenario, street_map: StreetMap) -> Iterator[str]
     crowd = scenario.crowd
     if crowd.density is not None:
         room_m2 = LocalWalkableArea(street_map, crowd.radius_m).area_m2(*scenario.start[:2])
-        if (persons := round(crowd.density * room_m2 / 1000.0)) > MOST_PERSONS:
+        if (persons := round(crowd.density * room_m2 / 1000.0)) > MAX_PERSONS:
             yield (
                 f"crowd density {crowd.density:g} within {crowd.radius_m:g} m of the start "
                 f"makes {persons} persons, "
-                f"and at most {MOST_PERSONS} can be had: lower density or radius_m"
+                f"and at most {MAX_PERSONS} can be had: lower density or radius_m"
             )
 
 

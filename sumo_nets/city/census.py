@@ -35,7 +35,11 @@ FORK_RAD = math.radians(152.0)
 """A junction of three arms is a Y if no two neighbouring arms are farther apart, else a T,
 radians."""
 
-LEAST_CLEAR_M = 1.2
+_WIDEST_M = 2.0
+"""Largest tested width of the free ground, metres."""
+_WIDTH_STEP_M = 0.05
+"""Step of tested widths, metres."""
+MIN_CLEAR_M = 1.2
 """Smallest free width in a city without faults, metres."""
 _LONGEST_M = 1500.0
 """Smallest length of the longest walk in a city without faults, metres."""
@@ -147,10 +151,8 @@ def census(
 def clear_width_m(
     place: StreetMap,
     standing: Sequence[shapely.Geometry] = (),
-    widest_m: float = 2.0,
-    step_m: float = 0.05,
 ) -> float:
-    """Return the largest width, in steps of `step_m`, that fits everywhere.
+    """Return the largest width up to 2 m, in steps of 5 cm, that fits everywhere.
 
     The walkable ground around furniture, shrunk by half of that width, must have one piece that
     holds the middles of all strips.
@@ -167,13 +169,13 @@ def clear_width_m(
     )
     middles = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
     low = 0
-    high = round(widest_m / step_m) + 1
+    high = round(_WIDEST_M / _WIDTH_STEP_M) + 1
     while high - low > 1:
         steps = (low + high) // 2
         low, high = (
-            (steps, high) if _passes(ground, middles, 0.5 * steps * step_m) else (low, steps)
+            (steps, high) if _passes(ground, middles, 0.5 * steps * _WIDTH_STEP_M) else (low, steps)
         )
-    return low * step_m
+    return low * _WIDTH_STEP_M
 
 
 def _passes(ground: shapely.Geometry, middles: Floats, half_m: float) -> bool:
@@ -297,7 +299,7 @@ def _faults(found: Census, place: StreetMap, signals: Sequence[str]) -> list[str
         faults.append(f"only {found.one_piece:.1%} of the walkable area is one piece")
     if loose:
         faults.append(f"{loose} strips end at no corner")
-    if found.clear_m < LEAST_CLEAR_M:
+    if found.clear_m < MIN_CLEAR_M:
         faults.append(f"a passage is only {found.clear_m:.2f} m wide")
     if found.km2 > 3.0 and found.longest_m < _LONGEST_M:
         faults.append(f"the longest walk has only {found.longest_m:.0f} m")

@@ -33,7 +33,10 @@ CLEAR_RAD = math.radians(58.0)
 
 
 class _Style(NamedTuple):
-    """Average shares of the elements of a city. classes: weight of each street class."""
+    """Average shares of the elements of a city.
+
+    classes: weight of each street class.
+    """
 
     classes: dict[str, float]
     jitter: float

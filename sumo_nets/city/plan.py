@@ -52,8 +52,10 @@ class Link:
 
 @dataclass(slots=True)
 class Draft:
-    """Lattice points, streets between them, and roundabouts. rings: radius of the roundabout at
-    a point, metres."""
+    """Lattice points, streets between them, and roundabouts.
+
+    rings: radius of the roundabout at a point, metres.
+    """
 
     at: dict[Cell, Point]
     links: list[Link]
@@ -114,8 +116,10 @@ class Node(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """One direction of a street. driveways: points of its line where driveways cross the
-    sidewalk."""
+    """One direction of a street.
+
+    driveways: points of its line where driveways cross the sidewalk.
+    """
 
     id: str
     tail: str
@@ -143,7 +147,10 @@ class _Ring(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CityPlan:
-    """The elements of a city. signal_rng: random generator of the signal programs."""
+    """The elements of a city.
+
+    signal_rng: random generator of the signal programs.
+    """
 
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
@@ -154,7 +161,10 @@ class CityPlan:
 
 @dataclass(slots=True)
 class _Parts:
-    """Elements planned so far. joints: node where a street, by index, meets a lattice point."""
+    """Elements planned so far.
+
+    joints: node where a street, by index, meets a lattice point.
+    """
 
     nodes: dict[str, Node]
     edges: list[Edge]
@@ -164,8 +174,10 @@ class _Parts:
 
 
 def plan_of(draft: Draft, rngs: Mapping[str, np.random.Generator], crosswalks: float) -> CityPlan:
-    """Return the plan of a draft. crosswalks: share of the longer streets with a mid-street
-    crosswalk."""
+    """Return the plan of a draft.
+
+    crosswalks: share of the longer streets with a mid-street crosswalk.
+    """
     parts = _Parts({}, [], [], {}, defaultdict(list))
     numbers = {id(link): number for number, link in enumerate(draft.links)}
     for cell, arms in draft.arms().items():

@@ -33,7 +33,10 @@ OPPOSITE_RAD = math.radians(38.0)
 
 
 class Phase(NamedTuple):
-    """One phase of a program. state: a letter per link, as in SUMO."""
+    """One phase of a program.
+
+    state: a letter per link, as in SUMO.
+    """
 
     duration_s: int
     state: str

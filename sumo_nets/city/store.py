@@ -35,7 +35,10 @@ _NETCONVERT = (
 
 
 def city_as_net(city: City, folder: Path) -> bytes:
-    """Return the net of a city. folder: for temporary files."""
+    """Return the net of a city.
+
+    folder: for temporary files.
+    """
     plan = plan_city(city.seed, city.size_m, city.style)
     return with_signal_programs(
         without_comments(_converted(plan, folder).read_bytes()), plan.signal_rng
@@ -145,7 +148,7 @@ def city_net(city: City) -> Path:
             f"{path}: the net's hash is {found}, but the scenario was made on {city.net_hash}: "
             "delete the file to build it again; if the hash stays, the scenario is of "
             "another version of the "
-            "generator or of SUMO: make the suite anew, or install the version it was made with"
+            "generator or of SUMO: build the suite again, or install the version it was made with"
         )
     return path
 

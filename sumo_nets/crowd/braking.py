@@ -52,7 +52,10 @@ _BOUND_BUT_BRAKES: Final = 27
 
 
 class _Path(NamedTuple):
-    """Path of a vehicle from the start of its lane. clear: where the robot is far from it."""
+    """Path of a vehicle from the start of its lane.
+
+    clear: where the robot is far from it.
+    """
 
     lane: str
     line: Polyline

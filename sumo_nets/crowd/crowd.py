@@ -81,8 +81,8 @@ class SumoCrowd(Crowd):
     closed: ports with barriers; background pedestrians never pass them.
     start_xy: start position of the robot, metres.
     footprint_m: length and width of the robot, metres.
-    before: entries and exits of an earlier run to replay.
-    standing: obstacles, besides the robot, that people step around.
+    recorded: entries and exits of an earlier run to replay.
+    obstacles: obstacles, besides the robot, that people step around.
     entrances: entries and exits of this run.
     """
 
@@ -98,8 +98,8 @@ class SumoCrowd(Crowd):
         closed: frozenset[Port],
         start_xy: tuple[float, float],
         footprint_m: tuple[float, float] = COURIER.footprint_m,
-        before: Entrances | None = None,
-        standing: StandingObstacles | None = None,
+        recorded: Entrances | None = None,
+        obstacles: StandingObstacles | None = None,
         weather: Weather = WEATHERS[CLEAR],
     ) -> None:
         self._net_path = net_path
@@ -111,8 +111,8 @@ class SumoCrowd(Crowd):
         self._ground = InnerGround(street_map) if street_map.scanned else None
         self._start_xy = start_xy
         self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
-        self._before = before
-        self._standing = StandingObstacles() if standing is None else standing
+        self._recorded = recorded
+        self._obstacles = StandingObstacles() if obstacles is None else obstacles
         self._street: Street | None = None
         self._stood_ticks = 0
 
@@ -158,7 +158,7 @@ class SumoCrowd(Crowd):
     @property
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """The person ids of each group."""
-        return self._together.groups
+        return self._cohesion.groups
 
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
         """Advance by one tick, with the robot and the event pedestrians at their current poses.
@@ -172,21 +172,21 @@ class SumoCrowd(Crowd):
             self._braking.update(self._found[1], None if absent else robot.pose)
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
-                self._gaps.keep(persons)
+                self._gaps.update(persons)
                 seen = _seen(persons, engine.persons_waiting_s(persons))
-                self._pedestrians.roll(x_m, y_m, seen, self._waits_at_red)
+                self._pedestrians.update(x_m, y_m, seen, self._waits_at_red)
                 seen = _seen(vehicles, engine.vehicles_waiting_s(vehicles))
-                self._drivers.roll(x_m, y_m, seen)
+                self._drivers.update(x_m, y_m, seen)
             stands = outline_mps(robot.v_mps, robot.w_radps, self._half_m) < ROBOT_STANDS_MPS
             self._stood_ticks = self._stood_ticks + 1 if stands else 0
             if not absent:
                 let_past = self._stood_ticks * TICK_MS >= LET_PAST_S * 1000
                 self._robot.update(robot.pose, let_past=let_past)
-            cast = sorted_actors(reply.actors, self._pedestrians.ages)
+            actors = sorted_actors(reply.actors, self._pedestrians.ages)
             self._mirror(reply.actors)
             sumo.simulationStep()
             body = None if absent else RobotBody(robot.pose, self._half_m, robot.v_mps)
-            self._street = self._read(tick + 1, x_m, y_m, cast, body)
+            self._street = self._read(tick + 1, x_m, y_m, actors, body)
         return self._street
 
     def _launch(self, sumo_seed: int, begin_s: int) -> None:
@@ -213,7 +213,7 @@ class SumoCrowd(Crowd):
         self._walks = Walks(sumo, self._map)
         self._signals = Signals(SumoLights(sumo, self._map), self._map)
         self._kerbs = WaitingSpots(self._map)
-        self._together = GroupCohesion(sumo, self._map.strips, TICK_MS / 1000)
+        self._cohesion = GroupCohesion(sumo, self._map.strips, TICK_MS / 1000)
         self._gaps = FollowingGaps(sumo)
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
         self._reader = NearReader(self._pedestrians.ages)
@@ -222,7 +222,7 @@ class SumoCrowd(Crowd):
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
         self._mirrored: list[str] = []
-        self._poses = PoseFilter(TICK_MS / 1000, self._standing)
+        self._poses = PoseFilter(TICK_MS / 1000, self._obstacles)
         self._shown = ShownPeople(TICK_MS / 1000)
         self._sized = NO_VEHICLES.ids, NO_VEHICLES.size, NO_VEHICLES.speed
         if self._spec.vehicles:
@@ -239,19 +239,19 @@ class SumoCrowd(Crowd):
         """Return the sources of pedestrians and vehicles; `entrances` records their entries and
         exits."""
         self.entrances = Entrances()
-        if self._before is not None:
+        if self._recorded is not None:
             return replayed_demand(
                 sumo,
-                self._before,
+                self._recorded,
                 self._map,
                 self._spec,
                 self._closed,
-                self._together,
+                self._cohesion,
                 self._gaps,
             )
         logged = sumo, self.entrances, self._map, self._spec
         people = Pedestrians(
-            *logged, rng_persons, self._closed, self._together, self._gaps, self._weather
+            *logged, rng_persons, self._closed, self._cohesion, self._gaps, self._weather
         )
         return people, Drivers(*logged, rng_vehicles)
 
@@ -270,15 +270,15 @@ class SumoCrowd(Crowd):
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
     def _read(
-        self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None
+        self, tick: int, x_m: float, y_m: float, actors: list[Actor], body: RobotBody | None
     ) -> Street:
         reach_m = self._spec.radius_m + LEAVE_MARGIN_M
         self._found = self._reader.near(x_m, y_m, reach_m, VEHICLE_REACH_M)
         persons, vehicles = self._found
-        people = self._people(persons, cast, body)
+        people = self._people(persons, actors, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
-    def _people(self, persons: NearPersons, cast: list[Actor], body: RobotBody | None) -> People:
+    def _people(self, persons: NearPersons, actors: list[Actor], body: RobotBody | None) -> People:
         xy = persons.xy
         if red := self._signals.red(persons.ahead):
             xy = xy.copy()
@@ -286,9 +286,9 @@ class SumoCrowd(Crowd):
         if self._ground is not None:
             xy = self._ground.nearest(xy)
         shown = self._poses.update(
-            persons.names, xy, persons.mps, _facing, body, positions_of(cast)
+            persons.names, xy, persons.mps, _facing, body, positions_of(actors)
         )
-        return self._shown.together(cast, self._pedestrians.ages, persons.names, *shown)
+        return self._shown.merged(actors, self._pedestrians.ages, persons.names, *shown)
 
     def _vehicles(self, near: NearVehicles) -> Vehicles:
         """Convert SUMO's positions, the middles of the front bumpers, to the middles of the

@@ -87,7 +87,7 @@ class Pedestrians:
         spec: CrowdSpec,
         rng: np.random.Generator,
         closed: frozenset[Port],
-        together: GroupCohesion,
+        cohesion: GroupCohesion,
         gaps: FollowingGaps,
         weather: Weather = WEATHERS[CLEAR],
     ) -> None:
@@ -96,7 +96,7 @@ class Pedestrians:
         self._spec = spec
         self._rng = rng
         self._closed = closed
-        self._together = together
+        self._cohesion = cohesion
         self._gaps = gaps
         self._hurry = weather.hurry
         self.ages = entrances.ages
@@ -125,7 +125,7 @@ class Pedestrians:
             return self._spec.persons
         return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
 
-    def roll(
+    def update(
         self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
     ) -> None:
         """Remove persons that are far away or stuck, with their groups; let others enter; keep
@@ -135,10 +135,10 @@ class Pedestrians:
         at_red: returns whether a person waits at a red light.
         """
         person, radius_m = self._engine.person, self._spec.radius_m
-        fellows = self._together.group_of
+        fellows = self._cohesion.group_of
         here = self.ages.keys() & set(person.getIDList())
         present = sorted(here)
-        self._together.forget(present)
+        self._cohesion.remove_absent(present)
         for name in present:
             one = seen.get(name)
             if one is not None and one.waiting_s <= STUCK_S:
@@ -162,13 +162,16 @@ class Pedestrians:
                 if len(fellows(name)) <= spare:
                     spare -= len(fellows(name))
                     self._remove(name, here)
-        self._together.keep(seen)
+        self._cohesion.update(seen)
         self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
 
     def _remove(self, name: str, here: set[str]) -> None:
-        """Remove a person with its group. here: persons in the simulation; it is updated."""
+        """Remove a person with its group.
+
+        here: persons in the simulation; it is updated.
+        """
         if name in here:
-            for fellow in self._together.leave(name):
+            for fellow in self._cohesion.dissolve(name):
                 self._entrances.people[self._engine.simulation.getTime()].append(fellow)
                 self._engine.person.remove(fellow)
                 here.discard(fellow)
@@ -220,7 +223,7 @@ class Pedestrians:
             gaps_m = group.gaps_m(self._rng_gaps)
             for name, xy, gap_m in zip(names, places, gaps_m, strict=True):
                 self._add(name, spot, walk, speed_mps, xy, gap_m)
-            self._together.join(names, speed_mps, walk)
+            self._cohesion.form(names, speed_mps, walk)
             self._groups.entered()
             taken = np.concatenate([taken, places])
             count -= group.size
@@ -344,7 +347,7 @@ class Drivers:
         for _ in range(self._spec.vehicles if ring else 0):
             self._enter(ring)
 
-    def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
+    def update(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
         """Remove vehicles that are far away, or stuck out of sight, and let others enter, if
         possible far away."""
         vehicle = self._engine.vehicle
@@ -404,20 +407,20 @@ class Drivers:
 
 def replayed_demand(
     engine: Sumo,
-    before: Entrances,
+    recorded: Entrances,
     street_map: StreetMap,
     spec: CrowdSpec,
     closed: frozenset[Port],
-    together: GroupCohesion,
+    cohesion: GroupCohesion,
     gaps: FollowingGaps,
 ) -> tuple[ReplayedPedestrians, ReplayedDrivers]:
-    """Return pedestrians and vehicles that repeat the entries and exits of `before` at the same
+    """Return pedestrians and vehicles that repeat the entries and exits of `recorded` at the same
     times."""
     unused_rng = np.random.default_rng(0)
     people = ReplayedPedestrians(
-        engine, before, street_map, spec, unused_rng, closed, together, gaps
+        engine, recorded, street_map, spec, unused_rng, closed, cohesion, gaps
     )
-    return people, ReplayedDrivers(engine, before, street_map, spec, unused_rng)
+    return people, ReplayedDrivers(engine, recorded, street_map, spec, unused_rng)
 
 
 class ReplayedPedestrians(Pedestrians):
@@ -429,11 +432,11 @@ class ReplayedPedestrians(Pedestrians):
     def fill(self, x_m: float, y_m: float) -> None:
         self._replay()
 
-    def roll(
+    def update(
         self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
     ) -> None:
-        self._together.forget(self._engine.person.getIDList())
-        self._together.keep(seen)
+        self._cohesion.remove_absent(self._engine.person.getIDList())
+        self._cohesion.update(seen)
         self._replay()
 
     def _replay(self) -> None:
@@ -446,7 +449,7 @@ class ReplayedPedestrians(Pedestrians):
             elif one in here:
                 self._engine.person.remove(one)
         for (walk, mps), group in groupby(entered, key=lambda one: (one.walk, one.mps)):
-            self._together.join([one.name for one in group], mps, walk)
+            self._cohesion.form([one.name for one in group], mps, walk)
 
 
 class ReplayedDrivers(Drivers):
@@ -455,7 +458,7 @@ class ReplayedDrivers(Drivers):
     def fill(self, x_m: float, y_m: float) -> None:
         self._replay()
 
-    def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
+    def update(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
         self._replay()
 
     def _replay(self) -> None:

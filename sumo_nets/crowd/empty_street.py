@@ -29,10 +29,14 @@ _SIGNAL_CLOCK_S: Final = 3600
 """Range of the start time of the signals, drawn from the seed, seconds."""
 
 
-def needs_no_sumo(street_map: StreetMap, spec: CrowdSpec, before: Entrances | None = None) -> bool:
-    """Return whether a street does not need SUMO. before: recorded entries to replay instead of
-    random ones."""
-    no_crowd = spec.empty if before is None else not (before.people or before.vehicles)
+def needs_no_sumo(
+    street_map: StreetMap, spec: CrowdSpec, recorded: Entrances | None = None
+) -> bool:
+    """Return whether a street does not need SUMO.
+
+    recorded: entries to replay instead of random ones.
+    """
+    no_crowd = spec.empty if recorded is None else not (recorded.people or recorded.vehicles)
     return no_crowd and street_map.signals_fixed_time
 
 
@@ -81,8 +85,10 @@ class EmptyStreet(Crowd):
         return self._street
 
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
-        """Advance by one tick, with the event pedestrians at their current poses. absent: has no
-        effect."""
+        """Advance by one tick, with the event pedestrians at their current poses.
+
+        absent: has no effect.
+        """
         self._street = self._read(
             self.street.tick + 1, robot.pose.x_m, robot.pose.y_m, reply.actors
         )
@@ -90,7 +96,5 @@ class EmptyStreet(Crowd):
 
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...]) -> Street:
         self._lights.now_ms += TICK_MS
-        people = self._shown.together(
-            sorted_actors(actors, self.entrances.ages), self.entrances.ages
-        )
+        people = self._shown.merged(sorted_actors(actors, self.entrances.ages), self.entrances.ages)
         return Street(tick, people, signals=self._signals.near(x_m, y_m))

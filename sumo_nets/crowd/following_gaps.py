@@ -48,8 +48,11 @@ class FollowingGaps:
         self._gaps_m[name] = gap_m
         self._engine.person.setMinGap(name, gap_m)
 
-    def keep(self, near: NearPersons) -> None:
-        """Update the gaps. near: the persons in the simulation near the robot."""
+    def update(self, near: NearPersons) -> None:
+        """Update the gaps.
+
+        near: the persons in the simulation near the robot.
+        """
         here = [name for name in near.names if name in self._gaps_m]
         if len(self._gaps_m) > 2 * len(here):
             self._gaps_m = {name: self._gaps_m[name] for name in here}

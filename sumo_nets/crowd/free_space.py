@@ -66,8 +66,10 @@ _NO_ROWS: Final = np.zeros(0, dtype=np.intp)
 
 
 class EntrySpot(NamedTuple):
-    """A pose on the middle line of an edge, heading along it. share: share of the edge's length
-    before it."""
+    """A pose on the middle line of an edge, heading along it.
+
+    share: share of the edge's length before it.
+    """
 
     edge: str
     share: float

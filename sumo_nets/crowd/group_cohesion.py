@@ -84,7 +84,7 @@ class _Group:
     share: dict[str, float] = field(default_factory=dict)
 
 
-class _Standing(Protocol):
+class _Positioned(Protocol):
     """Anything with a position."""
 
     @property
@@ -116,13 +116,13 @@ class GroupCohesion:
         """Return all members of a person's group, the person included."""
         return self._groups[name].names if name in self._groups else (name,)
 
-    def join(self, names: Sequence[str], mps: float, walk: Sequence[str]) -> None:
+    def form(self, names: Sequence[str], mps: float, walk: Sequence[str]) -> None:
         """Form a group that walks at `mps` m/s along the edges of `walk`."""
         if len(names) > 1:
             group = _Group(tuple(names), mps, walk)
             self._groups.update(dict.fromkeys(names, group))
 
-    def forget(self, present: Iterable[str]) -> None:
+    def remove_absent(self, present: Iterable[str]) -> None:
         """Remove persons that are not present; a last remaining member continues alone."""
         here = set(present)
         for group in [self._groups[name] for name in self._groups if name not in here]:
@@ -134,15 +134,18 @@ class GroupCohesion:
             elif group.names:
                 self._groups.update(dict.fromkeys(group.names, group))
 
-    def leave(self, name: str) -> tuple[str, ...]:
+    def dissolve(self, name: str) -> tuple[str, ...]:
         """Dissolve a person's group and return its members."""
         names = self.group_of(name)
         for fellow in names:
             self._groups.pop(fellow, None)
         return names
 
-    def keep(self, seen: Mapping[str, _Standing]) -> None:
-        """Set the speeds of all groups until the next update. seen: positions of people."""
+    def update(self, seen: Mapping[str, _Positioned]) -> None:
+        """Set the speeds of all groups until the next update.
+
+        seen: positions of people by name.
+        """
         for name, group in self._groups.items():
             if name == group.names[0] and all(fellow in seen for fellow in group.names):
                 here = {fellow: (seen[fellow].x_m, seen[fellow].y_m) for fellow in group.names}
@@ -170,7 +173,11 @@ class GroupCohesion:
             self._set_speed(group, name, round(_STEPS * share) / _STEPS)
 
     def _close_gap(
-        self, here: Mapping[str, _Place], group: _Group, way: _Place, seen: Mapping[str, _Standing]
+        self,
+        here: Mapping[str, _Place],
+        group: _Group,
+        way: _Place,
+        seen: Mapping[str, _Positioned],
     ) -> None:
         """Let one member that is too far to the side in two successive updates step closer, the
         hindmost first."""

@@ -44,7 +44,10 @@ class SignalState(NamedTuple):
 
 
 class Lights(Protocol):
-    """Source of signal states. crossings: ids of the signalised crossings."""
+    """Source of signal states.
+
+    crossings: ids of the signalised crossings.
+    """
 
     crossings: Collection[str]
 

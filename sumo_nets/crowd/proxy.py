@@ -59,8 +59,10 @@ class LocalLead(NamedTuple):
 
 
 class SidewalkLead:
-    """Distances by which a sidewalk is nearer than other lanes. internal: edges inside each
-    junction."""
+    """Distances by which a sidewalk is nearer than other lanes.
+
+    internal: edges inside each junction.
+    """
 
     def __init__(self, engine: Sumo, internal: Mapping[str, Iterable[str]]) -> None:
         self._engine = engine
@@ -331,8 +333,10 @@ class Walks:
 
 
 class Proxy:
-    """SUMO person that represents one body. base: prefix of the names of its successive SUMO
-    persons."""
+    """SUMO person that represents one body.
+
+    base: prefix of the names of its successive SUMO persons.
+    """
 
     def __init__(
         self, engine: Sumo, walks: Walks, *, base: str, kind: str, serial: Iterator[int]

@@ -62,11 +62,11 @@ class NearPairs:
     _one: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     _other: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
-    def of(self, xy: Floats, firm: NDArray[np.bool_]) -> tuple[Rows, Rows]:
+    def of(self, xy: Floats, unyielding: NDArray[np.bool_]) -> tuple[Rows, Rows]:
         """Return the indices of near pairs, two arrays (P,) in order; empty if no pair is too near.
 
         xy: (N, 2) positions, metres.
-        firm: (N,) whether a person does not give way.
+        unyielding: (N,) whether a person does not give way.
         """
         at = _points(xy)
         if len(at) != len(self._at) or (
@@ -81,7 +81,7 @@ class NearPairs:
         if 1 in (far_m2 < SHOULDERS_M * SHOULDERS_M).tobytes():
             near = far_m2 <= _NEAR_M * _NEAR_M
             one, other = self._one[near], self._other[near]
-            moves = ~(firm[one] & firm[other])
+            moves = ~(unyielding[one] & unyielding[other])
             if (moves & (far_m2[near] < SHOULDERS_M * SHOULDERS_M)).any():
                 return one[moves], other[moves]
         return self._one[:0], self._other[:0]
@@ -94,35 +94,35 @@ class NearPairs:
 
 def separated_positions(
     before: Floats,
-    wanted: Floats,
-    firm: NDArray[np.bool_],
+    preferred: Floats,
+    unyielding: NDArray[np.bool_],
     reach_m: float,
-    stand: NDArray[np.bool_] | None = None,
+    standing: NDArray[np.bool_] | None = None,
     pairs: tuple[Rows, Rows] | None = None,
 ) -> Floats:
-    """Return positions (N, 2) close to `wanted` at which people do not overlap, metres.
+    """Return positions (N, 2) close to `preferred` at which people do not overlap, metres.
 
-    before, wanted: (N, 2) current and wanted positions, metres.
-    firm: (N,) whether a person does not give way.
+    before, preferred: (N, 2) current and preferred positions, metres.
+    unyielding: (N,) whether a person does not give way.
     reach_m: largest step, metres.
-    stand: (N,) whether a person wants to stand; it does not move unless that brings it closer to
+    standing: (N,) whether a person wants to stand; it does not move unless that brings it closer to
         its goal.
-    pairs: near pairs at `wanted`, if they are known already.
+    pairs: near pairs at `preferred`, if they are known already.
     """
-    one, other = NearPairs().of(wanted, firm) if pairs is None else pairs
+    one, other = NearPairs().of(preferred, unyielding) if pairs is None else pairs
     if not len(one):
-        return wanted
-    goal, start = _points(wanted), _points(before)
-    share_one = np.where(firm[one], 0.0, np.where(firm[other], 1.0, 0.5))
-    shares = share_one, np.where(firm[other], 0.0, np.where(firm[one], 1.0, 0.5))
+        return preferred
+    goal, start = _points(preferred), _points(before)
+    share_one = np.where(unyielding[one], 0.0, np.where(unyielding[other], 1.0, 0.5))
+    shares = share_one, np.where(unyielding[other], 0.0, np.where(unyielding[one], 1.0, 0.5))
     apart = start[other] - start[one]
     bend = _bend(apart, goal[other] - goal[one] - apart)
     at = _pushed(goal, one, other, shares, apart, bend)
-    if stand is not None and stand.any():
-        nowhere = stand & (np.abs(goal - at) > np.abs(goal - start) - MIN_GAIN_M)
+    if standing is not None and standing.any():
+        nowhere = standing & (np.abs(goal - at) > np.abs(goal - start) - MIN_GAIN_M)
         at = _pushed(np.where(nowhere, start, at), one, other, shares, apart, None)
     step = at - start
-    at = np.where(firm, goal, start + step * (reach_m / np.maximum(np.abs(step), reach_m)))
+    at = np.where(unyielding, goal, start + step * (reach_m / np.maximum(np.abs(step), reach_m)))
     return np.column_stack([at.real, at.imag])
 
 

@@ -59,17 +59,17 @@ class PoseFilter:
     flips its angle on side steps. The displayed person follows at a limited speed and turn rate,
     and avoids others and the robot.
 
-    standing: obstacles, besides the robot, that people step around.
+    obstacles: obstacles, besides the robot, that people step around.
     """
 
     period_s: float
-    standing: StandingObstacles = field(default_factory=StandingObstacles)
+    obstacles: StandingObstacles = field(default_factory=StandingObstacles)
     _rows: RowLookup = field(default_factory=RowLookup)
     _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
     _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _near: NearPairs = field(default_factory=NearPairs)
-    _firm: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    _unyielding: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     _others: int = 0
 
     def update(
@@ -105,9 +105,9 @@ class PoseFilter:
         reach_m = MAX_SPEED_MPS * self.period_s
         gap *= (reach_m / np.maximum(distance, reach_m))[:, None]
         shown = before + gap
-        stand = speed < PERSON_STANDS_MPS
-        shown = self._separated(before, shown, others, stand)
-        shown = self._around_obstacles(before, shown, body, stand)
+        standing = speed < PERSON_STANDS_MPS
+        shown = self._separated(before, shown, others, standing)
+        shown = self._around_obstacles(before, shown, body, standing)
         velocity = shown - before
         velocity /= self.period_s
         if new:
@@ -131,7 +131,7 @@ class PoseFilter:
         return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
 
     def _around_obstacles(
-        self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]
+        self, before: Floats, shown: Floats, body: RobotBody | None, standing: NDArray[np.bool_]
     ) -> Floats:
         """Step around the robot and obstacles.
 
@@ -139,12 +139,12 @@ class PoseFilter:
         that stands without room beside an obstacle is passed on its other side.
         """
         if body is None:
-            return self.standing.stepped_around(before, shown, stand)
+            return self.obstacles.stepped_around(before, shown, standing)
         if abs(body.v_mps) < ROBOT_STANDS_MPS:
-            past = self.standing.stepped_around(before, shown, stand)
-            return stepped_around(before, past, self.standing.closing(body), stand)
-        past = stepped_around(before, shown, body, stand)
-        round_both = self.standing.stepped_around(before, past, stand)
+            past = self.obstacles.stepped_around(before, shown, standing)
+            return stepped_around(before, past, self.obstacles.closing(body), standing)
+        past = stepped_around(before, shown, body, standing)
+        round_both = self.obstacles.stepped_around(before, past, standing)
         if round_both is past:
             return past
         nearer = approaches_body(before, round_both, body)
@@ -154,21 +154,26 @@ class PoseFilter:
         return np.where(stays[:, None], before, round_both)
 
     def _separated(
-        self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]
+        self, before: Floats, shown: Floats, others: Floats, standing: NDArray[np.bool_]
     ) -> Floats:
-        """Keep people apart. others: (K, 2) positions of people who do not give way, metres."""
+        """Keep people apart.
+
+        others: (K, 2) positions of people who do not give way, metres.
+        """
         count = len(shown)
-        if len(self._firm) != count + len(others) or len(others) != self._others:
+        if len(self._unyielding) != count + len(others) or len(others) != self._others:
             self._others = len(others)
-            self._firm = np.arange(count + len(others)) >= count
-        wanted = np.concatenate([shown, others]) if len(others) else shown
-        pairs = self._near.of(wanted, self._firm)
+            self._unyielding = np.arange(count + len(others)) >= count
+        preferred = np.concatenate([shown, others]) if len(others) else shown
+        pairs = self._near.of(preferred, self._unyielding)
         if not len(pairs[0]):
             return shown
         before = np.concatenate([before, others])
-        stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
+        standing = np.concatenate([standing, np.zeros(len(others), dtype=bool)])
         reach_m = MAX_SPEED_MPS * self.period_s
-        return separated_positions(before, wanted, self._firm, reach_m, stand, pairs)[:count]
+        return separated_positions(before, preferred, self._unyielding, reach_m, standing, pairs)[
+            :count
+        ]
 
 
 _NO_VALUES: Final = np.zeros(0)
@@ -180,13 +185,13 @@ class ShownPeople:
 
     def __init__(self, tick_s: float) -> None:
         self._strides = Strides(tick_s)
-        self._cast: tuple[tuple[str, ...], list[tuple[str, PersonKind, Age]]] | None = None
+        self._identities: tuple[tuple[str, ...], list[tuple[str, PersonKind, Age]]] | None = None
         self._walk = b""
         self._doing: tuple[Doing, ...] = ()
 
-    def together(
+    def merged(
         self,
-        cast: list[Actor],
+        actors: list[Actor],
         ages: Mapping[str, Age],
         names: tuple[str, ...] = (),
         xy: Floats = _NO_POINTS,
@@ -195,24 +200,24 @@ class ShownPeople:
     ) -> People:
         """Return crowd and event pedestrians as one value.
 
-        cast: the event pedestrians.
+        actors: the event pedestrians.
         ages: ages of the crowd.
         names, xy, heading, speed: the crowd's N members; (N, 2) metres, (N,) radians, (N,) m/s.
         """
-        if (names, cast_of := [(a.id, a.kind, a.age) for a in cast]) != self._cast:
-            self._cast = names, cast_of
-            self._names = (*names, *(a.id for a in cast))
-            kinds = [*[PersonKind.CROWD] * len(xy), *(a.kind for a in cast)]
-            all_ages = [*(ages[name] for name in names), *(a.age for a in cast)]
+        if (names, identities := [(a.id, a.kind, a.age) for a in actors]) != self._identities:
+            self._identities = names, identities
+            self._names = (*names, *(a.id for a in actors))
+            kinds = [*[PersonKind.CROWD] * len(xy), *(a.kind for a in actors)]
+            all_ages = [*(ages[name] for name in names), *(a.age for a in actors)]
             self._kind = write_protected_copy(kinds, np.int8)
             self._age = write_protected_copy(all_ages, np.int8)
         if (walk := (speed > PERSON_STANDS_MPS).tobytes()) != self._walk:
             self._walk = walk
             self._doing = tuple(map(_DOING.__getitem__, walk))
         doing, paces = self._doing, speed
-        if cast:
-            doing += tuple([a.doing for a in cast])
-            added = np.array([_columns(a) for a in cast])
+        if actors:
+            doing += tuple([a.doing for a in actors])
+            added = np.array([_columns(a) for a in actors])
             xy = np.concatenate([xy, added[:, :2]])
             heading = np.concatenate([heading, added[:, 2]])
             paces = np.concatenate([speed, added[:, 4]])
@@ -251,6 +256,6 @@ def sorted_actors(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[A
     return sorted(actors, key=lambda actor: actor.id)
 
 
-def positions_of(cast: list[Actor]) -> Floats:
+def positions_of(actors: list[Actor]) -> Floats:
     """Return the positions of actors, (N, 2) metres."""
-    return np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)
+    return np.array([(a.x_m, a.y_m) for a in actors], dtype=float).reshape(-1, 2)

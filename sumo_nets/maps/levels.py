@@ -30,8 +30,10 @@ def is_levelled(tags: Mapping[str, str]) -> bool:
 
 
 def edges_of(ways: Mapping[str, int]) -> Iterator[str]:
-    """Yield the ids that netconvert may give the edges of OSM ways. ways: number of nodes by way
-    id."""
+    """Yield the ids that netconvert may give the edges of OSM ways.
+
+    ways: number of nodes by way id.
+    """
     for way, nodes in ways.items():
         for name in (way, *(f"{way}#{part}" for part in range(nodes - 1))):
             yield name

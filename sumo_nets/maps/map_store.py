@@ -77,7 +77,10 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class KnownMap(msgspec.Struct, frozen=True):
-    """A known place. origin: "imported" or "sumo" (in the SUMO package, imported on first use)."""
+    """A known place.
+
+    origin: "imported" or "sumo" (in the SUMO package, imported on first use).
+    """
 
     name: str
     origin: str
@@ -147,7 +150,7 @@ def map_net(place: CityMap | str) -> Path:
         raise MapError(
             f"map '{name}': its hash is {found}, but the scenario was made on "
             f"{place.net_hash}: import the same "
-            "file with the same options and versions again, or make the scenarios anew"
+            "file with the same options and versions again, or build the scenarios again"
         )
     return path
 
@@ -170,7 +173,7 @@ def read_map(place: CityMap | str) -> StreetMap:
         with_features(street_map.net_hash, path.with_name(FEATURES_FILE)), path.parent
     )
     whole = dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
-    return whole.with_source_hash(f"{street_map.made_of}-{known_as}")
+    return whole.with_input_hash(f"{street_map.input_hash}-{known_as}")
 
 
 def map_hash(net: Path) -> str:

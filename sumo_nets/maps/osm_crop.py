@@ -13,7 +13,7 @@ from cosim.core.errors import MapError
 MARGIN_M: Final = 500.0
 """Width of the margin around the box, metres: blocks are complete, and the net is cropped
 afterwards."""
-MOST_MEMBERS: Final = 50
+MAX_MEMBERS: Final = 50
 """Areas of more ways (rivers, borders) are omitted."""
 _DEGREE_M: Final = 111_195.0
 """Length of a degree of latitude, metres."""
@@ -59,7 +59,10 @@ def refuse_box_outside(source: Path, box: Box, bounds: Box, unit: str = "degrees
 
 @dataclass(slots=True)
 class _Part:
-    """Ids of the cropped part. cuts: indices of the first and last node of shortened streets."""
+    """Ids of the cropped part.
+
+    cuts: indices of the first and last node of shortened streets.
+    """
 
     nodes: set[int] = field(default_factory=set)
     ways: set[int] = field(default_factory=set)
@@ -99,7 +102,7 @@ def _selected_part(file: Path, box: Box, source: Path) -> _Part:
         kind = relation.tags.get("type", "")
         if (
             kind == "multipolygon"
-            and len(members) <= MOST_MEMBERS
+            and len(members) <= MAX_MEMBERS
             and part.ways.intersection(members)
         ):
             part.relations.add(relation.id)

@@ -41,7 +41,7 @@ NO_STREET = frozenset(
     ("construction", "proposed", "raceway", "bus_guideway", "platform", "rest_area", "services")
 )
 
-MOST_LANES = 40
+MAX_LANES = 40
 """Largest plausible number of lanes."""
 _WIDEST_M = 200
 """Largest plausible width of a street, metres."""
@@ -239,7 +239,7 @@ def _check_numbers(way: str, tags: dict[str, str]) -> None:
     for key, value in tags.items():
         parts = key.split(":")
         if parts[0] == "lanes":
-            most = MOST_LANES
+            most = MAX_LANES
         elif "width" in (parts[0], parts[-1]):
             most = _WIDEST_M
         else:

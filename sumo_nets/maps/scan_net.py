@@ -38,7 +38,7 @@ CROWD_M: Final = 1.2
 """Clear width below which the crowd does not walk, in metres."""
 INNER_M: Final = 0.2
 """Width by which lanes are narrower than the clear width, in metres."""
-_LEAST_LANE_M: Final = 0.4
+_MIN_LANE_M: Final = 0.4
 _TWO_WAY_M: Final = 5.0
 """Clear width from which a road has a lane in each direction, in metres."""
 _LANE_MPS: Final = 8.33
@@ -118,7 +118,10 @@ class _Zebra:
 
 
 class _NoCrossing(Exception):
-    """A crossing that does not fit on its road. number: of its area."""
+    """A crossing that does not fit on its road.
+
+    number: of its area.
+    """
 
     def __init__(self, number: int, reason: str) -> None:
         super().__init__(reason)
@@ -138,7 +141,11 @@ class _Plan:
 
 
 class ScanNet(NamedTuple):
-    """Built net. findings: a sentence each; inner_iou: of SUMO's lanes and the drawn ground."""
+    """Built net.
+
+    findings: a sentence each
+    inner_iou: of SUMO's lanes and the drawn ground.
+    """
 
     path: Path
     findings: tuple[str, ...]
@@ -274,7 +281,7 @@ def _add_roads(plan: _Plan, axis: Axis) -> None:
 
 
 def _inner(clear_m: float) -> float:
-    return max(clear_m - INNER_M, _LEAST_LANE_M)
+    return max(clear_m - INNER_M, _MIN_LANE_M)
 
 
 def _add_crossing(

@@ -93,7 +93,10 @@ def net_bytes(path: Path) -> bytes:
 
 @contextmanager
 def file_chunks(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
-    """Yield the content of a file in chunks. packing: "", "gzip" or "bzip2"."""
+    """Yield the content of a file in chunks.
+
+    packing: "", "gzip" or "bzip2".
+    """
     try:
         with OPENERS[packing](source) as stream:
             yield _bounded(source, stream, source.stat().st_size)

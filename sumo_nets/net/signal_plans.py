@@ -41,7 +41,10 @@ class SignalPrograms:
     others: bool = False
 
     def add(self, tag: str, parent: str, attributes: Mapping[str, str]) -> None:
-        """Add the next element of the net. parent: tag of the enclosing element."""
+        """Add the next element of the net.
+
+        parent: tag of the enclosing element.
+        """
         if tag == "tlLogic":
             self.logics.append(attributes)
             self.phases.append([])
@@ -56,8 +59,10 @@ class SignalPrograms:
     def plans(
         self, links: Sequence[Mapping[str, str]], crossings: Iterable[str]
     ) -> dict[str, SignalPlan]:
-        """Return the plans of those crossings that have one. links: connections to the
-        crossings."""
+        """Return the plans of those crossings that have one.
+
+        links: connections to the crossings.
+        """
         names = [logic.get("id", "") for logic in self.logics]
         often = Counter(names)
         fixed = {} if self.others else {name: k for k, name in enumerate(names) if often[name] == 1}

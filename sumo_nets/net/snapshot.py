@@ -61,7 +61,7 @@ def street_map_of(path: Path) -> StreetMap:
     street_map = cached(
         snapshot, lambda: _read(path), lambda made: [map_as_bytes(made)], map_from_bytes
     )
-    return street_map.with_source_hash(key)
+    return street_map.with_input_hash(key)
 
 
 def _read(path: Path) -> StreetMap:

@@ -60,7 +60,7 @@ import sys, time
 import msgspec
 from bridge import keys
 from bridge.codec import decode, encode
-from bridge.director import verify_query, sign
+from bridge.director import decode_query, encode_versioned
 from bridge.session import open_session
 from cosim.spec.connection import Connection
 from scenarios.events import react
@@ -68,17 +68,17 @@ from scenarios.episodes.director import behaviour_version
 
 last = {}
 def lie(payload):
-    query = verify_query(payload, behaviour_version())
-    reply, by, replace = react(query), behaviour_version(), msgspec.structs.replace
+    query = decode_query(payload, behaviour_version())
+    reply, version, replace = react(query), behaviour_version(), msgspec.structs.replace
     before, last[query.episode] = last.get(query.episode, reply), reply
     if query.tick < 3 or query.episode == "honest":
-        return sign(reply, by)
+        return encode_versioned(reply, version)
     match query.episode:
-        case "late": return sign(before, by)
-        case "many": return sign(replace(reply, states=reply.states * 1000), by)
+        case "late": return encode_versioned(before, version)
+        case "many": return encode_versioned(replace(reply, states=reply.states * 1000), version)
         case "noise": return b"\\x93\\x01" * 100
-        case "other-code": return sign(reply, "0" * 16)
-        case "huge": return sign(reply, "x" * 10_000_000)
+        case "other-code": return encode_versioned(reply, "0" * 16)
+        case "huge": return encode_versioned(reply, "x" * 10_000_000)
     raise RuntimeError("no idea")
 
 with open_session(Connection(role="director", listen=sys.argv[1])) as hub:
@@ -210,7 +210,7 @@ def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> Non
         run = cosim(*words, "--director-wait", "5", cwd=tmp_path)
     lost = recorded(tmp_path, "t-1")
     assert run.returncode == 1 and lost["status"] == "invalid"
-    assert "nobody answered on 'cosim/run/env/t-1/director' for 5 s" in lost["reason"]
+    assert "no reply on 'cosim/run/env/t-1/director' within 5 s" in lost["reason"]
     assert "t-1: waits at tick" in run.stderr and "5 s at most" in run.stderr
 
 
@@ -222,7 +222,7 @@ def test_a_director_that_lies_spoils_its_episodes_and_no_other(
     says = {
         "late": "it answered tick 2 of 'late'",
         "many": "it answered with 1000 states for 1 events",
-        "noise": "not a SignedMessage message",
+        "noise": "not a VersionedMessage message",
         "other-code": "run and director must be started from the same code",
         "huge": "Expected `str` of length <= 64",
         "raises": "RuntimeError: no idea",

@@ -17,10 +17,10 @@ from bridge.codec import encode
 from bridge.director import (
     QueryParts,
     RemoteDirector,
+    decode_query,
+    encode_query,
+    encode_versioned,
     serve_director,
-    sign,
-    sign_query,
-    verify_query,
 )
 from bridge.security import settings
 from bridge.session import LocalSession
@@ -79,15 +79,15 @@ def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
         return echo(asked)
 
     with LocalSession() as session:
-        serve_director(session, KEY, seen, by="cafe")
-        director = RemoteDirector(session, KEY, by="cafe")
+        serve_director(session, KEY, seen, version="cafe")
+        director = RemoteDirector(session, KEY, version="cafe")
         assert [director.react(query(tick)) for tick in range(100)] == [
             echo(query(tick)) for tick in range(100)
         ]
         assert open_sockets() <= before and threads == {threading.get_ident()}
         with pytest.raises(EngineError, match="'feed' met behaviours 'cafe'"):
-            RemoteDirector(session, KEY, by="feed").react(query())
-        with pytest.raises(EngineError, match=r"nobody answered .* for 0\.5 s"):
+            RemoteDirector(session, KEY, version="feed").react(query())
+        with pytest.raises(EngineError, match=r"no reply .* within 0\.5 s"):
             RemoteDirector(session, keys.director("test", "nobody"), wait_s=0.5).react(query())
 
 
@@ -128,7 +128,7 @@ def test_a_missing_director_is_waited_for_and_then_lost(tmp_path: Path) -> None:
     """A query to a missing director is retried until its timeout and then fails."""
     with listening_at(endpoint(tmp_path)), connected_to(endpoint(tmp_path)) as client:
         began = time.monotonic()
-        with pytest.raises(DirectorLost, match=r"nobody answered .* for 0\.5 s"):
+        with pytest.raises(DirectorLost, match=r"no reply .* within 0\.5 s"):
             RemoteDirector(client, KEY, wait_s=0.5).react(query())
         assert time.monotonic() - began > 0.4
 
@@ -216,15 +216,17 @@ def test_a_reply_that_cannot_be_meant_is_refused_in_words(
 def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) -> None:
     """Whatever it would do: both ends sign with their version, and each refuses the other's."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
-        serve_director(hub, KEY, echo, by=theirs)
+        serve_director(hub, KEY, echo, version=theirs)
         with pytest.raises(
             DirectorLost, match=f"'cafe' met behaviours '{theirs}': .* from the same code"
         ):
-            RemoteDirector(client, KEY, by="cafe").react(query())
+            RemoteDirector(client, KEY, version="cafe").react(query())
         lax = keys.director("test", "lax")
-        hub.serve(lax, lambda payload: sign(echo(verify_query(payload, "cafe")), theirs))
+        hub.serve(
+            lax, lambda payload: encode_versioned(echo(decode_query(payload, "cafe")), theirs)
+        )
         with pytest.raises(DirectorLost, match=f"'{theirs}' met behaviours 'cafe'"):
-            RemoteDirector(client, lax, by="cafe").react(query())
+            RemoteDirector(client, lax, version="cafe").react(query())
 
 
 def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
@@ -234,9 +236,9 @@ def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
         for run, env in (("a", "x"), ("b", "y")):
             assert RemoteDirector(client, keys.director(run, env)).react(query(2)).tick == 2
         with pytest.raises(EngineError, match="ask for exactly"):
-            client.ask(
+            client.query(
                 keys.director("a", "x").replace("a", "*", 1),
-                sign_query(query(), ""),
+                encode_query(query(), ""),
                 timeout_s=PATIENCE_S,
             )
 
@@ -251,8 +253,8 @@ def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None
     works."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
-        with pytest.raises(EngineError, match=r"not a (SignedMessage|QueryParts) message"):
-            client.ask(KEY, payload, timeout_s=PATIENCE_S)
+        with pytest.raises(EngineError, match=r"not a (VersionedMessage|QueryParts) message"):
+            client.query(KEY, payload, timeout_s=PATIENCE_S)
         assert RemoteDirector(client, KEY).react(query(3)).tick == 3
 
 
@@ -261,7 +263,7 @@ def test_a_wildcard_query_does_not_reach_a_director(tmp_path: Path) -> None:
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
         with pytest.raises(EngineError, match=f"ask for exactly '{KEY}'"):
-            client.ask("cosim/*/env/*/director", encode(query()), timeout_s=PATIENCE_S)
+            client.query("cosim/*/env/*/director", encode(query()), timeout_s=PATIENCE_S)
 
 
 def test_nobody_to_connect_to_is_an_error_with_the_endpoint(
@@ -288,9 +290,9 @@ def test_a_query_holds_its_own_events_however_often_others_are_asked_between() -
         msgspec.structs.replace(query(k), events=(event(route_s_m=5.0 + k % 2),) * (k % 3))
         for k in range(12)
     ]
-    assert [verify_query(sign_query(one, "cafe"), "cafe") for one in queries] == queries
+    assert [decode_query(encode_query(one, "cafe"), "cafe") for one in queries] == queries
     wrong = encode(event()).replace(b"\xa2e0", b"\xa2x0")
     parts = QueryParts(msgspec.Raw(encode(query())), msgspec.Raw(b"\x91" + wrong))
     for _ in range(2):
         with pytest.raises(EngineError, match="ids of event pedestrians start with 'e'"):
-            verify_query(sign(parts, "cafe"), "cafe")
+            decode_query(encode_versioned(parts, "cafe"), "cafe")

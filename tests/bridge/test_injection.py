@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 
-from bridge.live import LARGEST_B, answer_injection
+from bridge.live import MAX_MESSAGE_B, answer_injection
 from bridge.security.authority import issue, make_authority
 from cosim.core.geometry import Polyline, Pose
 from cosim.episode.interfaces import Director
@@ -258,7 +258,7 @@ def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
         ),
         (b"\x93\x01", ""),
         (b"[" * 60_000, ""),
-        (b"x" * (LARGEST_B + 1), f"at most {LARGEST_B}"),
+        (b"x" * (MAX_MESSAGE_B + 1), f"at most {MAX_MESSAGE_B}"),
         (b"", ""),
     ],
     ids=[
@@ -565,8 +565,8 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(
     assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
     said = json.loads(vandal.stdout)
     for name, words in {
-        "10 MB": f"at most {LARGEST_B}",
-        "10 MB of nothing": f"at most {LARGEST_B}",
+        "10 MB": f"at most {MAX_MESSAGE_B}",
+        "10 MB of nothing": f"at most {MAX_MESSAGE_B}",
         "NaN": "malformed",
         "outside": "not on this map",
         "too fast": "at most 3, not 30",

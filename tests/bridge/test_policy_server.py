@@ -235,19 +235,19 @@ def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
     hub: Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server is lost a fixed time after its link was cut, however long its answer took before."""
-    ask_once = Session.ask_once
+    query_once = Session.query_once
     cuts = ["one"]
 
     def cut_once(session: Session, key: str, payload: bytes, *, timeout_s: float) -> QueryResult:
         if not cuts:
-            return ask_once(session, key, payload, timeout_s=timeout_s)
+            return query_once(session, key, payload, timeout_s=timeout_s)
         cuts.clear()
         time.sleep(0.6)
-        return QueryResult("nobody")
+        return QueryResult("unserved")
 
     with served(hub, Counting()), driver_at(hub, times=SOON) as driver:
         driver.reset("k1", 7)
-        monkeypatch.setattr(Session, "ask_once", cut_once)
+        monkeypatch.setattr(Session, "query_once", cut_once)
         assert driver.act(seen_at(0)) == Command(0.1, 0.0)
 
 
@@ -401,7 +401,7 @@ def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver, open_session(hub) as stranger:
         driver.reset("k1", 7)
-        (key,) = stranger.answers(
+        (key,) = stranger.query_all(
             f"{policy_key('default', 'counting', '*')}/info", timeout_s=PATIENCE_S
         )
         key = key.removesuffix("info") + "act"
@@ -412,10 +412,10 @@ def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -
             b"\x91" * 100_000,
             encode_message(ActRequest(*sign, 0, 0, 0.0, 0.0, 0.0)),
         ):
-            heard = stranger.ask_once(key, payload, timeout_s=PATIENCE_S)
-            assert heard.how == "refused" and isinstance(decode_reply(heard.payload), Refusal)
+            heard = stranger.query_once(key, payload, timeout_s=PATIENCE_S)
+            assert heard.outcome == "refused" and isinstance(decode_reply(heard.payload), Refusal)
         everybody = key.rpartition("/")[0].rpartition("/")[0] + "/**"
-        assert stranger.ask_once(everybody, b"", timeout_s=PATIENCE_S).how in (
+        assert stranger.query_once(everybody, b"", timeout_s=PATIENCE_S).outcome in (
             "refused",
             "answered",
         )
@@ -481,7 +481,7 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
 def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:
     """`serve` refuses it, and no endpoint, and two, and a name that cannot stand in a key."""
     with pytest.raises(
-        ValueError, match="is beyond this machine and unguarded: whoever can reach it may ask"
+        ValueError, match="is beyond this machine and unguarded: anyone who can reach it may query"
     ):
         serve(Counting(), listen="tcp/0.0.0.0:7449")
     for ends in (

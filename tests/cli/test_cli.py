@@ -195,7 +195,7 @@ def test_a_run_prints_its_table_and_leaves_its_folder(
     )
     assert (
         other.returncode == 2
-        and "is 3 of 3 (all), now asked for is 2 of 3 (--episodes 2)." in other.stderr
+        and "is 3 of 3 (all), and this command has 2 of 3 (--episodes 2)." in other.stderr
     )
     again = cosim("score", "whole", cwd=desk)
     assert (
@@ -506,7 +506,7 @@ def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(
     assert f"Seed {seed}: " in cosim(*words, "--resume", cwd=desk).stderr
     refused = cosim(*words, "--resume", "--seed", "3", cwd=desk)
     assert refused.returncode == 2
-    assert f"its seed is {seed}, now asked for is 3" in refused.stderr
+    assert f"its seed is {seed}, and this command has 3" in refused.stderr
 
 
 def test_the_record_says_what_it_was_made_with(whole_run: Path) -> None:

@@ -49,6 +49,6 @@ def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim
     assert run("one", "--scenario", "lateral-001-decoy") == {"lateral-001-decoy"}
     assert run("one", "--scenario", "lateral-001-decoy", "--resume") == {"lateral-001-decoy"}
     said = cosim(*always, "--out", "events", "--resume", cwd=tmp_path)
-    assert "2 of 4 (--no-decoys), now asked for is 4 of 4 (all)" in said.stderr, said
+    assert "2 of 4 (--no-decoys), and this command has 4 of 4 (all)" in said.stderr, said
     said = cosim("list", few.name, cwd=tmp_path)
     assert "decoy of" in said.stdout and "lateral-001-decoy" in said.stdout

@@ -84,7 +84,7 @@ def test_values_that_contradict_each_other_are_refused(
     ("more", "told"),
     [
         ((), "used already holds a run. Add --resume to finish it"),
-        (("--resume",), "used is of another run: its suite is s, now asked for is reactive"),
+        (("--resume",), "used is of another run: its suite is s, and this command has reactive"),
         (("--map", "sumo-a10kw"), "used already holds a run"),
     ],
     ids=["new", "resumed", "on a map"],

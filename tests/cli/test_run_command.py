@@ -164,7 +164,7 @@ def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim)
     weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=desk)
     assert (
         weak.returncode == 2
-        and f"its policy_runs is {kind}, now asked for is isolated: weak" in weak.stderr
+        and f"its policy_runs is {kind}, and this command has isolated: weak" in weak.stderr
     ), weak.stderr
     by_module = ("run", suite, "--policy", "far:Far", "--isolated", "--out", out, "--resume")
     again = cosim(*by_module, cwd=desk / "deeper")

@@ -162,7 +162,7 @@ def test_a_cache_that_cannot_be_written_is_reported_once(
     make = Maker()
     assert same(get("a", "0_0", make)) and same(get("a", "0_0", make)) and make.times == 2
     said = capsys.readouterr().err
-    assert said.startswith("note: ") and "not kept" in said and len(said.splitlines()) == 1
+    assert said.startswith("note: ") and "not cached" in said and len(said.splitlines()) == 1
 
 
 @both

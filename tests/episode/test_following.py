@@ -26,7 +26,7 @@ def log_of(*answers: tuple[int, int, Command]) -> Log:
     """Ten ticks of a log with answers: their ticks, delays, and commands."""
     commands = CommandDelay()
     for answer in answers:
-        commands.answered(*answer)
+        commands.add(*answer)
     sizes, points, index = commands.plans
     log = driven(short_way("s-000"), [1.0] * 10)
     return dataclasses.replace(
@@ -88,7 +88,9 @@ def test_waypoints_are_followed_from_when_they_take_effect_until_others_do_or_th
     )
     assert following.follows == 2
     poses = [Pose(1.0, 2.0 + tick, math.pi / 2.0) for tick in range(9)]
-    came = [following.take(step_at(tick, pose), reset=tick == 7) for tick, pose in enumerate(poses)]
+    came = [
+        following.update(step_at(tick, pose), reset=tick == 7) for tick, pose in enumerate(poses)
+    ]
     assert [one is None for one in came] == [
         True,
         True,

@@ -74,7 +74,7 @@ def test_the_point_of_the_route_lies_5_to_20_m_along_it() -> None:
     assert point(told.at(Pose(15.0, 1.0, 0.0), 15.0)) == (5.0, -1.0)
     assert point(told.at(Pose(15.5, 1.0, NORTH), 15.5)) == (-1.0, -20.0)  # 35.5 m along: (35.5, 0)
     assert point(told.at(Pose(31.0, 0.0, 0.0), 31.0)) == (9.0, 11.0)  # 51 m along: (40, 11)
-    told.put_back()
+    told.on_reset()
     assert point(told.at(Pose(25.0, 0.0, 0.0), 25.0)) == (
         15.0,
         5.0,
@@ -128,7 +128,7 @@ def test_random_points_are_drawn_ahead_and_stay_where_they_are_until_reached_or_
     assert point(told.at(Pose(x_m - 0.9, y_m, 0.0), 9.0)) == second
     third = point(told.at(Pose(x_m - 0.9, y_m, math.pi), 9.0))
     assert 5.0 <= third[0] <= 20.0 and third != second
-    told.put_back()
+    told.on_reset()
     assert point(told.at(Pose(x_m - 0.9, y_m, math.pi), 9.0)) != third
 
 
@@ -140,7 +140,7 @@ def test_an_image_is_taken_at_the_next_sub_goal_and_only_when_there_is_another()
         looked.append(pose)
         return np.full((2, 2, 3), len(looked), np.uint8)
 
-    told = goals("image", look=look)
+    told = goals("image", take_picture=look)
     seen = [told.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 5.0, 15.0, 16.0, 30.0, 32.0)]
     assert [one.rgb[0, 0, 0] for one in seen if isinstance(one, ImageGoal)] == [1, 1, 1, 2, 2, 3]
     assert [tuple(round(v, 9) for v in pose) for pose in looked] == [
@@ -277,7 +277,7 @@ def test_goals_are_the_same_for_the_same_seed(protocol: GoalProtocol) -> None:
             protocol,
             seed,
             size=(8, 6),
-            look=lambda pose: np.full((6, 8, 3), int(pose.x_m), np.uint8),
+            take_picture=lambda pose: np.full((6, 8, 3), int(pose.x_m), np.uint8),
         )
         along = [told.at(Pose(s_m, 0.5, 0.1), s_m) for s_m in np.arange(0.0, 40.0, 0.5).tolist()]
         return [
@@ -321,7 +321,7 @@ def test_goals_and_odometry_that_there_are_none_of_are_refused_with_the_valid_on
         UsageError, match=r"'blind' has no camera, and goal protocol 'image' .*one of none, route"
     ):
         with_goal(blind, "image")
-    with pytest.raises(UsageError, match="'blind' has cameras, but no camera"):
+    with pytest.raises(UsageError, match="'blind' has further cameras, but no main camera"):
         with_goal(Manifest("blind", camera=None, cameras={"left": CameraSpec()}), None)
     assert (
         with_goal(seeing, "image").goal == "image"

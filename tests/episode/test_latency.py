@@ -52,16 +52,16 @@ def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put
     put back."""
     way = CommandDelay()
     told = [Command(float(v), 0.0) for v in (1, 2, 3)]
-    way.answered(0, 7, told[0])
+    way.add(0, 7, told[0])
     assert [way.at(tick) for tick in (0, 4)] == [STILL, STILL]
-    way.answered(5, 7, told[1])
+    way.add(5, 7, told[1])
     assert [way.at(tick) for tick in (6, 7, 9)] == [STILL, told[0], told[0]]
-    way.answered(10, 7, told[2])
+    way.add(10, 7, told[2])
     assert [way.at(tick) for tick in (11, 12)] == [told[0], told[1]]
-    way.put_back()
+    way.on_reset()
     assert (way.at(13), way.at(17)) == (STILL, STILL)
     assert way.answers.tolist() == [[0, 7, 1, 0], [5, 7, 2, 0], [10, 7, 3, 0]]
-    way.answered(20, 0, told[0])
+    way.add(20, 0, told[0])
     assert way.at(20) == told[0]
 
 
@@ -236,7 +236,7 @@ def test_a_measured_latency_is_that_of_every_command_of_the_run(
     other = cosim(*words, "--resume", cwd=tmp_path)
     assert (
         other.returncode == 2
-        and f"its latency_ms is {latency_ms}, now asked for is 0.0" in other.stderr
+        and f"its latency_ms is {latency_ms}, and this command has 0.0" in other.stderr
     )
 
 

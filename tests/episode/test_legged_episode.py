@@ -53,7 +53,7 @@ def walked(scenario: Scenario, robot: str, push_ns: float) -> RecordedEpisode:
 
     def push(step: Step, verdict: Verdict) -> None:
         if step.tick == PUSH_TICK and push_ns:
-            bodies = stages[0].parts.world._engine  # type: ignore[attr-defined]
+            bodies = stages[0].engines.world._engine  # type: ignore[attr-defined]
             heading = step.motion.robot.pose.heading_rad
             force = push_ns / 0.005 * np.array([-math.sin(heading), math.cos(heading), 0.0])
             (x, y, z), _ = p.getBasePositionAndOrientation(bodies._robot, bodies._client)
@@ -105,7 +105,7 @@ def test_a_body_that_flies_makes_the_episode_invalid_with_the_engines_values(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where every height counts as flying, the row says so; it is no failure of the policy."""
-    monkeypatch.setattr("physics.dynamics.legs.watch._FLIES_M", -1.0)
+    monkeypatch.setattr("physics.dynamics.legs.leg_monitor._FLIES_M", -1.0)
     suite = Suite(name="one", version="1", scenarios=(scenario,))
     options = EpisodeOptions(seed=0, robot=LEGGED[0])
     (row,) = cosim.run(suite, Straight(), options=options).to_dict("records")

@@ -86,7 +86,7 @@ def observed(
     """What a policy is given in a street with two people."""
     eye = None if manifest.camera is None else Eye(manifest.camera)
     observer = observing(manifest, seed, known)
-    return observer.observed(now or moment(), 1.0, eye, put_back=False)[0]
+    return observer.observed(now or moment(), 1.0, eye, was_reset=False)[0]
 
 
 def observing(
@@ -241,11 +241,11 @@ def test_a_reset_gives_another_random_point_and_is_not_counted_by_the_wheels() -
     ahead of it."""
     observer = observing(Manifest("mine", camera=None, goal="random_point", odometry="wheel"))
     start, there, back = (Pose(101.3 + d, 57.7, 0.0) for d in (0.0, 2.0, -4.0))
-    first = observer.observed(moment(0, start), 0.0, None, put_back=False)[0].goal
-    observer.moved(drove(start, there), put_back=False)
-    kept = observer.observed(moment(5, there), 0.25, None, put_back=False)[0].goal
-    observer.moved(drove(there, there), put_back=True)
-    seen = observer.observed(moment(6, back), 0.3, None, put_back=True)[0]
+    first = observer.observed(moment(0, start), 0.0, None, was_reset=False)[0].goal
+    observer.moved(drove(start, there), is_reset=False)
+    kept = observer.observed(moment(5, there), 0.25, None, was_reset=False)[0].goal
+    observer.moved(drove(there, there), is_reset=True)
+    seen = observer.observed(moment(6, back), 0.3, None, was_reset=True)[0]
     assert (
         isinstance(first, PointGoal)
         and isinstance(kept, PointGoal)

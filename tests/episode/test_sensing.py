@@ -133,7 +133,7 @@ def test_neighbours_swap_ids_and_the_lost_get_new_ones() -> None:
     for time_s, shown in (*seen, (4.1, street)):
         found.append(tracker.read(ROBOT, shown, time_s).ids.tolist())
     assert found == [[0], [], [0], [0], [], [1]]
-    tracker.put_back()
+    tracker.on_reset()
     assert tracker.read(ROBOT, street, 4.2).ids.tolist() == [2]
 
 

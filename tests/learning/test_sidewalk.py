@@ -153,7 +153,7 @@ def test_a_run_feeds_the_graph_the_windows_of_training(data: Path) -> None:
             np.testing.assert_allclose(fed[name][0], getattr(batch, name)[0, row], atol=1e-6)
         assert fed["memory"].any() == (row > 0)
         feeder.remember({"memory_next": np.ones((1, MEMORY), np.float32)})
-    feeder.forget()
+    feeder.clear()
     assert not feeder.feed(
         Observation(0, 0.0, packed.frames[0], 0.0, 0.0, COURIER, goal=PointGoal(1.0, 0.0))
     )["memory"].any()

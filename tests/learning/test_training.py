@@ -286,7 +286,7 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
         zip(packed.frames, packed.state, packed.goal, strict=True)
     ):
         if packed.frame[row] == 0:
-            feeder.forget()
+            feeder.clear()
         v_mps, w_radps, x_m, y_m = map(float, (*speeds, *goal))
         fed = feeder.feed(
             Observation(row, 0.0, rgb, v_mps, w_radps, COURIER, goal=PointGoal(x_m, y_m))

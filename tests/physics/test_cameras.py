@@ -54,7 +54,9 @@ def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
     with RunFolder.create(tmp_path / "run", spec, suite):
         pass
     other = spec_of(suite, renderer="gl: other")
-    with pytest.raises(RunError, match="its renderer is bullet-tiny, now asked for is gl: other"):
+    with pytest.raises(
+        RunError, match="its renderer is bullet-tiny, and this command has gl: other"
+    ):
         RunFolder.resume(tmp_path / "run", other)
 
 

@@ -34,7 +34,7 @@ from cosim.policies.onnx.manifest import file_facts
 from cosim.policies.onnx.torch_file import read_torch_file
 from cosim.policies.onnx.weights import NetworkFile
 from cosim.spec.robot import COURIER, DOG, WALKER, Legs
-from physics.dynamics.drive import SUBSTEP_S, BodyNow
+from physics.dynamics.drive import SUBSTEP_S, MeasuredBody
 from physics.dynamics.drives import drive_of, gait_drive
 from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_file import published_gait, user_gait, weights_in_words
@@ -187,7 +187,7 @@ def test_a_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
         graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
         for k in range(5):
             given = 3.0 * normal(k, inputs)
-            expected = graph.ask({"obs": given[None]}, ["actions"])["actions"][0]
+            expected = graph.run({"obs": given[None]}, ["actions"])["actions"][0]
             assert network.answer(given, ())[0] == pytest.approx(expected, abs=1e-5)
 
 
@@ -226,7 +226,7 @@ def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
     held = {"h_in": np.zeros((1, 1, 8), np.float32), "c_in": np.zeros((1, 1, 8), np.float32)}
     for k in range(6):
         given = 3.0 * normal(10 + k, 5)
-        found = graph.ask({"obs": given[None], **held}, ["actions", "h_out", "c_out"])
+        found = graph.run({"obs": given[None], **held}, ["actions", "h_out", "c_out"])
         held = {"h_in": found["h_out"], "c_in": found["c_out"]}
         answer, state = network.answer(given, state)
         assert answer == pytest.approx(found["actions"][0], abs=1e-5)
@@ -398,16 +398,18 @@ def test_speeds_of_a_gait_are_averaged_over_its_own_cycle(tmp_path: Path) -> Non
         assert drive.cycle_s == cycle_s
         with BulletWorld(FLAT, robot=DOG, drive=drive) as world:
             world.place(Pose(0.0, 0.0, 0.0))
-            assert world._watch is not None and world._watch._count == round(cycle_s / SUBSTEP_S)
+            assert world._leg_monitor is not None and world._leg_monitor._count == round(
+                cycle_s / SUBSTEP_S
+            )
 
 
-def still_body(**changes: Any) -> BodyNow:
+def still_body(**changes: Any) -> MeasuredBody:
     """A dog at rest."""
     assert isinstance(DOG.drive, Legs)
     rest = DOG.drive.rest_rad
     level = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     zero = (0.0, 0.0, 0.0)
-    return BodyNow(zero, level, zero, zero, rest, (0.0,) * 12)._replace(**changes)
+    return MeasuredBody(zero, level, zero, zero, rest, (0.0,) * 12)._replace(**changes)
 
 
 def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy(
@@ -439,7 +441,7 @@ class Fixed:
     def reset(self) -> None:
         pass
 
-    def step(self, command: Command, body: BodyNow) -> list[float]:
+    def step(self, command: Command, body: MeasuredBody) -> list[float]:
         return self._torques_nm
 
 

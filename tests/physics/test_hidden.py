@@ -57,7 +57,7 @@ def test_who_is_seen_has_pixels_and_who_is_hidden_has_none(
         eye = camera_position(robot, mount)
         points = body_points(eye, np.array(at), robot.z_m)
         inside = points[in_picture(robot.pose, mount, STANDARD_CAMERA, points - eye)]
-        unhidden = (~world.hidden(eye, inside)).sum() / len(points)
+        unhidden = (~world.occluded(eye, inside)).sum() / len(points)
         with camera_of("bullet", world, STANDARD_CAMERA) as camera:
             pixels = (camera.render(robot, street).labels == LABELS["person"]).sum()
     assert (unhidden >= 0.1) == shown and (pixels >= 3) == shown

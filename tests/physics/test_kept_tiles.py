@@ -57,7 +57,7 @@ def hilly(street_map: StreetMap) -> StreetMap:
     heights = np.random.default_rng(1).uniform(0.0, 3.0, (30, 30)).astype(np.float32)
     return dataclasses.replace(
         street_map, terrain=Terrain(-50.0, -50.0, 25.0, heights)
-    ).with_source_hash("hilly")
+    ).with_input_hash("hilly")
 
 
 def equal(one: object, other: object) -> bool:
@@ -94,7 +94,7 @@ def test_a_tile_that_is_read_is_the_one_that_is_made(
     street_map = hilly(street_map) if ground == "hilly" else street_map
     roughness = 0.6 if ground == "rough" else 0.0
     unkept = dataclasses.replace(street_map)
-    assert street_map.made_of and not unkept.made_of
+    assert street_map.input_hash and not unkept.input_hash
     keys = tiles_within(250.0, 250.0, 15.0)
     made = StreetSurface(unkept, 3, roughness)
     tiles = [made._built(key) for key in keys]

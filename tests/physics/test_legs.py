@@ -28,9 +28,9 @@ from physics.cameras.gl.robot_body import link_parts
 from physics.cameras.posture import posture_of
 from physics.cameras.view import robot_shot
 from physics.dynamics.bullet import p
-from physics.dynamics.drive import BodyNow, Drive, Motors
+from physics.dynamics.drive import Drive, MeasuredBody, Motors
+from physics.dynamics.legs.leg_monitor import LegMonitor
 from physics.dynamics.legs.trot import leg_angles
-from physics.dynamics.legs.watch import LegWatch
 from physics.dynamics.world import BulletWorld
 from physics.robots import urdf_path
 from physics.robots.dog import SEGMENT_M, THIGH_ASIDE_M
@@ -303,16 +303,16 @@ def test_a_low_fence_is_a_collision_of_the_legs_and_the_ground_is_none(robot: Ro
 def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
     """The error has the engine's values; a robot that lies or stands is sound."""
     legs = legs_of(robot)
-    watch = LegWatch(legs, legs.cycle_s, 0.005)
+    monitor = LegMonitor(legs, legs.cycle_s, 0.005)
     for z_m, sound in ((0.0, True), (-legs.stand_m, True), (-2.0, False), (5.0, False)):
         state = RobotState(Pose(1.0, 2.0, 0.0), z_m=z_m)
         if sound:
-            assert watch.judged(state, 0.0, touches=False)[1] == (z_m < 0.0)
+            assert monitor.assess(state, 0.0, touches=False)[1] == (z_m < 0.0)
         else:
             with pytest.raises(EngineError, match=r"at \(1, 2, .*it sinks or flies"):
-                watch.judged(state, 0.0, touches=False)
+                monitor.assess(state, 0.0, touches=False)
     with pytest.raises(EngineError, match="nan"):
-        watch.judged(RobotState(Pose(1.0, 2.0, 0.0), z_m=math.nan), 0.0, touches=False)
+        monitor.assess(RobotState(Pose(1.0, 2.0, 0.0), z_m=math.nan), 0.0, touches=False)
 
 
 class Broken:
@@ -324,7 +324,7 @@ class Broken:
     def reset(self) -> None:
         pass
 
-    def step(self, command: Command, body: BodyNow) -> Motors:
+    def step(self, command: Command, body: MeasuredBody) -> Motors:
         return Motors([math.nan] * len(body.angles_rad))
 
 

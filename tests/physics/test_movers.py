@@ -49,11 +49,11 @@ def test_who_comes_near_is_who_is_near_at_either_end_of_the_tick(who_changes: bo
         assert [mover.id for mover in found] == list(expected)
         for mover in found:
             start, change = expected[mover.id]
-            ways = np.array(mover.way(10))
+            ways = np.array(mover.poses(10))
             assert (ways == start + (np.arange(1, 11) / 10)[:, None] * change).all()
             nearest_m = np.hypot(*(ways[:, :2] - (x, y)).T).min() - 0.5 * math.hypot(*mover.size_m)
-            assert mover.passes(x, y, nearest_m + 1e-6)
-            assert not mover.passes(x, y, nearest_m - 2.0 * math.hypot(*change[:2]) - 1e-6)
+            assert mover.may_come_within(x, y, nearest_m + 1e-6)
+            assert not mover.may_come_within(x, y, nearest_m - 2.0 * math.hypot(*change[:2]) - 1e-6)
         seen += len(found)
     assert seen > 500
 
@@ -68,4 +68,4 @@ def test_a_vehicle_has_its_own_size() -> None:
     )
     bus, car = movers_near(before, after, 0.0, 0.0, 10.0)
     assert (bus.id, bus.size_m, car.size_m) == ("b", (12.0, 2.5), (4.0, 1.8))
-    assert bus.way(2) == [(1.0, 0.25, 0.0), (1.0, 0.5, 0.0)]
+    assert bus.poses(2) == [(1.0, 0.25, 0.0), (1.0, 0.5, 0.0)]

@@ -102,7 +102,7 @@ def test_a_scanned_wall_stops_a_robot_and_hides_people() -> None:
         assert motions[-1].robot.pose.x_m < WALL_X_M
         eye = np.array([0.0, 0.0, 1.0])
         points = np.array([[WALL_X_M + 2.0, 0.0, 1.0], [WALL_X_M - 2.0, 0.0, 1.0]])
-        assert world.hidden(eye, points).tolist() == [True, False]
+        assert world.occluded(eye, points).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(("kind", "value"), [("sidewalk", 0.9), ("verge", 0.7)])

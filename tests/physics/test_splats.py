@@ -384,4 +384,4 @@ def test_the_appearance_is_part_of_the_renderer() -> None:
     names = [renderer_of("gl", look) for look in APPEARANCES]
     assert names[0] == renderer_of("gl") != names[1]
     assert renderer_of("bullet", "mesh") == renderer_of("bullet")
-    assert EpisodeOptions.asked(RunConfig(appearance="mesh")).appearance == "mesh"
+    assert EpisodeOptions.from_config(RunConfig(appearance="mesh")).appearance == "mesh"

@@ -23,11 +23,11 @@ from cosim.results.compare import (
     compare_runs,
     groups_of,
 )
-from cosim.results.finished_run import read_whole_run
 from cosim.results.metrics import METRICS, WORST
 from cosim.results.record import Record, ScanLook
 from cosim.results.run_folder import RunFolder, read_records, read_spec
 from cosim.results.table import table_of, table_row
+from cosim.results.verified_run import read_verified_run
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario, read_suite
@@ -190,7 +190,7 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     ways = several(20)
     clear = run_of(tmp_path / "c", [GOALS] * 20, "p", ways)
     rain = run_of(tmp_path / "r", [HIT] * 20, "p", ways, weather="rain")
-    difference = read_spec(clear).apart(read_spec(rain))
+    difference = read_spec(clear).difference_from(read_spec(rain))
     assert difference is not None and difference[:3] == ("weather", "", "rain")
     told = compare_runs([clear, rain])
     assert (told.before.label, told.others[0].label) == ("p, own weather", "p, rain")
@@ -201,7 +201,7 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", said.stdout)
     assert (tmp_path / "weather.png").read_bytes().startswith(b"\x89PNG")
     printed = io.StringIO()
-    table = table_of(read_whole_run(rain).records.values())
+    table = table_of(read_verified_run(rain).records.values())
     print_table(Console(file=printed, width=200), table, 20, rain)
     assert printed.getvalue().count("weather rain") == 1
 
@@ -294,7 +294,7 @@ def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
     with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
         for record in read_records(run):
             other = fields if of in ("", record.scenario.id) else {}
-            folder.keep(
+            folder.write_episode(
                 changed(record, **other),
                 (run / f"episodes/{record.scenario.id}/trajectory.npz").read_bytes(),
             )
@@ -497,7 +497,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "no run": (
         lambda run: (run / "run.json").unlink(),
-        "{run} is no run folder: it holds no run.json. Runs in it and beside it: {first}",
+        "{run} is no run folder: it holds no run.json. Runs in it and next to it: {first}",
     ),
     "a damaged database": (
         lambda run: (run / "results.sqlite").write_bytes(b"nothing" * 500),

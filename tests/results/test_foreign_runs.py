@@ -78,9 +78,7 @@ def test_what_never_began_cannot_be_resumed(tmp_path: Path, cosim: Cosim) -> Non
     """Stopped before its folder was there, or before it was written: it is said how to begin it."""
     words = ("run", "reactive", "--policy", "straight", "--episodes", "1", "--out")
     said = cosim(*words, "mine", "--resume", "--seed", "1", cwd=tmp_path)
-    told = (
-        "mine: no run has begun there, so that nothing is kept: give the command of the run without"
-    )
+    told = "mine: no run has begun there, so there is nothing to resume: give the command of the run without"
     assert said.returncode == 2 and told in said.stderr.splitlines()[-1], said
     (tmp_path / "half" / "episodes").mkdir(parents=True)
     (tmp_path / "half" / "lock").touch()

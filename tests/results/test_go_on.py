@@ -39,7 +39,7 @@ def window_end(
         at_s = (tick + 1) / 20
         place = person(at_s)
         people = {} if place is None else {0: np.array([place, 1.0])}
-        window.see(tick, 8.0 + robot_mps * at_s, people)
+        window.update(tick, 8.0 + robot_mps * at_s, people)
     return window.end
 
 
@@ -76,7 +76,7 @@ def test_no_motion_gives_way_and_goes_on() -> None:
         for twin, away_m in ((event, 0.9), (decoy, 4.0)):
             window = PassingWindow(ROUTE, twin, EVENT_KINDS["overtaking"])
             for tick, s_m in enumerate(route_s_m.tolist()):
-                window.see(tick, s_m, {0: np.array([s_m + away_m, 0.0])})
+                window.update(tick, s_m, {0: np.array([s_m + away_m, 0.0])})
             ends.append(window.end)
         assert ends[0] == ends[1]
         end = ends[0] or 0

@@ -39,7 +39,7 @@ def kept(path: Path, spec: RunSpec, ways: Sequence[Scenario], wall_s: float = 1.
         for way in reversed(ways):
             record, log = episode_of(way, SUITE.content_hash, HOWS[way.id])
             record = msgspec.structs.replace(record, clock={"wall_s": wall_s})
-            folder.keep(record, log.encoded() if log is not None else b"")
+            folder.write_episode(record, log.encoded() if log is not None else b"")
     return path
 
 
@@ -48,7 +48,7 @@ def shards(folder: Path, of: int, **fields: object) -> list[Path]:
     them."""
     cut = [Shard(number, of) for number in range(1, of + 1)]
     return [
-        kept(folder / f"{one.number}", changed(SPEC, shard=one, **fields), one.share(WAYS))
+        kept(folder / f"{one.number}", changed(SPEC, shard=one, **fields), one.select(WAYS))
         for one in cut
     ]
 
@@ -120,7 +120,7 @@ def test_what_is_missing_is_named_and_can_be_run(tmp_path: Path, cosim: Cosim) -
     )
     assert not (tmp_path / "merged/results.csv").exists()
     with RunFolder.resume(tmp_path / "merged", SPEC) as folder:
-        assert folder.finished() == set(SPEC.scenarios) - {"s-001", "s-004"}
+        assert folder.finished_ids() == set(SPEC.scenarios) - {"s-001", "s-004"}
 
 
 def test_equal_episodes_are_taken_once(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_different_episodes_of_a_scenario_are_a_conflict(
             record = msgspec.structs.replace(record, state_hash="f00")
         else:
             log.pose[0, 2] += 1e-16
-        folder.keep(record, log.encoded())
+        folder.write_episode(record, log.encoded())
     said = cosim("merge", *map(str, parts), str(other), "--out", str(tmp_path / "merged"))
     assert said.returncode == 2 and not (tmp_path / "merged").exists()
     assert f"CONFLICT: {other} and {parts[0]} have different episodes of 's-002'" in said.stderr
@@ -172,7 +172,7 @@ def test_different_episodes_of_a_scenario_are_a_conflict(
         (
             "versions",
             {"numpy": "2", "arithmetic": "2e"},
-            "the processors or C libraries round differently",
+            "processors or C libraries of the two machines round differently",
         ),
     ],
     ids=["seed", "policy", "scenarios", "package", "arithmetic"],
@@ -217,9 +217,9 @@ def test_what_is_damaged_in_use_or_in_the_way_is_refused(tmp_path: Path) -> None
 def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
     """Another one, or the whole run, is refused: the shards are named as they are asked for."""
     (first, _) = shards(tmp_path, 2)
-    with pytest.raises(RunError, match="its shard is 1/2, now asked for is 2/2"):
+    with pytest.raises(RunError, match="its shard is 1/2, and this command has 2/2"):
         RunFolder.resume(first, msgspec.structs.replace(SPEC, shard=Shard(2, 2)))
-    with pytest.raises(RunError, match="its shard is 1/2, now asked for is None"):
+    with pytest.raises(RunError, match="its shard is 1/2, and this command has None"):
         RunFolder.resume(first, SPEC)
 
 
@@ -229,17 +229,17 @@ def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
 def test_a_shard_that_is_none_is_refused(words: str) -> None:
     """In one line that says how it is written."""
     with pytest.raises(UsageError, match="give i/n, with i from 1 to n"):
-        Shard.called(words, 100)
+        Shard.parse(words, 100)
 
 
 def test_shards_share_out_every_scenario_once() -> None:
     """Whatever they are cut in; of more shards than scenarios some would be empty, which is
     refused."""
     for of in range(1, 8):
-        cut = [Shard.called(f"{number}/{of}", 7).share(range(7)) for number in range(1, of + 1)]
+        cut = [Shard.parse(f"{number}/{of}", 7).select(range(7)) for number in range(1, of + 1)]
         assert sorted(itertools.chain(*cut)) == list(range(7)) and all(cut)
     with pytest.raises(UsageError, match="the run has 7 scenarios"):
-        Shard.called("1/8", 7)
+        Shard.parse("1/8", 7)
 
 
 def test_a_shard_needs_the_seed_of_its_run(cosim: Cosim) -> None:

@@ -19,8 +19,8 @@ import pytest
 from cosim.core.errors import MachineError, RunError, UsageError
 from cosim.results.log import COLUMNS, Log
 from cosim.results.metrics import METRICS
-from cosim.results.record import Record
-from cosim.results.run_folder import RunFolder, read_records, read_spec
+from cosim.results.record import Record, ScanLook
+from cosim.results.run_folder import RunFolder, read_records, read_spec, record_difference
 from cosim.results.run_setup import RunSetup
 from cosim.results.run_spec import Shard
 from cosim.results.table import summary_of, table_of, table_row
@@ -79,7 +79,7 @@ def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: 
     for name, order in (("a", (0, 1, 2)), ("b", (2, 0, 1))):
         with RunFolder.create(tmp_path / name, SPEC, SUITE) as folder:
             for i in order:
-                folder.add(record(f"s-{i}", wall_s=float(np.random.default_rng().random())))
+                folder.add_row(record(f"s-{i}", wall_s=float(np.random.default_rng().random())))
             folder.finish()
     assert (tmp_path / "a/results.csv").read_bytes() == (tmp_path / "b/results.csv").read_bytes()
 
@@ -94,7 +94,7 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "begun/episodes").mkdir(parents=True)
     (tmp_path / "begun/lock").touch()
     with RunFolder.create(tmp_path / "begun", SPEC, SUITE) as folder:
-        assert folder.finished() == set()
+        assert folder.finished_ids() == set()
     (tmp_path / "other").mkdir()
     (tmp_path / "other/photo.png").touch()
     with pytest.raises(RunError, match="is no run folder"):
@@ -132,9 +132,9 @@ def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     with RunFolder.create(Path("run"), SPEC, SUITE) as folder:
         monkeypatch.chdir("/")
-        folder.add(record("s-0"))
+        folder.add_row(record("s-0"))
         assert (
-            folder.finished() == {"s-0"}
+            folder.finished_ids() == {"s-0"}
             and folder.episode_folder("s-0") == tmp_path / "run/episodes/s-0"
         )
 
@@ -175,7 +175,7 @@ def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
     with pytest.raises(RunError) as caught:
         RunFolder.resume(tmp_path / "run", other)
     assert (
-        "its camera is front, 512 x 288 px, 60 deg, now asked for is mast, 512 x 288 px, 60 deg, "
+        "its camera is front, 512 x 288 px, 60 deg, and this command has mast, 512 x 288 px, 60 deg, "
         "crop 0 88 512 288. Resume with the same command"
     ) in str(caught.value)
     with RunFolder.resume(tmp_path / "run", spec) as again:
@@ -229,6 +229,12 @@ def odd_rows(database: Path) -> None:
         connection.execute("update episodes set record = '{'")
 
 
+def deep_rows(path: Path) -> None:
+    deep = '{"unknown": ' + "[" * 100_000 + "]" * 100_000 + "}"
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("update episodes set record = ?", (deep,))
+
+
 def null_rows(database: Path) -> None:
     with closing(sqlite3.connect(database)) as connection, connection:
         connection.execute("update episodes set record = null")
@@ -236,7 +242,7 @@ def null_rows(database: Path) -> None:
 
 DAMAGES = {
     damage.__name__: damage
-    for damage in (garbage, cut_off, overwritten, another_table, odd_rows, null_rows)
+    for damage in (garbage, cut_off, overwritten, another_table, odd_rows, null_rows, deep_rows)
 }
 
 
@@ -246,17 +252,15 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
     record on disk."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         for i in (2, 0):
-            folder.keep(record(f"s-{i}"), LOG)
+            folder.write_episode(record(f"s-{i}"), LOG)
             os.utime(folder.episode_folder(f"s-{i}") / "record.json", (0, 10 - i))
     DAMAGES[name](tmp_path / "run/results.sqlite")
-    with pytest.raises(
-        RunError, match=r"results\.sqlite is damaged .*--resume, which makes it anew"
-    ):
+    with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume, which builds it"):
         read_records(tmp_path / "run")
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
-        assert again.finished() == {"s-0", "s-2"}
+        assert again.finished_ids() == {"s-0", "s-2"}
         (note,) = again.notes
-        assert "results.sqlite was damaged (" in note and "made anew from 2 records" in note
+        assert "results.sqlite was damaged (" in note and "built again from 2 records" in note
     assert [r.scenario.id for r in read_records(tmp_path / "run")] == ["s-2", "s-0"]
     assert (tmp_path / "run/results.sqlite.damaged").exists()
 
@@ -264,14 +268,14 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
 def test_a_database_of_an_earlier_version_is_read_and_added_to(tmp_path: Path) -> None:
     """It has a column `row` with the table's row of each record, which is not read any more."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
-        folder.keep(record("s-0"), LOG)
+        folder.write_episode(record("s-0"), LOG)
     with closing(sqlite3.connect(tmp_path / "run/results.sqlite")) as database, database:
         database.execute("alter table episodes rename to new")
         database.execute("create table episodes (scenario text primary key, row text, record text)")
         database.execute("insert into episodes select scenario, '{}', record from new")
         database.execute("drop table new")
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
-        again.keep(record("s-1"), LOG)
+        again.write_episode(record("s-1"), LOG)
         assert again.notes == [] and [*again.finish()["scenario"]] == ["s-0", "s-1"]
 
 
@@ -288,7 +292,7 @@ def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write
         shard=Shard(1, 2),
     )
     with RunFolder.create(tmp_path / "run", spec, SUITE) as folder:
-        folder.keep(
+        folder.write_episode(
             msgspec.structs.replace(record("s-0"), setup=spec.setup, manifest=spec.manifest), LOG
         )
     path = tmp_path / "run/episodes/s-0/record.json"
@@ -345,7 +349,7 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
             "import os, sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]);from "
             "test_run_folder import *; held = RunFolder.create(Path(sys.argv[1]), SPEC, "
             "SUITE).__enter__();keep = sqlite3.connect(held.path / 'results.sqlite'); "
-            "keep.execute('select * from episodes').fetchall();held.keep(record('s-1'), LOG); "
+            "keep.execute('select * from episodes').fetchall();held.write_episode(record('s-1'), LOG); "
             "os.kill(os.getpid(), 9)"
         )
         killed = subprocess.run(
@@ -354,7 +358,7 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
         assert killed.returncode == -9 and (path / "results.sqlite-wal").stat().st_size > 0
         (path / lost).unlink()
         with RunFolder.resume(path, SPEC) as again:
-            assert again.finished() == {"s-1"}
+            assert again.finished_ids() == {"s-1"}
         assert [r.scenario.id for r in read_records(path)] == ["s-1"]
 
 
@@ -396,9 +400,9 @@ def test_a_run_folder_that_is_damaged_during_a_run_loses_no_row(
     """Its rows, records and spec are written again, and it can be resumed."""
     run = tmp_path / "run"
     with RunFolder.create(run, SPEC, SUITE) as folder:
-        folder.keep(record("s-0"), LOG)
+        folder.write_episode(record("s-0"), LOG)
         HARM[damage](run)
-        folder.keep(record("s-1"), LOG)
+        folder.write_episode(record("s-1"), LOG)
         HARM[damage](run)
         assert folder.finish()["scenario"].tolist() == ["s-0", "s-1"]
     assert {one.scenario.id: one for one in read_records(run)} == {
@@ -407,7 +411,7 @@ def test_a_run_folder_that_is_damaged_during_a_run_loses_no_row(
     assert Record.load(run / "episodes/s-0/record.json") == record("s-0")
     assert not (tmp_path / "moved").exists()
     with RunFolder.resume(run, SPEC) as again:
-        assert again.finished() >= ({"s-0", "s-1"} if damage != "deleted" else set())
+        assert again.finished_ids() >= ({"s-0", "s-1"} if damage != "deleted" else set())
 
 
 def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> None:
@@ -430,7 +434,7 @@ def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
         on_disk(folder, record("s-2"), "s-1")
         on_disk(folder, record("s-2"))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
-        assert again.finished() == {"s-2"}
+        assert again.finished_ids() == {"s-2"}
         assert len(again.notes) == 2 and all(
             note.endswith("This episode is run again.") for note in again.notes
         )
@@ -444,8 +448,8 @@ def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> N
         for name in ("trajectory.npz", "trajectory.npz.part", "record.json.part"):
             (folder.episode_folder("s-0") / name).write_bytes(b"of the first attempt")
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
-        again.forget("s-0")
-        again.keep(record("s-0", status="crashed"))
+        again.delete_episode("s-0")
+        again.write_episode(record("s-0", status="crashed"))
         assert [path.name for path in again.episode_folder("s-0").iterdir()] == ["record.json"]
 
 
@@ -454,12 +458,12 @@ def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> 
     its row's does not."""
     folder = RunFolder.create(tmp_path / "run", SPEC, SUITE)
     with folder:
-        folder.add(record("s-0", success=1.0))
+        folder.add_row(record("s-0", success=1.0))
         for name in ("s-0", "s-1"):
             on_disk(folder, record(name, success=0.0))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert (
-            again.finished() == {"s-1"}
+            again.finished_ids() == {"s-1"}
             and "not what results.sqlite has of this episode" in again.notes[0]
         )
     assert {r.scenario.id: r.measures["success"] for r in read_records(tmp_path / "run")} == {
@@ -491,7 +495,7 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
         ("other", "unknown run '{run}'. Valid choices: {beside}/mine. Did you mean"),
         (
             "runs",
-            "{run} is no run folder: it holds no run.json. Runs in it and beside it: "
+            "{run} is no run folder: it holds no run.json. Runs in it and next to it: "
             "{beside}/mine, {run}/theirs",
         ),
         ("file", "{run} is no run folder: a file is there, and a run is a folder with run.json"),
@@ -545,10 +549,18 @@ def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
     """Asked for one, `cosim show` refuses in words; without, it tells what became of the
     episode."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as held:
-        held.keep(record("s-0", status="crashed"))
+        held.write_episode(record("s-0", status="crashed"))
     said = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
     assert (
         said.returncode == 2 and "episode 's-0' is crashed: it has no track to draw" in said.stderr
     )
     assert not (tmp_path / "above.png").exists()
     assert cosim("show", "run", "--episode", "s-0", cwd=tmp_path).returncode == 0
+
+
+def test_records_differ_if_only_one_has_a_scan() -> None:
+    """The difference is described in both orders, also if the first record has the scan."""
+    plain = record("s-0")
+    scanned = msgspec.structs.replace(plain, scan=ScanLook(appearance="splats"))
+    assert record_difference(plain, scanned).startswith("scan is None, there {'appearance'")
+    assert record_difference(scanned, plain).endswith("there None")

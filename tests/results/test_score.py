@@ -267,11 +267,11 @@ def test_a_damaged_episode_is_refused_and_run_again(
         and "give the command of the run again with --resume, which" in told
     )
     with RunFolder.resume(run, read_spec(run)) as folder:
-        assert folder.finished() == {"s-000", "s-002", "s-003"}
+        assert folder.finished_ids() == {"s-000", "s-002", "s-003"}
         (note,) = folder.notes
         assert note.startswith(f"{file}: ") and note.endswith(". This episode is run again.")
     with RunFolder.resume(run, read_spec(run)) as again:
-        assert again.finished() == {"s-000", "s-002", "s-003"}
+        assert again.finished_ids() == {"s-000", "s-002", "s-003"}
 
 
 def test_what_is_no_run_is_told_with_a_remedy(tmp_path: Path, cosim: Cosim) -> None:
@@ -322,7 +322,9 @@ def test_another_metric_schema_is_refused(tmp_path: Path, cosim: Cosim) -> None:
     shown = cosim("show", str(run))
     assert shown.returncode == 0 and "its values are shown as recorded" in shown.stdout
     rewrite(run, "s-000", lambda record: record.pop("metric_schema"))
-    assert "are of an earlier version, which did not tell its metric schema" in refusal(cosim, run)
+    assert "are of an earlier version, which did not record its metric schema" in refusal(
+        cosim, run
+    )
 
 
 @pytest.mark.engine

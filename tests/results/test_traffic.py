@@ -73,7 +73,7 @@ def test_the_carriageway_is_the_road_and_the_red_crossing(
 ) -> None:
     """On the road, on a green, a red and an unsignalised crossing, and beside the road."""
     after = street(8.0, walk)
-    assert TrafficMonitor(MAP, 0.05).see(step(0, x_m, y_m, after, after)).carriageway is on_road
+    assert TrafficMonitor(MAP, 0.05).update(step(0, x_m, y_m, after, after)).carriageway is on_road
 
 
 def test_a_vehicle_that_brakes_for_the_robot_counts_once() -> None:
@@ -81,7 +81,7 @@ def test_a_vehicle_that_brakes_for_the_robot_counts_once() -> None:
     after two seconds."""
     roadway = TrafficMonitor(MAP, 0.05)
     ticks = (0, 1, 2, 60)
-    seen = [roadway.see(step(tick, 12.0, 0.5, street(8.0), street(7.85))) for tick in ticks]
+    seen = [roadway.update(step(tick, 12.0, 0.5, street(8.0), street(7.85))) for tick in ticks]
     assert seen == [RoadState(True, 1), RoadState(True, 0), RoadState(True, 0), RoadState(True, 1)]
 
 
@@ -100,7 +100,7 @@ def test_a_green_crossing_makes_nobody_brake() -> None:
     """Cars that stop while the robot crosses at green stop for their own light; at red they stop
     for the robot."""
     for walk, braked in ((True, 0), (False, 1)):
-        seen = TrafficMonitor(MAP, 0.05).see(
+        seen = TrafficMonitor(MAP, 0.05).update(
             step(0, 20.0, 0.5, street(8.0, walk), street(7.8, walk))
         )
         assert seen.braked == braked
@@ -138,7 +138,7 @@ def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
     for tick, (x_m, y_m) in enumerate(walk.tolist()):
         after = street(7.7, tick % 2 == 0)
         this = step(100 * tick, x_m, y_m, street(8.0, tick % 2 == 0), after)
-        assert kept.see(this) == TrafficMonitor(street_map, 0.05).see(this)
+        assert kept.update(this) == TrafficMonitor(street_map, 0.05).update(this)
         if tick == 99:
             assert len(looks) == 1
 
@@ -150,7 +150,7 @@ def test_who_waits_on_the_seam_before_a_red_crossing_is_not_on_the_road() -> Non
     street_map = StreetMap("m", MAP.bounds, {":j_c0": seamed}, {}, {}, {})
     after = street(0.0, walk=False)
     seen = [
-        TrafficMonitor(street_map, 0.05).see(step(0, 20.0, y_m, after, after)).carriageway
+        TrafficMonitor(street_map, 0.05).update(step(0, 20.0, y_m, after, after)).carriageway
         for y_m in (4.3, 3.9, -4.3)
     ]
     assert seen == [False, True, False]

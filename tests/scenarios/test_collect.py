@@ -189,13 +189,16 @@ def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
     [
         (
             ("--resume", "--noise", "0.1"),
-            "is of another data set: its noise is 0.3, now asked for is 0.1.",
+            "is of another data set: its noise is 0.3, and this command has 0.1.",
         ),
         (
             ("--resume", "--policy", "social_force"),
-            "its policy is orca, now asked for is social_force.",
+            "its policy is orca, and this command has social_force.",
         ),
-        (("--resume", "--seed", "5"), "is of another data set: its seed is 0, now asked for is 5."),
+        (
+            ("--resume", "--seed", "5"),
+            "is of another data set: its seed is 0, and this command has 5.",
+        ),
         ((), "demos already holds a data set, or a part of one. Add --resume"),
         (("--out", "."), ". exists and is no data set. Choose another --out."),
         (("--goal", "image"), "give --goal, one of none, route_point, final_point, instruction"),
@@ -425,7 +428,7 @@ def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
     said = cosim(*asked, "--learner", "beside:Another", "--resume", cwd=desk.folder)
     assert (
         said.returncode == 2
-        and "its learner is beside:Learner, now asked for is beside:Another" in said.stderr
+        and "its learner is beside:Learner, and this command has beside:Another" in said.stderr
     )
     (desk.folder / "beside.py").write_text(BESIDE.replace("0.7", "0.6"))
     said = cosim(*asked, "--learner", "beside:Learner", "--resume", cwd=desk.folder)

@@ -118,7 +118,7 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(
     scored = cosim("score", "asked", cwd=tmp_path)
     assert (
         scored.returncode == 0
-        and "no trajectory tells people_delay_s, people_compared," in scored.stdout
+        and "not computed from trajectories: people_delay_s, people_compared," in scored.stdout
     )
     row = pd.read_csv(tmp_path / "asked" / "results.csv").iloc[0]
     plain = run_episode(short, load_policy("orca"), EpisodeOptions()).record

@@ -80,7 +80,7 @@ def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(
         for one in (first, seen, *policy.seen):
             assert leaks(one, scenario, episode.moment) == [] == leaks(one, scenario, now)
         place = scenario.route_line.at(20.0)
-        z_m, _, _ = episode._open.parts.world.surface.lean(place, seen.robot.drive.span_m)  # type: ignore[attr-defined]
+        z_m, _, _ = episode._open.engines.world.surface.lean(place, seen.robot.drive.span_m)  # type: ignore[attr-defined]
         robot = RobotState(place, z_m=z_m)
         ahead = place.xy + 3.0 * np.array([np.cos(place.heading_rad), np.sin(place.heading_rad)])
         somebody = People.of(("a",), [ahead], [0.0], [0.0], ("stand",))
@@ -147,8 +147,8 @@ def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
     spec = read_spec(tmp_path / "run")
     assert (spec.manifest.goal, spec.manifest.odometry) == ("route_point", "gps")
     for goal, named in (
-        ("final_point", "now asked for is final_point"),
-        (None, "now asked for is none"),
+        ("final_point", "and this command has final_point"),
+        (None, "and this command has none"),
     ):
         other = EpisodeOptions(seed=2, goal=goal)  # type: ignore[arg-type]
         with pytest.raises(
@@ -165,7 +165,7 @@ def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
         seen = episode.reset()
         z_m = episode.moment.robot.z_m
         # type: ignore[attr-defined]
-        surface = episode._open.parts.world.surface
+        surface = episode._open.engines.world.surface
         robot = episode.moment.robot
         lean = np.array(surface.lean(scenario.start_pose, seen.robot.drive.span_m)[1:])
         shot = robot_shot(surface, seen.robot, SPEC, robot)

@@ -129,7 +129,7 @@ class Run:
             open_session(Connection(role="coordinator", listen=self.endpoint)) as hub,
             suppress(_Killed),
         ):
-            done = held.finished()
+            done = held.finished_ids()
             todo = [one for one in SUITE.scenarios if one.id not in done]
             try:
                 run = LockedRun(held, hello, SUITE.scenarios, todo)
@@ -169,7 +169,7 @@ class Hand:
         self.session = open_session(Connection(role="worker", connect=endpoint))
         self.name = f"w-{secrets.token_hex(4)}"
         self.run = run_hash(SPEC)
-        self.session.stand(keys.worker(self.run, self.name))
+        self.session.declare_token(keys.worker(self.run, self.name))
         self.lease = 0
         self.scenario = ""
 
@@ -177,7 +177,7 @@ class Hand:
         installed = {**installed_here(), **other}
         payload = encode(Claim(**self.me(), host="here", installed=installed, ready=ready))
         return decode_reply(
-            self.session.ask(keys.job(self.run, "claim"), payload, timeout_s=PATIENCE_S)
+            self.session.query(keys.job(self.run, "claim"), payload, timeout_s=PATIENCE_S)
         )
 
     def job(self) -> str:
@@ -191,7 +191,7 @@ class Hand:
     def report(self, **fields: object) -> CoordinatorReply:
         payload = self.payload(**fields)
         return decode_reply(
-            self.session.ask(keys.job(self.run, "report"), payload, timeout_s=PATIENCE_S)
+            self.session.query(keys.job(self.run, "report"), payload, timeout_s=PATIENCE_S)
         )
 
     def payload(self, **fields: object) -> bytes:
@@ -228,7 +228,7 @@ class Hand:
         return {"worker": self.name, "slot": 0}
 
     def status(self) -> RunStatus:
-        (told,) = self.session.answers(keys.EVERY_RUN, timeout_s=PATIENCE_S).values()
+        (told,) = self.session.query_all(keys.EVERY_RUN, timeout_s=PATIENCE_S).values()
         return msgspec.json.decode(told, type=RunStatus)
 
 
@@ -379,15 +379,15 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
         for act in ("claim", "report"):
             for payload in GARBAGE:
                 with pytest.raises(EngineError, match="not a"):
-                    foe.session.ask(keys.job(foe.run, act), payload, timeout_s=PATIENCE_S)
+                    foe.session.query(keys.job(foe.run, act), payload, timeout_s=PATIENCE_S)
         with pytest.raises(EngineError, match="more than a message may have"):
-            foe.session.ask(
+            foe.session.query(
                 keys.job(foe.run, "report"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S
             )
         with pytest.raises(EngineError, match="ask for exactly"):
-            foe.session.ask("cosim/*/jobs/claim", b"", timeout_s=PATIENCE_S)
+            foe.session.query("cosim/*/jobs/claim", b"", timeout_s=PATIENCE_S)
         with pytest.raises(TimeoutError):
-            foe.session.ask(keys.job("another-run", "claim"), b"", timeout_s=0.2)
+            foe.session.query(keys.job("another-run", "claim"), b"", timeout_s=0.2)
         for other in ({"libsumo": "0.1"}, {"metric schema": "0"}):
             reply = foe.claim(**other)
             words = " ".join(*other.items())
@@ -434,9 +434,9 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(
     with hands(run, 1) as (one,):
         one.job()
         with monkeypatch.context() as patch:
-            patch.setattr(RunFolder, "keep", full)
+            patch.setattr(RunFolder, "write_episode", full)
             with pytest.raises(TimeoutError):
-                one.session.ask(
+                one.session.query(
                     keys.job(one.run, "report"), one.payload(**one.result()), timeout_s=0.5
                 )
             assert run.over() == {} and "no space left" in str(run.error)

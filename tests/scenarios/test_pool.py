@@ -312,7 +312,7 @@ def all_pooled(
         pool.run_all(
             held, suite.scenarios, hello, transport, handle=lambda _: None, renderer=renderer
         )
-        assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
+        assert next(transport.waiting, None) is None and held.finished_ids() == set(spec.scenarios)
     return sorted(read_records(folder / "run"), key=lambda record: record.scenario.id)
 
 

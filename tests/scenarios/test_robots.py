@@ -34,9 +34,9 @@ from cosim.policies.privileged.route import best_lane, crossing_limit
 from cosim.policies.privileged.route_planner import DistanceField
 from cosim.policies.privileged.social_force import contact_distance_m
 from cosim.policies.privileged.standing_groups import lines
-from cosim.results.finished_run import read_whole_run
 from cosim.results.merge import merge_runs
 from cosim.results.run_folder import RunFolder
+from cosim.results.verified_run import read_verified_run
 from cosim.spec import robot as table
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest, WaypointRule
@@ -298,7 +298,7 @@ def test_runs_by_two_robots_have_the_suite_hash_of_the_shipped_scenarios(tmp_pat
     for robot in ("", "scout"):
         options = EpisodeOptions(robot=robot, seed=1)
         run(suite, "straight", out=tmp_path / f"run{robot}", options=options)
-        whole = read_whole_run(tmp_path / f"run{robot}")
+        whole = read_verified_run(tmp_path / f"run{robot}")
         assert whole.spec.setup.suite_hash == suite.content_hash
         assert whole.spec.suite_version == "1" and [*whole.spec.robots] == [robot or "courier"]
         (record,) = whole.records.values()

@@ -239,7 +239,7 @@ def test_a_policy_that_fills_its_descriptors_gets_a_new_process(
     for files in (0, 600):
         driver.reset("e1", files)
         driver.ended()
-        spent.append(driver.spent)
+        spent.append(driver.has_exited)
     driver.close()
     assert spent == [False, True]
 

@@ -74,7 +74,7 @@ def test_a_single_episode_records_the_gait_that_moved_it(tmp_path: Path) -> None
         record = run_episode(second("a"), Straight(), EpisodeOptions(gait="onnx:tiny.onnx")).record
     found = user_gait(options.gait, DOG, SUBSTEP_S).digest
     assert (record.setup.gait, record.setup.gait_hash) == (options.gait, found)
-    assert EpisodeOptions.asked(RunConfig(suite="s", gait="onnx:tiny.onnx")).gait == (
+    assert EpisodeOptions.from_config(RunConfig(suite="s", gait="onnx:tiny.onnx")).gait == (
         f"onnx:{Path('tiny.onnx').absolute()}"
     )
     setup = RunSetup.of(options, gait_hash="0" * 32)

@@ -40,10 +40,10 @@ def test_beyond_this_machine_needs_tls_or_a_word(endpoint: str) -> None:
     assert f"Use tls/{endpoint[4:]} with --tls FOLDER" in str(
         refused.value
     ) and "--insecure" in str(refused.value)
-    with pytest.raises(UsageError, match="stands between here and"):
+    with pytest.raises(UsageError, match="anyone between here and"):
         Connection(role="worker", connect=endpoint)
     warning = Connection(role="coordinator", listen=endpoint, insecure=True).warning
-    assert warning.startswith("--insecure: whoever can reach") and "\n" not in warning
+    assert warning.startswith("--insecure: anyone who can reach") and "\n" not in warning
     assert (
         Connection(
             role="coordinator", listen=endpoint.replace("tcp", "tls"), tls="certs/coordinator"
@@ -61,7 +61,10 @@ def test_contradictions_are_refused() -> None:
         ("choose one", {"listen": "tls/0.0.0.0:7447", "tls": "certs", "insecure": True}),
         ("name one endpoint", {}),
         ("name one endpoint", {"listen": "tcp/127.0.0.1:7447", "connect": "tcp/127.0.0.1:7447"}),
-        ("the role worker listens nowhere", {"listen": "tcp/127.0.0.1:7447", "role": "worker"}),
+        (
+            "the role worker connects and does not listen",
+            {"listen": "tcp/127.0.0.1:7447", "role": "worker"},
+        ),
         ("write it as PROTOCOL/ADDRESS", {"listen": "7447"}),
         ("write it as PROTOCOL/ADDRESS", {"listen": "udp/127.0.0.1:7447"}),
         (

@@ -176,7 +176,7 @@ def test_a_density_makes_no_more_people_than_may_be_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """How many it makes is known where the map is: 400 m2 hold 60 people at 150 per 1000 m2."""
-    monkeypatch.setattr(fits, "MOST_PERSONS", 59)
+    monkeypatch.setattr(fits, "MAX_PERSONS", 59)
     dense = from_west_to_east(crowd=CrowdSpec(density=150.0))
     assert list(misfits([dense], crossroads())) == [
         "scenario 's': crowd density 150 within 80 m of the start makes 60 persons, and at most "

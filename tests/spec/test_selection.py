@@ -77,10 +77,13 @@ def test_a_run_resumed_with_another_selection_names_the_options(
     assert str(caught.value) == (
         f"{tmp_path / 'run'} is of another run: its choice of scenarios is 60 of 1700 "
         f"(--event frontal --episodes 30), "
-        "now asked for is 1700 of 1700 (all). Resume with the same command, or choose another --out."
+        "and this command has 1700 of 1700 (all). Resume with the same command, or choose another --out."
     )
-    apart = spec(some).apart(spec(every))
-    assert apart is not None and (apart.mine, apart.theirs) == ("60", f"1700, with {every[0]}")
+    difference = spec(some).difference_from(spec(every))
+    assert difference is not None and (difference.mine, difference.theirs) == (
+        "60",
+        f"1700, with {every[0]}",
+    )
 
 
 def with_decoys_of(reactive: Suite) -> Suite:
@@ -140,7 +143,7 @@ def test_shards_keep_pairs_together(reactive: Suite) -> None:
     assert sorted(map(len, pairs)) == [1] * 2 + [2] * 8
     for of in (2, 3, 7):
         parts = [
-            [one for pair in Shard(number, of).share(pairs) for one in pair]
+            [one for pair in Shard(number, of).select(pairs) for one in pair]
             for number in range(1, of + 1)
         ]
         ids = [one.id for part in parts for one in part]

@@ -32,15 +32,15 @@ def test_a_person_stands_closer_where_it_is_held_up_and_then_takes_up_its_gap_ag
     gaps = FollowingGaps(engine)
     gaps.enter("c0", 1.2)
     gaps.enter("c1", 0.3)
-    gaps.keep(walkers(0.0, 3.0))
+    gaps.update(walkers(0.0, 3.0))
     assert written_m == {"c0": 1.2, "c1": 0.3}
-    gaps.keep(walkers(0.0, 1.0, mps=0.1))
+    gaps.update(walkers(0.0, 1.0, mps=0.1))
     assert written_m == pytest.approx({"c0": 0.63, "c1": 0.27})
-    gaps.keep(walkers(0.0, 1.5))
+    gaps.update(walkers(0.0, 1.5))
     assert written_m == pytest.approx({"c0": 0.63, "c1": 0.3})
-    gaps.keep(walkers(0.0, 1.8))
+    gaps.update(walkers(0.0, 1.8))
     assert written_m == {"c0": 1.2, "c1": 0.3}
-    gaps.keep(walkers(0.0, 1.8, *(2.0 + 0.1 * k for k in range(CROWDED - 1))))
+    gaps.update(walkers(0.0, 1.8, *(2.0 + 0.1 * k for k in range(CROWDED - 1))))
     assert written_m["c0"] == 0.25
 
 

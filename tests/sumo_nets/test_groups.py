@@ -64,10 +64,10 @@ class Walkers:
 
 def kept(walkers: Walkers, looks: int = 2) -> dict[str, float]:
     """What two who walk together at 1.3 m/s are told in some looks, half a second apart."""
-    together = GroupCohesion(walkers, STRIPS, 0.05)
-    together.join(tuple(walkers.at), 1.3, ("s",))
+    cohesion = GroupCohesion(walkers, STRIPS, 0.05)
+    cohesion.form(tuple(walkers.at), 1.3, ("s",))
     for _ in range(looks):
-        together.keep(walkers.seen())
+        cohesion.update(walkers.seen())
         walkers.advance(0.65)
     return walkers.told
 
@@ -139,22 +139,22 @@ def test_who_is_far_ahead_waits() -> None:
     """Three metres ahead one waits, and walks on when the fellow is near; also if a light has
     parted them."""
     walkers = Walkers(c0=("s", 13.0, 0.0), c1=("s", 10.0, 0.64))
-    together = GroupCohesion(walkers, STRIPS, 0.05)
-    together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
+    cohesion = GroupCohesion(walkers, STRIPS, 0.05)
+    cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(2):
-        together.keep(walkers.seen())
+        cohesion.update(walkers.seen())
         walkers.advance(0.65)
     assert walkers.told["c0"] == 0.0 and walkers.told["c1"] > 1.3
     walkers.at["c1"] = ("s", walkers.at["c0"][1] - 1.0, 0.64)
-    together.keep(walkers.seen())
+    cohesion.update(walkers.seen())
     assert walkers.told["c0"] > 1.0
 
     parted = Walkers(c0=("t", 11.0, 0.0), c1=("s", 10.0, 0.64))
-    together = GroupCohesion(parted, STRIPS, 0.05)
-    together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
+    cohesion = GroupCohesion(parted, STRIPS, 0.05)
+    cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(6):
         parted.at["c0"] = ("t", parted.at["c0"][1] + 0.65, 0.0)
-        together.keep(parted.seen())
+        cohesion.update(parted.seen())
     assert parted.told["c0"] == 0.0 and parted.told["c1"] > 1.3
 
 
@@ -165,10 +165,10 @@ def test_who_walks_aside_steps_back_unless_somebody_comes() -> None:
     kept(walkers, looks=3)
     assert sorted(y for _, _, y in walkers.at.values()) in ([0.0, 1.58], [0.34, 1.92])
     walkers = Walkers(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
-    together = GroupCohesion(walkers, STRIPS, 0.05)
-    together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
+    cohesion = GroupCohesion(walkers, STRIPS, 0.05)
+    cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(3):
-        together.keep({**walkers.seen(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
+        cohesion.update({**walkers.seen(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
         walkers.advance(0.65)
     assert [y for _, _, y in walkers.at.values()] == [0.0, 1.92]
 
@@ -177,17 +177,17 @@ def test_who_has_left_is_forgotten() -> None:
     """Of three one leaves, and two are a group; the last one walks on at its own speed; two may
     leave at once."""
     walkers = Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64), c2=("s", 10.0, 1.28))
-    together = GroupCohesion(walkers, STRIPS, 0.05)
-    together.join(("c0", "c1", "c2"), 1.3, ("s",))
-    together.join(("c3", "c4"), 1.2, ("s",))
+    cohesion = GroupCohesion(walkers, STRIPS, 0.05)
+    cohesion.form(("c0", "c1", "c2"), 1.3, ("s",))
+    cohesion.form(("c3", "c4"), 1.2, ("s",))
     for _ in range(2):
-        together.keep(walkers.seen())
+        cohesion.update(walkers.seen())
         walkers.advance(0.65)
     assert walkers.told["c0"] < 1.3
-    together.forget(["c0", "c1"])
-    assert together.groups == (("c0", "c1"),) and together.group_of("c2") == ("c2",)
-    together.forget(["c0"])
-    assert together.groups == () and walkers.told["c0"] == 1.3
+    cohesion.remove_absent(["c0", "c1"])
+    assert cohesion.groups == (("c0", "c1"),) and cohesion.group_of("c2") == ("c2",)
+    cohesion.remove_absent(["c0"])
+    assert cohesion.groups == () and walkers.told["c0"] == 1.3
 
 
 def test_a_suite_can_be_asked_for_groups() -> None:

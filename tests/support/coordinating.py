@@ -134,7 +134,7 @@ class _MadeUp:
         self._run = run
         self._replies = replies
         self._me = {"worker": f"w-{os.getpid()}-{number}", "slot": 0}
-        session.stand(keys.worker(run, f"w-{os.getpid()}-{number}"))
+        session.declare_token(keys.worker(run, f"w-{os.getpid()}-{number}"))
         self._claim = encode(
             Claim(**self._me, host="here", installed=dict(installed_here()), ready=True)
         )  # type: ignore[arg-type]
@@ -167,7 +167,7 @@ class _MadeUp:
 
     def _say(self, act: str, payload: bytes) -> None:
         self._said = (act, payload)
-        self._session.send(keys.job(self._run, act), payload, self._heard, timeout_s=30.0)
+        self._session.send_query(keys.job(self._run, act), payload, self._heard, timeout_s=30.0)
 
     def _heard(self, payload: bytes | None, error: str) -> None:
         self._replies.put((self, payload))  # type: ignore[arg-type]
@@ -188,7 +188,7 @@ def _load(endpoint: str, workers: int) -> None:
     """So many made-up workers, until the run is over."""
     replies: queue.SimpleQueue[tuple[_MadeUp, bytes]] = queue.SimpleQueue()
     with open_session(Connection(role="worker", connect=endpoint)) as session:
-        while not (runs := session.answers(keys.EVERY_RUN, timeout_s=5.0)):
+        while not (runs := session.query_all(keys.EVERY_RUN, timeout_s=5.0)):
             time.sleep(0.05)
         run = next(iter(runs)).split("/")[1]
         there = [_MadeUp(session, run, number, replies) for number in range(workers)]

@@ -162,6 +162,6 @@ def run_of(
             record, log = episode_of(way, suite.content_hash, how, policy)
             setup = msgspec.structs.replace(record.setup, **of_gait)
             record = msgspec.structs.replace(record, setup=setup)
-            folder.keep(record, log.encoded() if log is not None else b"")
+            folder.write_episode(record, log.encoded() if log is not None else b"")
         folder.finish()
     return path

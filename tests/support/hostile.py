@@ -211,9 +211,9 @@ def _patches_the_director(self: Hostile, seen: Any) -> None:
     """Let the director of this process fail, as an alarm at an unlucky moment does."""
     from bridge import director
 
-    before = director.verify_query
-    director.verify_query = lambda *_: _raise(OSError("alarm"))
-    self.undo = lambda: setattr(director, "verify_query", before)
+    before = director.decode_query
+    director.decode_query = lambda *_: _raise(OSError("alarm"))
+    self.undo = lambda: setattr(director, "decode_query", before)
 
 
 def _patches_numpy(self: Hostile, seen: Any) -> None:

@@ -20,7 +20,7 @@ from bridge.session import Session, open_session
 from cosim.core.errors import EngineError
 from cosim.core.state import Command
 from cosim.spec.connection import Connection
-from cosim.spec.ros2 import CMD_VEL, SENT
+from cosim.spec.ros2 import CMD_VEL, PUBLISHED_TOPICS
 
 
 class Seen(NamedTuple):
@@ -89,7 +89,7 @@ class Peer:
     ) -> None:
         self.session = _opened(endpoint)
         self.node = Ros2Node(self.session, network, name, ordered=True)
-        self.seen: dict[str, list[Any]] = {topic: [] for topic in SENT}
+        self.seen: dict[str, list[Any]] = {topic: [] for topic in PUBLISHED_TOPICS}
         self.goal: tuple[float, float] | None = None
         self._answer = answer
         self._lock = threading.Lock()
@@ -102,11 +102,11 @@ class Peer:
     def subscribe(self) -> None:
         for topic in ("/clock", "/cosim/episode", "/goal_pose", "/odom"):
             self.node.subscribe(
-                topic, (SENT[topic],), lambda got, topic=topic: self._take(topic, got)
+                topic, (PUBLISHED_TOPICS[topic],), lambda got, topic=topic: self._take(topic, got)
             )  # type: ignore[misc]
 
     def _take(self, topic: str, got: Received) -> None:
-        message = types.from_cdr(got.payload, SENT[topic])
+        message = types.from_cdr(got.payload, PUBLISHED_TOPICS[topic])
         self.seen[topic].append(message)
         with self._lock:
             if topic == "/goal_pose":

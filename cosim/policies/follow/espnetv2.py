@@ -82,7 +82,7 @@ class _Builder:
             lambda name: name in unused or name.endswith(".num_batches_tracked")
         )
         self._writer.operator("Identity", "scores", out)
-        return self._writer.whole(
+        return self._writer.serialized(
             {"picture": (1, 3, HEIGHT, WIDTH)}, {"scores": (1, _CLASSES, HEIGHT // 2, WIDTH // 2)}
         )
 

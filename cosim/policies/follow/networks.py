@@ -70,14 +70,14 @@ def _answer_in_grey(
     name, shape = given
     wanted, sides = output
     try:
-        answer = graph.ask({name: np.full(shape, 0.5, np.float32)}, [wanted])[wanted]
+        answer = graph.run({name: np.full(shape, 0.5, np.float32)}, [wanted])[wanted]
     except Exception as error:
         raise UsageError(
             f"{graph.path}: cannot be run by onnxruntime: {runtime_message(error)}"
         ) from error
     if answer.shape != sides or not np.isfinite(answer).all():
         raise UsageError(
-            f"{graph.path}: tells {wanted} {answer.shape}; wanted are finite numbers, {sides}"
+            f"{graph.path}: returns {wanted} {answer.shape}; expected are finite numbers, {sides}"
         )
     return answer.tobytes()
 

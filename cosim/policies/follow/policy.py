@@ -49,7 +49,7 @@ def walkable_pixels(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.bool_]
     tensor = np.ascontiguousarray(
         picture_tensor(rgb, _STREET_INPUT).transpose(2, 0, 1)[None], np.float32
     )
-    kinds = network.ask({"picture": tensor}, ["scores"])["scores"][0].argmax(axis=0)
+    kinds = network.run({"picture": tensor}, ["scores"])["scores"][0].argmax(axis=0)
     free = np.isin(kinds, _NO_OBSTACLE).astype(np.uint8)
     return np.asarray(cv2.medianBlur(free, _SPECKS), np.bool_)
 
@@ -122,7 +122,7 @@ def detect_people(rgb: NDArray[np.uint8], network: Graph) -> Floats:
     tensor = np.ascontiguousarray(
         picture_tensor(rgb, _PEOPLE_INPUT).transpose(2, 0, 1)[None], np.float32
     )
-    output = network.ask({"images": tensor}, ["output"])["output"][0]
+    output = network.run({"images": tensor}, ["output"])["output"][0]
     return decode_boxes(output, _SIDE_PX / max(rgb.shape[:2]))
 
 

@@ -19,7 +19,7 @@ _OFFSET_M: Final = 0.1
 """Distance of neighbouring offsets in metres."""
 WIDEST_M: Final = 1.6
 """Largest offset from the route in metres."""
-_MOST_CHANGE: Final = 3
+_MAX_CHANGE: Final = 3
 """Largest change between two stations, in offsets: 1.2 m a metre."""
 _OFFSET_COST: Final = 0.25
 """Cost of an offset of 1 m at a station."""
@@ -121,10 +121,10 @@ def local_plan(
 def _cheapest(cost: Floats, start: int) -> np.ndarray:
     """Return the offsets of the cheapest way through a lattice (stations, offsets), as indices."""
     stations, count = cost.shape
-    changes = np.arange(-_MOST_CHANGE, _MOST_CHANGE + 1)
+    changes = np.arange(-_MAX_CHANGE, _MAX_CHANGE + 1)
     change_cost = _CHANGE_COST * changes**2
-    padded = np.full(count + 2 * _MOST_CHANGE, np.inf)
-    best = padded[_MOST_CHANGE : _MOST_CHANGE + count]
+    padded = np.full(count + 2 * _MAX_CHANGE, np.inf)
+    best = padded[_MAX_CHANGE : _MAX_CHANGE + count]
     best[start] = 0.0
     from_each = np.lib.stride_tricks.sliding_window_view(padded, len(changes))
     total = np.empty(from_each.shape)
@@ -137,5 +137,5 @@ def _cheapest(cost: Floats, start: int) -> np.ndarray:
     chosen = np.zeros(stations, dtype=int)
     chosen[-1] = int(np.argmin(best))
     for k in range(stations - 1, 0, -1):
-        chosen[k - 1] = chosen[k] + came[k, chosen[k]] - _MOST_CHANGE
+        chosen[k - 1] = chosen[k] + came[k, chosen[k]] - _MAX_CHANGE
     return chosen

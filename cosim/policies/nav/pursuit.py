@@ -91,7 +91,10 @@ def pursue(
 
 
 def _regulated_mps(curvature: float, ahead: Floats, costmap: Costmap, robot: Robot) -> float:
-    """Return the speed in a curve and near obstacles. ahead: (N, 2) next points of the way."""
+    """Return the speed in a curve and near obstacles.
+
+    ahead: (N, 2) next points of the way.
+    """
     slow = min(1.0, 1.0 / max(abs(curvature) * MIN_RADIUS_M, 1e-6))
     gap_m = float(costmap.distances(ahead).min()) - robot.width_m / 2
     slow *= float(np.clip(gap_m / SLOW_WITHIN_M, 0.0, 1.0))
@@ -109,7 +112,10 @@ def _turn_to(side: float, w_radps: float, costmap: Costmap, robot: Robot) -> Com
 
 
 def can_turn(costmap: Costmap, robot: Robot, side: float) -> bool:
-    """Return whether the robot's corners stay clear in a turn on the spot. side: left positive"""
+    """Return whether the robot's corners stay clear in a turn on the spot.
+
+    side: left positive
+    """
     ahead, aside = robot.length_m / 2, robot.width_m / 2
     corners = np.array([(ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside)])
     turn_rad = math.copysign(_TURN_RAD, side) * np.array([0.0, 1.0, 2.0])

@@ -47,7 +47,7 @@ class GraphWriter:
         self._nodes.append(self._onnx.helper.make_node(kind, list(inputs), [out], **attributes))
         return out
 
-    def whole(self, inputs: PortShapes, outputs: PortShapes) -> bytes:
+    def serialized(self, inputs: PortShapes, outputs: PortShapes) -> bytes:
         """Serialize the graph. Raises ValueError if it is invalid."""
         make = self._onnx.helper
         graph = make.make_graph(

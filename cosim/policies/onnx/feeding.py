@@ -66,9 +66,9 @@ class Feeder:
         for name, one in inputs.items():
             if isinstance(one, PixelsInput | RoutePatchInput):
                 _check_pixels(name, one, ports[name])
-        self.forget()
+        self.clear()
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Clear the history after the robot was moved."""
         self._past.clear()
         for name, one in self._inputs.items():

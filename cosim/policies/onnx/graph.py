@@ -23,7 +23,7 @@ _PLACES: Final = re.compile(
     r"/onnxruntime_src/\S+:\d+ [^()]*\((?:[^()]|\([^()]*\))*\)(?: const)? "
 )
 """Error codes and source locations in messages of onnxruntime."""
-_MOST_SAID: Final = 400
+_MAX_SAID: Final = 400
 """Largest number of characters of a runtime's message that is shown."""
 
 Tensor = NDArray[Any]
@@ -74,7 +74,7 @@ class RunnableGraph(Protocol):
     inputs: Mapping[str, TensorPort]
     outputs: Mapping[str, TensorPort]
 
-    def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    def run(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
         """Run the graph and return the named outputs. Errors of the runtime are passed on."""
 
 
@@ -118,7 +118,7 @@ class Graph:
         shape = tuple(side if isinstance(side, int) and side >= 0 else None for side in sides)
         return TensorPort(name, np.dtype(_TYPES[kind]), shape)
 
-    def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    def run(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
         """Run the graph and return the named outputs. Errors of the runtime are passed on."""
         return dict(zip(names, self._session.run(list(names), dict(tensors)), strict=True))
 
@@ -170,7 +170,7 @@ def _refusal(error: Exception, version: str) -> str:
     remedy = (
         "export it with other operators, or a lower opset"
         if lacks or "opset" in said.lower()
-        else "export it anew"
+        else "export it again"
     )
     what = "has an operator that onnxruntime lacks" if lacks else "is refused by onnxruntime"
     return f"{what} ({version}): {said}; {remedy}"
@@ -179,4 +179,4 @@ def _refusal(error: Exception, version: str) -> str:
 def runtime_message(error: Exception) -> str:
     """Return a runtime's message on one line, without codes and source locations."""
     said = _PLACES.sub("", " ".join(str(error).split()))
-    return said if len(said) <= _MOST_SAID else f"{said[:_MOST_SAID]}..."
+    return said if len(said) <= _MAX_SAID else f"{said[:_MAX_SAID]}..."

@@ -35,7 +35,7 @@ class AnyInput(Ranged, frozen=True, kw_only=True):
     """Type of goal that the input needs, if any; such an input has a field `missing`."""
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return f"{self.__struct_config__.tag} "
 
     @property
@@ -76,7 +76,7 @@ class VectorInput(PastInput, frozen=True, kw_only=True):
     std: Annotated[tuple[float, ...], ItemCount(0, 16)] = ()
 
     def contradictions(self) -> Iterator[str]:
-        yield from _normalised(self.called, self.mean, self.std, len(self.values))
+        yield from _normalised(self.prefix, self.mean, self.std, len(self.values))
 
 
 class PixelsInput(PastInput, frozen=True, kw_only=True):
@@ -125,17 +125,17 @@ class PixelsInput(PastInput, frozen=True, kw_only=True):
         return (height // 2, width // 2) if self.colour == "yuv420" else (height, width)
 
     def contradictions(self) -> Iterator[str]:
-        yield from _normalised(self.called, self.mean, self.std, self.channels)
-        yield layout_fault(self.called, self.layout, T=self.frames, C=self.channels)
+        yield from _normalised(self.prefix, self.mean, self.std, self.channels)
+        yield layout_fault(self.prefix, self.layout, T=self.frames, C=self.channels)
         if not all(_SIDE.low <= side <= _SIDE.high for side in self.size):
-            yield f"{self.called}size must be two sides of {_SIDE} pixels, not {list(self.size)}"
+            yield f"{self.prefix}size must be two sides of {_SIDE} pixels, not {list(self.size)}"
         elif self.colour == "yuv420" and (self.size[0] % 2 or self.size[1] % 2):
-            yield f"{self.called}size must be even for yuv420, not {list(self.size)}"
+            yield f"{self.prefix}size must be even for yuv420, not {list(self.size)}"
         if self.crop is not None and not (
             0.0 <= self.crop[0] < self.crop[2] <= 1.0 and 0.0 <= self.crop[1] < self.crop[3] <= 1.0
         ):
             yield (
-                f"{self.called}crop must be shares [x0, y0, x1, y1] with 0 <= x0 < x1 <= 1, not "
+                f"{self.prefix}crop must be shares [x0, y0, x1, y1] with 0 <= x0 < x1 <= 1, not "
                 f"{list(self.crop)}"
             )
 
@@ -208,7 +208,7 @@ class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", t
     missing: Annotated[float | None, _NUMBER] = None
 
     def contradictions(self) -> Iterator[str]:
-        yield layout_fault(self.called, self.layout, T=self.frames, C=1)
+        yield layout_fault(self.prefix, self.layout, T=self.frames, C=1)
 
 
 class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="what"):

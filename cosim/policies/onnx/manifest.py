@@ -39,10 +39,10 @@ from cosim.spec.validation import PathName, Ranged, Text, Within, shown
 MANIFEST_FILE: Final = "manifest.json"
 EXAMPLE_FILE: Final = "example.npz"
 """File with an array of each input's name, and `expected.<name>` of each output."""
-MOST_EXAMPLE_BYTES: Final = 512 << 20
+MAX_EXAMPLE_BYTES: Final = 512 << 20
 """Largest size of an example in bytes, packed and unpacked."""
 
-_MOST_NAME_BYTES: Final = 255
+_MAX_NAME_BYTES: Final = 255
 """Longest file name in bytes."""
 _HASH: Final = re.compile(r"[0-9a-f]{64}")
 
@@ -57,7 +57,7 @@ def file_name_fault(name: str) -> str:
         name.isprintable()
         and name not in ("", ".", "..")
         and "/" not in name
-        and len(name.encode()) <= _MOST_NAME_BYTES
+        and len(name.encode()) <= _MAX_NAME_BYTES
     ):
         return ""
     return (
@@ -164,7 +164,7 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
     output: GraphOutput
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return ""
 
     @property

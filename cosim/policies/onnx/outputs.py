@@ -90,7 +90,7 @@ class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_fi
     mixture: Mixture | None = None
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "waypoints "
 
     @property
@@ -137,7 +137,7 @@ class WheelsOutput(Ranged, frozen=True, kw_only=True, tag="wheels", tag_field="w
     unit_mps: Annotated[float, _ABOVE_0] = 1.0
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "wheels "
 
     @property
@@ -163,7 +163,7 @@ class SteeringOutput(Ranged, frozen=True, kw_only=True, tag="steering", tag_fiel
     keep_speed: Annotated[float, Within(0, 0.99)] = 0.0
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "steering "
 
     @property
@@ -184,7 +184,7 @@ class CommandOutput(Ranged, frozen=True, kw_only=True, tag="command", tag_field=
     unit_radps: Annotated[float, _NUMBER] = 1.0
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "command "
 
     @property
@@ -242,7 +242,7 @@ def _number(tensors: Mapping[str, Tensor], one: Element) -> float:
     if one.index >= numbers.size:
         raise UsageError(
             f"output: '{one.name}' holds {numbers.size} numbers, and number {one.index} "
-            f"(from 0) is asked"
+            f"(from 0) is requested"
         )
     return float(numbers[one.index])
 

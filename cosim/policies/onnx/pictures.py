@@ -21,12 +21,12 @@ _RESAMPLED: Final = {
 }
 
 
-def picture_tensor(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
+def picture_tensor(rgb: NDArray[np.uint8], spec: PixelsInput) -> NDArray[Any]:
     """Return a picture (H, W, 3) as (rows, columns, channels): float32, or unchanged uint8."""
-    pixels = _coloured(_fitted(_cut(rgb, how), how), how.colour)
-    if how.keeps_bytes:
+    pixels = _coloured(_fitted(_cut(rgb, spec), spec), spec.colour)
+    if spec.keeps_bytes:
         return pixels
-    numbers = _numbers_of_bytes(how)
+    numbers = _numbers_of_bytes(spec)
     if pixels.shape[2] in (1, 3):
         looked_up: NDArray[Any] = cv2.LUT(np.ascontiguousarray(pixels), numbers[None])
         return looked_up.reshape(pixels.shape)
@@ -34,15 +34,15 @@ def picture_tensor(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
 
 
 @cache
-def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
+def _numbers_of_bytes(spec: PixelsInput) -> NDArray[np.float32]:
     """Return (256, channels): the normalised value of each byte."""
     numbers = np.arange(256, dtype=np.float32)[:, None] * np.full(
-        how.channels, 1.0 / how.scale, np.float32
+        spec.channels, 1.0 / spec.scale, np.float32
     )
-    if how.mean:
-        numbers -= np.asarray(how.mean, np.float32)
-    if how.std:
-        numbers /= np.asarray(how.std, np.float32)
+    if spec.mean:
+        numbers -= np.asarray(spec.mean, np.float32)
+    if spec.std:
+        numbers /= np.asarray(spec.std, np.float32)
     return numbers
 
 
@@ -73,7 +73,9 @@ def combine_frames(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
 
 
 def tensor_shape(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
-    """Return the shape of a tensor. sides: rows, columns and channels of a frame.
+    """Return the shape of a tensor.
+
+    sides: rows, columns and channels of a frame.
 
     >>> tensor_shape((64, 85, 3), 6, "N(TC)HW")
     (1, 18, 64, 85)
@@ -82,17 +84,17 @@ def tensor_shape(sides: tuple[int, int, int], frames: int, layout: str) -> tuple
     return tuple(math.prod(counts[letter] for letter in group) for group in axes_of(layout))
 
 
-def _cut(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
+def _cut(rgb: NDArray[np.uint8], spec: PixelsInput) -> NDArray[np.uint8]:
     """Crop a picture to `crop`, and to the aspect ratio of `size` for fit "crop"."""
     rows, columns = rgb.shape[:2]
-    if how.crop is not None:
-        x0, y0, x1, y1 = how.crop
+    if spec.crop is not None:
+        x0, y0, x1, y1 = spec.crop
         left, right = _within(x0 * columns, x1 * columns, columns)
         top, bottom = _within(y0 * rows, y1 * rows, rows)
         rgb = rgb[top:bottom, left:right]
         rows, columns = rgb.shape[:2]
-    if how.fit == "crop":
-        width, height = how.size
+    if spec.fit == "crop":
+        width, height = spec.size
         wide = min(columns, max(round(rows * width / height), 1))
         high = min(rows, max(round(columns * height / width), 1))
         left, top = (columns - wide) // 2, (rows - high) // 2
@@ -106,26 +108,26 @@ def _within(low: float, high: float, most: int) -> tuple[int, int]:
     return first, max(round(high), first + 1)
 
 
-def _fitted(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
+def _fitted(rgb: NDArray[np.uint8], spec: PixelsInput) -> NDArray[np.uint8]:
     """Resize a picture to the size (width, height)."""
-    width, height = how.size
-    if how.fit in ("stretch", "crop"):
-        return _resized(rgb, width, height, how)
+    width, height = spec.size
+    if spec.fit in ("stretch", "crop"):
+        return _resized(rgb, width, height, spec)
     scale = min(width / rgb.shape[1], height / rgb.shape[0])
     wide, high = max(round(rgb.shape[1] * scale), 1), max(round(rgb.shape[0] * scale), 1)
-    left, top = ((width - wide) // 2, (height - high) // 2) if how.fit == "letterbox" else (0, 0)
-    whole = np.full((height, width, 3), how.border, np.uint8)
-    whole[top : top + high, left : left + wide] = _resized(rgb, wide, high, how)
+    left, top = ((width - wide) // 2, (height - high) // 2) if spec.fit == "letterbox" else (0, 0)
+    whole = np.full((height, width, 3), spec.border, np.uint8)
+    whole[top : top + high, left : left + wide] = _resized(rgb, wide, high, spec)
     return whole
 
 
 def _resized(
-    rgb: NDArray[np.uint8], width: int, height: int, how: PixelsInput
+    rgb: NDArray[np.uint8], width: int, height: int, spec: PixelsInput
 ) -> NDArray[np.uint8]:
     if rgb.shape[:2] == (height, width):
         return rgb
     resized: NDArray[np.uint8] = cv2.resize(
-        np.ascontiguousarray(rgb), (width, height), interpolation=_RESAMPLED[how.resample]
+        np.ascontiguousarray(rgb), (width, height), interpolation=_RESAMPLED[spec.resample]
     )
     return resized
 

@@ -31,7 +31,7 @@ from cosim.policies.onnx.inputs import StateInput
 from cosim.policies.onnx.manifest import (
     EXAMPLE_FILE,
     MANIFEST_FILE,
-    MOST_EXAMPLE_BYTES,
+    MAX_EXAMPLE_BYTES,
     BundleManifest,
     read_bundle_manifest,
 )
@@ -103,8 +103,8 @@ class _Memory:
         self.feeder = feeder
         self.last: Command = STILL
 
-    def forget(self) -> None:
-        self.feeder.forget()
+    def clear(self) -> None:
+        self.feeder.clear()
         self.last = STILL
 
 
@@ -157,7 +157,7 @@ class OnnxPolicy:
 
     def on_reset(self) -> None:
         """Clear the history."""
-        self._memory.forget()
+        self._memory.clear()
 
     def act(self, observation: Observation) -> PolicyAnswer:
         """Return waypoints (N, 2) or (N, 4) in units of the manifest's rule, or a command."""
@@ -178,10 +178,10 @@ class OnnxPolicy:
         """Run the graph on one observation, or on a batch."""
         inputs = [memory.feeder.feed(one) for memory, one in zip(memories, seen, strict=True)]
         if len(inputs) == 1:
-            outputs = [graph.ask(inputs[0], self._names)]
+            outputs = [graph.run(inputs[0], self._names)]
         else:
             batch = {name: np.concatenate([one[name] for one in inputs]) for name in inputs[0]}
-            together = graph.ask(batch, self._names)
+            together = graph.run(batch, self._names)
             outputs = [
                 {name: array[i : i + 1] for name, array in together.items()}
                 for i in range(len(inputs))
@@ -227,13 +227,13 @@ class OnnxPolicy:
             for _ in range(2):
                 answer = self._answers(graph, [self._memory], [seen])[0]
                 command_of(answer, rule=self.manifest.waypoints, robot=seen.robot)
-            outputs = graph.ask(self._memory.feeder.feed(seen), self._names)
+            outputs = graph.run(self._memory.feeder.feed(seen), self._names)
             return b"".join(outputs[name].tobytes() for name in self._names)
         except UsageError:
             raise
         except PolicyError as error:
             raise UsageError(
-                f"{graph.path}: in a grey street the policy {error}: are its weights whole?"
+                f"{graph.path}: in a grey street the policy {error}: are its weights intact?"
             ) from error
         except Exception as error:
             raise UsageError(
@@ -254,7 +254,7 @@ class OnnxBatchPolicy(OnnxPolicy):
 
     def on_reset(self, episode_id: str = "") -> None:
         """Clear the history of an episode."""
-        self._memories[episode_id].forget()
+        self._memories[episode_id].clear()
 
     def ended(self, episode_id: str) -> None:
         """Remove an episode."""
@@ -303,7 +303,7 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
     """
     path = policy.example
     try:
-        held: dict[str, Tensor] = read_npz(path, most_bytes=MOST_EXAMPLE_BYTES)
+        held: dict[str, Tensor] = read_npz(path, max_bytes=MAX_EXAMPLE_BYTES)
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
@@ -330,7 +330,7 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
             )
     try:
         with policy.open_graph() as graph:
-            found = graph.ask({name: held[name] for name in graph.inputs}, list(graph.outputs))
+            found = graph.run({name: held[name] for name in graph.inputs}, list(graph.outputs))
     except UsageError:
         raise
     except Exception as error:
@@ -338,7 +338,7 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
     for name, array in wanted.items():
         if found[name].shape != array.shape:
             raise UsageError(
-                f"{path}: expected.{name} is {array.shape}, the graph tells {found[name].shape}"
+                f"{path}: expected.{name} is {array.shape}, the graph returns {found[name].shape}"
             )
     return {
         name: float(np.abs(found[name].astype(float) - array).max(initial=0.0))

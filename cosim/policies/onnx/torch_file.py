@@ -24,7 +24,7 @@ _TAGS: Final = ("restore_type_tag", "build_tensorlist", "build_intlist")
 """Functions that TorchScript applies to lists and dictionaries."""
 _SCRIPT: Final = "__torch__."
 """Begin of the names of modules of classes in TorchScript."""
-_MOST_BYTES: Final = 2 << 30
+_MAX_BYTES: Final = 2 << 30
 """Largest size of an unpacked file in bytes."""
 _Stored = tuple[str, str]
 """Type and key of a block of numbers."""
@@ -84,8 +84,8 @@ def _read_old(file: io.BytesIO) -> dict[str, NDArray[Any]]:
 def _read_zip(file: io.BytesIO) -> dict[str, NDArray[Any]]:
     """Read a zip archive: a pickle, and a file for each block of numbers."""
     with zipfile.ZipFile(file) as held:
-        if sum(one.file_size for one in held.infolist()) > _MOST_BYTES:
-            raise ValueError(f"unpacks to more than {_MOST_BYTES} bytes")
+        if sum(one.file_size for one in held.infolist()) > _MAX_BYTES:
+            raise ValueError(f"unpacks to more than {_MAX_BYTES} bytes")
         pickles = [name for name in held.namelist() if name.endswith("/data.pkl")]
         if len(pickles) != 1:
             raise ValueError("is no PyTorch file of weights: it has no data.pkl")

@@ -24,7 +24,7 @@ ROOM_BYTES: Final = 4 << 30
 """Memory in bytes that a graph may use in addition to _TIMES the size of its files."""
 _TIMES: Final = 8
 """Memory that a graph may use, as a multiple of the size of its files."""
-_MOST_ANSWER_BYTES: Final = 512 << 20
+_MAX_ANSWER_BYTES: Final = 512 << 20
 """Largest size of all outputs in bytes."""
 
 _Packed = tuple[str, tuple[int, ...], bytes]
@@ -92,7 +92,7 @@ class TrialGraph:
     def __exit__(self, *_: object) -> None:
         self._child.close()
 
-    def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+    def run(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
         """Run the graph and return the named outputs.
 
         Raises RuntimeError with the runtime's message.
@@ -125,7 +125,7 @@ class TrialGraph:
     def _dead(self) -> UsageError:
         return UsageError(
             f"{self.path}: ends onnxruntime: the process that ran it {self._child.ended()}; "
-            f"export it anew"
+            f"export it again"
         )
 
 
@@ -144,12 +144,12 @@ def _serve(path: Path, wire: MessageSocket) -> None:
     while True:
         request = msgspec.msgpack.decode(wire.receive(), type=_Request)
         try:
-            outputs = graph.ask(
+            outputs = graph.run(
                 {name: _unpacked(one) for name, one in request.tensors.items()}, request.names
             )
-            if (size := sum(array.nbytes for array in outputs.values())) > _MOST_ANSWER_BYTES:
+            if (size := sum(array.nbytes for array in outputs.values())) > _MAX_ANSWER_BYTES:
                 raise ValueError(
-                    f"the outputs hold {size} bytes; at most {_MOST_ANSWER_BYTES} are taken"
+                    f"the outputs hold {size} bytes; at most {_MAX_ANSWER_BYTES} are taken"
                 )
             reply: _Outputs | _Raised = _Outputs(
                 {name: _packed(array) for name, array in outputs.items()}

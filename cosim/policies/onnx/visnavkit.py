@@ -31,7 +31,7 @@ from cosim.policies.onnx.inputs import (
     SpeedsInput,
     StateInput,
 )
-from cosim.policies.onnx.manifest import MOST_EXAMPLE_BYTES, BundleCamera, BundleManifest
+from cosim.policies.onnx.manifest import MAX_EXAMPLE_BYTES, BundleCamera, BundleManifest
 from cosim.policies.onnx.outputs import Mixture, WaypointsOutput
 from cosim.policies.onnx.weights import read_file
 from cosim.spec.goal import GoalProtocol
@@ -44,7 +44,7 @@ _WINDOW_HZ = 20.0
 """Default rate in Hz of a graph that takes a window of frames."""
 _FRAME_HZ = 10.0
 """Default rate in Hz of a graph that takes single frames."""
-_MOST_METADATA_BYTES: Final = 16 << 20
+_MAX_METADATA_BYTES: Final = 16 << 20
 """Largest size of a metadata file in bytes."""
 _REACHED_S: Final = 0.5
 """Time in seconds of the waypoint to follow: the first at or after it."""
@@ -72,7 +72,7 @@ def manifest_of_export(graph: Path) -> BundleManifest:
     """
     path = graph.with_suffix(METADATA)
     try:
-        metadata = msgspec.json.decode(read_file(path, _MOST_METADATA_BYTES), type=_Metadata)
+        metadata = msgspec.json.decode(read_file(path, _MAX_METADATA_BYTES), type=_Metadata)
     except (msgspec.DecodeError, RecursionError) as error:
         raise UsageError(f"{path}: cannot be read: {error}") from error
     found = hashlib.sha256(read_file(graph)).hexdigest()
@@ -165,7 +165,7 @@ def _example(graph: Path, name: str) -> tuple[float, ...]:
     """Return the numbers of a constant input from the exported example."""
     path = graph.with_suffix(EXAMPLE)
     try:
-        array = read_npz(path, [name], MOST_EXAMPLE_BYTES)[name]
+        array = read_npz(path, [name], MAX_EXAMPLE_BYTES)[name]
         return tuple(array.astype(float).ravel().tolist())
     except (OSError, TypeError, ValueError) as error:
         raise UsageError(f"{path}: has no {name}, which the graph wants: {error}") from error

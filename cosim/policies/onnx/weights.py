@@ -19,9 +19,9 @@ from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, 
 
 WEIGHTS_VARIABLE: Final = "COSIM_WEIGHTS"
 """Environment variable with a folder of weights."""
-_MOST_BYTES: Final = 8_000_000_000
+_MAX_BYTES: Final = 8_000_000_000
 """Largest size of a file of a bundle in bytes."""
-_MOST_GRAPH_BYTES: Final = 2 << 30
+_MAX_GRAPH_BYTES: Final = 2 << 30
 """Largest size of an ONNX file in bytes, the limit of a protobuf message."""
 _PIECE_BYTES: Final = 1 << 20
 """Bytes read at once while hashing."""
@@ -108,7 +108,7 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
     if bad:
         more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
         raise UsageError(
-            f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it anew"
+            f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it again"
         )
     digest = hashlib.blake2b(digest_size=32)
     size = 0
@@ -145,10 +145,10 @@ def _inside(path: Path, folder: Path) -> Path:
     return path
 
 
-def read_file(path: Path, most_bytes: int = _MOST_GRAPH_BYTES) -> bytes:
-    """Read a file. Raises UsageError if it is not a regular file or larger than most_bytes."""
+def read_file(path: Path, max_bytes: int = _MAX_GRAPH_BYTES) -> bytes:
+    """Read a file. Raises UsageError if it is not a regular file or larger than max_bytes."""
     with _read_in_words(path):
-        return read_limited(path, most_bytes)
+        return read_limited(path, max_bytes)
 
 
 @contextmanager
@@ -180,7 +180,7 @@ def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.b
     blake2b = hashlib.blake2b(digest_size=32)
     sha256 = hashlib.sha256()
     with _read_in_words(path):
-        size = checked_size(path, _MOST_BYTES)
+        size = checked_size(path, _MAX_BYTES)
         check("bytes", size)
         digest.update(f"{name}\0{size}\0".encode())
         with path.open("rb") as file:

@@ -98,7 +98,7 @@ _TIGHT_COST: Final = 6.0
 """Extra cost factor of a metre at the edge."""
 _ASIDE_COST: Final = 0.15
 """Extra cost factor per metre of distance from the route."""
-_LEAST_M: Final = 0.03
+_MIN_M: Final = 0.03
 """Smallest distance in metres to the edge for a grid point to be used."""
 _PERSON_M: Final = PERSON_RADIUS_M + 0.45
 """Metres around a standing person that are avoided."""
@@ -121,8 +121,8 @@ class RoutePlanner:
         self.clearance = clearance
         self._route = route
         depth = clearance.depth[clearance.rows(clearance.cells)]
-        cells = clearance.cells[depth > _LEAST_M]
-        depth = depth[depth > _LEAST_M]
+        cells = clearance.cells[depth > _MIN_M]
+        depth = depth[depth > _MIN_M]
         self._points = cells * GRID_M
         self._cost = 1.0 + _TIGHT_COST * np.maximum(1.0 - depth / _WANTED_M, 0.0) ** 2
         self._cost += _ASIDE_COST * _aside(self._points, route)

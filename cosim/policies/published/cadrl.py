@@ -35,9 +35,9 @@ from cosim.policies.published.tensorflow_file import read_checkpoint
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
-MOST_PEOPLE: Final = 10
+MAX_PEOPLE: Final = 10
 """Number of people in the input, as in training."""
-MOST_M: Final = 8.0
+MAX_M: Final = 8.0
 """Distance in metres up to which people are in the input."""
 GOAL_MOST_M: Final = 10.0
 """Largest distance of the goal in metres, about that of training."""
@@ -165,7 +165,7 @@ class Cadrl(NetworkPolicy):
     def act(self, observation: Observation) -> Command:
         robot = observation.robot
         preferred = preferred_mps(robot)
-        people = nearest_tracks(observation.people, MOST_PEOPLE, MOST_M)
+        people = nearest_tracks(observation.people, MAX_PEOPLE, MAX_M)
         radii_m = np.full(len(people), PERSON_RADIUS_M)
         goal = goal_point(observation, GOAL_MOST_M)
         logits = self.network.logits(*states(goal, people, radii_m, radius(robot), preferred))

@@ -46,7 +46,7 @@ RADIUS_M: Final = 0.3
 """Radius of the robot in training, in metres."""
 PREFERRED_MPS: Final = 1.0
 """Preferred and largest speed in training, in m/s."""
-MOST_CHANGE: Final = 0.1
+MAX_CHANGE: Final = 0.1
 """Largest change of the speed in m/s, and of the heading in rad, in a step."""
 STEP_S: Final = 0.1
 """Time step in seconds."""
@@ -291,6 +291,6 @@ class Dsrnn(NetworkPolicy):
         people = self._places.relative(here, centre, observation.time_s)
         memory = self._memory._replace(people=memories)
         changes, self._memory = self.network.changes(robot, velocity, people, memory)
-        faster, turn_rad = np.clip(changes, -MOST_CHANGE, MOST_CHANGE).tolist()
+        faster, turn_rad = np.clip(changes, -MAX_CHANGE, MAX_CHANGE).tolist()
         self._speed = min(max(self._speed + faster, 0.0), PREFERRED_MPS)
         return clipped(Command(self._speed, turn_rad / STEP_S), observation.robot)

@@ -48,7 +48,7 @@ POINT_UNIT_M: Final = 30.0
 """Unit of a point's coordinates in metres."""
 STEP_S: Final = 0.1
 """Time step in seconds."""
-MOST_STEERING_RAD: Final = math.radians(60.0)
+MAX_STEERING_RAD: Final = math.radians(60.0)
 """Steering angle of a steering of 1 in radians."""
 WHEELBASE_M: Final = 1.36 + 1.45
 """Distance of the axles of the simulator's robot in metres."""
@@ -134,7 +134,7 @@ def driven(steering: float, throttle: float, v_mps: float, robot: Robot) -> Comm
     """
     force = ENGINE_N / MASS_KG if throttle >= 0.0 else BRAKE_MPS2
     speed = min(max(v_mps + STEP_S * force * throttle, 0.0), robot.cruise_mps)
-    return Command(speed, speed * math.tan(MOST_STEERING_RAD * steering) / WHEELBASE_M)
+    return Command(speed, speed * math.tan(MAX_STEERING_RAD * steering) / WHEELBASE_M)
 
 
 class MetaurbanPpo(NetworkPolicy):

@@ -26,7 +26,7 @@ from cosim.spec.sensors import Tracks
 Arrays = Mapping[str, NDArray[Any]]
 POINT_GOALS: Final[tuple[GoalProtocol, ...]] = protocols_of(PointGoal)
 """Goal protocols of networks that drive to a point."""
-_MOST_BYTES: Final = 64 << 20
+_MAX_BYTES: Final = 64 << 20
 """Largest size of a file of weights in bytes."""
 
 
@@ -51,7 +51,7 @@ class NetworkPolicy(ABC):
             path = weights_file(
                 f"policy '{self.manifest.name}'", file.name, file.facts, file.source
             )
-            data = read_file(path, _MOST_BYTES)
+            data = read_file(path, _MAX_BYTES)
             file.check(path, data)
             digest.update(data)
             read.append(data)

@@ -22,7 +22,7 @@ RATE_HZ: Final = 10.0
 """Rate at which schedules are driven."""
 _SUFFIX: Final = ".json"
 _LOOK_S: Final = 0.8
-_LEAST_LOOK_M: Final = 0.7
+_MIN_LOOK_M: Final = 0.7
 """Look-ahead of the pursuit, in seconds of travel, and its least distance in metres."""
 _TURN_FIRST_RAD: Final = 1.2
 """Bearing beyond which the robot turns in place."""
@@ -150,7 +150,7 @@ class SchedulePolicy:
         """Return the command towards a point ahead in the lane."""
         if self._v_mps == 0.0:
             return STILL
-        look_m = max(_LEAST_LOOK_M, _LOOK_S * self._v_mps)
+        look_m = max(_MIN_LOOK_M, _LOOK_S * self._v_mps)
         bearing_rad = self._way.bearing_rad(look_m, self._lane_m)
         if abs(bearing_rad) > _TURN_FIRST_RAD:
             return Command(0.0, math.copysign(w_max_radps, bearing_rad))
@@ -158,7 +158,10 @@ class SchedulePolicy:
 
 
 class _Progress(NamedTuple):
-    """Progress of a robot. length_m: of the way, infinite if unknown."""
+    """Progress of a robot.
+
+    length_m: of the way, infinite if unknown.
+    """
 
     along_m: float
     length_m: float

@@ -37,7 +37,10 @@ class Way(Protocol):
 
 
 class _Segment(NamedTuple):
-    """Straight part of a way. begins_m: position along the way of its start."""
+    """Straight part of a way.
+
+    begins_m: position along the way of its start.
+    """
 
     x_m: float
     y_m: float

@@ -90,7 +90,10 @@ class Exposure(NamedTuple):
 def plots_of(
     runs: Sequence[ReportedRun], colours: Mapping[str, str], progress: Progress = ignore
 ) -> list[Plot]:
-    """Build every plot for which the runs have data. colours: by run label."""
+    """Build every plot for which the runs have data.
+
+    colours: by run label.
+    """
     rate = "Failures per 100 m"
     found = [
         _metric_plot(
@@ -365,7 +368,10 @@ def _hover_of(cell: Estimate) -> str:
 
 
 def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> dict[str, Any]:
-    """Return a figure with one stacked bar of causes per row. rows: by their Plotly label."""
+    """Return a figure with one stacked bar of causes per row.
+
+    rows: by their Plotly label.
+    """
     causes = [cause for cause in CAUSE_COLOURS if any(row.get(cause) for row in rows.values())]
     data = [
         {

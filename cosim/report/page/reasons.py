@@ -59,7 +59,11 @@ class MetBody(NamedTuple):
 
     @classmethod
     def seen_from(cls, robot: Floats, at: Floats, velocity: Floats) -> MetBody:
-        """Convert from the world frame. robot: (3,) x, y, heading; at, velocity: (2,)."""
+        """Convert from the world frame.
+
+        robot: (3,) x, y, heading
+        at, velocity: (2,).
+        """
         cos, sin = math.cos(robot[2]), math.sin(robot[2])
         turn = np.array([[cos, sin], [-sin, cos]])
         return cls(*(turn @ (at - robot[:2])).tolist(), *(turn @ velocity).tolist())

@@ -14,12 +14,12 @@ import pandas as pd
 from cosim.core.errors import RunError, UsageError
 from cosim.core.npz import read_npz
 from cosim.core.progress import Progress, ignore
-from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.run_folder import RUN_AGAIN, load_log, trajectory_file
 from cosim.results.run_spec import RunSpec, names_by_conditions
 from cosim.results.table import table_of
+from cosim.results.verified_run import VerifiedRun, read_verified_run
 from cosim.spec.scenario import CityMap, Light, Scenario
 from cosim.spec.weather import CLEAR, WEATHERS
 
@@ -53,7 +53,7 @@ class ReportedRun:
     """
 
     label: str
-    whole: WholeRun
+    whole: VerifiedRun
 
     @property
     def path(self) -> Path:
@@ -69,12 +69,12 @@ class ReportedRun:
 
     @property
     def records(self) -> tuple[Record, ...]:
-        """Return the records, sorted by scenario."""
+        """Records, sorted by scenario."""
         return tuple(self.whole.records.values())
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Return one row per episode, see the class."""
+        """One row per episode, see the class."""
         table = table_of(self.records)
         of = [self.scenarios[name] for name in table["scenario"]]
         return table.assign(
@@ -112,7 +112,7 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
     """Load the runs of a report.
 
     Raises UsageError for a run given twice, RunError for runs that cannot share a table, and
-    whatever `read_whole_run` raises.
+    whatever `read_verified_run` raises.
     """
     resolved = [path.resolve() for path in paths]
     for path, real in zip(paths, resolved, strict=True):
@@ -121,8 +121,8 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
     found = []
     for path in paths:
         progress(f"reading {path}")
-        found.append(read_whole_run(path))
-    _refuse_other_suites(found)
+        found.append(read_verified_run(path))
+    _check_same_suites(found)
     names = names_by_conditions([whole.spec for whole in found])
     policies = [(whole.spec.suite, name) for whole, name in zip(found, names, strict=True)]
     suites = {
@@ -186,14 +186,14 @@ def sun_deg(light: Light) -> float:
     return math.degrees(math.asin(max(-1.0, min(1.0, up))))
 
 
-def _refuse_other_suites(runs: Sequence[WholeRun]) -> None:
+def _check_same_suites(runs: Sequence[VerifiedRun]) -> None:
     """Raise RunError for two runs whose suites have the same name but different content."""
-    first: dict[str, WholeRun] = {}
+    first: dict[str, VerifiedRun] = {}
     for run in runs:
         other = first.setdefault(run.spec.suite, run)
         if other.spec.setup.suite_hash != run.spec.setup.suite_hash:
             raise RunError(
                 f"{run.path} and {other.path} are of different suites '{run.spec.suite}' "
-                f"({run.spec.setup.suite_hash}, {other.spec.setup.suite_hash}): their rows cannot "
-                "stand in one table. Report them apart, or run one again"
+                f"({run.spec.setup.suite_hash}, {other.spec.setup.suite_hash}): their rows "
+                "cannot be in one table. Report them separately, or run one again"
             )

@@ -26,7 +26,10 @@ class Track(msgspec.Struct, frozen=True):
 
 
 class CrossingLight(msgspec.Struct, frozen=True):
-    """Light of one crossing. states: one letter per sample, g walk, r stop, - unknown."""
+    """Light of one crossing.
+
+    states: one letter per sample, g walk, r stop, - unknown.
+    """
 
     line: Outline
     states: str
@@ -125,7 +128,10 @@ class PlacePicture(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Spot(msgspec.Struct, frozen=True, kw_only=True):
-    """Position of a failure on a place. entry: index of its card, -1 without one."""
+    """Position of a failure on a place.
+
+    entry: index of its card, -1 without one.
+    """
 
     x_m: float
     y_m: float

@@ -146,7 +146,10 @@ def track_of(table: pd.DataFrame) -> str:
 
 
 def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> ReportTable:
-    """Return a table with one row of main figures per run. colours: by run label."""
+    """Return a table with one row of main figures per run.
+
+    colours: by run label.
+    """
     decoys = any(has_decoys(run.table) for run in runs)
     first = with_discerned(_FIRST, decoys)
     rows = []

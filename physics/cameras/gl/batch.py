@@ -81,7 +81,7 @@ class Stage(NamedTuple):
 
     @property
     def variant(self) -> Variant:
-        """Return the variant of the programs."""
+        """Variant of the programs."""
         return self.scene.style.variant
 
 

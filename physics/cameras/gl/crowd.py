@@ -108,7 +108,7 @@ class PeopleSeen(NamedTuple):
 
     @property
     def dressed(self) -> _Dress:
-        """Return all that their appearance depends on."""
+        """Values that determine their appearance."""
         people = self.people
         crowd = (people.kind == PersonKind.CROWD.value).tobytes()
         return people.ids, people.age.tobytes(), crowd, self.seed, self.season, self.rain

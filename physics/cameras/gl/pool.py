@@ -96,12 +96,12 @@ class MeshPool:
 
     @property
     def version(self) -> int:
-        """Return a number that changes whenever a buffer is another one."""
+        """Number that changes whenever a buffer is another one."""
         return self._corners.version + self._indices.version
 
     @property
     def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:
-        """Return the vertex and the index buffer."""
+        """Vertex and index buffer."""
         return self._corners.buffer, self._indices.buffer
 
     def hold(self, rows: NDArray[np.void], triangles: NDArray[np.uint32]) -> Piece:

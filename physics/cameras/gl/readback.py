@@ -177,7 +177,7 @@ class Readback:
 
     @property
     def _buffer(self) -> moderngl.Buffer:
-        """Return the buffer that pictures of the most recent batch are written to."""
+        """Buffer that pictures of the most recent batch are written to."""
         memory = self._pending[-1].memory
         if not self._staged:
             return memory.buffer

@@ -33,8 +33,8 @@ from physics.cameras.view import Shot
 LATTICE_M: Final = 0.25
 """Spacing of the eyes that splats are sorted for, metres."""
 _ORDERS_MAX: Final = 4
-_LEAST_KEY: Final = 251904
-_MOST_KEY: Final = 65535
+_MIN_KEY: Final = 251904
+_MAX_KEY: Final = 65535
 _KEY_BITS: Final = 16
 _VIEW_ROWS: Final = 5
 _CHUNK: Final = 16_384
@@ -55,7 +55,7 @@ def distance_keys(centres: NDArray[np.float32], point: NDArray[np.float32]) -> N
     """
     x, y, z = (centres[:, k] - point[k] for k in range(3))
     bits = (x * x + y * y + z * z).view(np.uint32) >> np.uint32(12)
-    steps = np.clip(bits, _LEAST_KEY, _LEAST_KEY + _MOST_KEY) - np.uint32(_LEAST_KEY)
+    steps = np.clip(bits, _MIN_KEY, _MIN_KEY + _MAX_KEY) - np.uint32(_MIN_KEY)
     return np.asarray(steps, dtype=np.uint16)
 
 
@@ -144,7 +144,7 @@ class Views(NamedTuple):
 
     @property
     def tiles(self) -> tuple[int, int]:
-        """Return columns and rows of tiles of a picture."""
+        """Columns and rows of tiles of a picture."""
         width, height = self.size
         return -(-width // glsl.TILE_PX), -(-height // glsl.TILE_PX)
 

@@ -105,7 +105,7 @@ class StreetDrawing:
 
     @property
     def scene_ids_end(self) -> int:
-        """Return a number above all ids."""
+        """Number above all ids."""
         return self._ids_end
 
     def place(self, first: int, scene_id: int, middles: Floats, anchor: Floats) -> None:

@@ -25,5 +25,5 @@ class Variant(IntFlag):
 
     @property
     def defines(self) -> str:
-        """Return the lines that select the variant in a shader."""
+        """Lines that select the variant in a shader."""
         return "".join(f"#define {one.name}\n" for one in Variant if one and one in self)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from cosim.spec.robot import Legs
-from physics.dynamics.drive import BodyNow
+from physics.dynamics.drive import MeasuredBody
 from physics.dynamics.legs.pd import torques_nm
 from physics.robots.kinematics import Frame, LinkTree, centre_of_mass, rotate, rows_of
 from physics.robots.model import Model, Triple
@@ -59,13 +59,13 @@ class Balance:
         self._behind_m: Triple = (0.0, 0.0, 0.0)
         self._omega_hz = 1.0
 
-    def lifted_m(self, body: BodyNow) -> float:
+    def lifted_m(self, body: MeasuredBody) -> float:
         """Return the height of the left ankle over the right one."""
         left, right = self._feet(self._frames(body))
         apart = left[0] - right[0], left[1] - right[1], left[2] - right[2]
         return rotate(rows_of(body.rotation), apart)[2]
 
-    def begin(self, body: BodyNow) -> None:
+    def begin(self, body: MeasuredBody) -> None:
         """Freeze the joints at their present angles."""
         frames = self._frames(body)
         left, right = self._feet(frames)
@@ -78,7 +78,7 @@ class Balance:
         upright = self._arm_m[2] > 0.0
         self._omega_hz = math.sqrt(_GRAVITY_MPS2 / self._arm_m[2]) if upright else 0.0
 
-    def holds(self, body: BodyNow) -> bool:
+    def holds(self, body: MeasuredBody) -> bool:
         """Return whether ankle torques can keep the balance.
 
         They cannot if the centre of mass was not above the ankles when the joints were frozen.
@@ -88,7 +88,7 @@ class Balance:
         ahead, left = self._capture_m(body)
         return _HOLDS_M[0] < ahead < _HOLDS_M[1] and abs(left) < _ASIDE_M
 
-    def torques_nm(self, body: BodyNow) -> list[float]:
+    def torques_nm(self, body: MeasuredBody) -> list[float]:
         """Return the joints' torques."""
         stance = self._stance
         torques = torques_nm(stance.kp, stance.kd, self._angles, body)
@@ -99,7 +99,7 @@ class Balance:
             torques[ankle] += 0.5 * self._weight_n * pressure_m
         return torques
 
-    def _capture_m(self, body: BodyNow) -> tuple[float, float]:
+    def _capture_m(self, body: MeasuredBody) -> tuple[float, float]:
         """Return the capture point ahead and to the left of the middle of the ankles."""
         m, (vx, vy, _), (wx, wy, wz) = body.rotation, body.velocity_mps, body.spin_radps
         turn = rows_of(m)
@@ -111,7 +111,7 @@ class Balance:
         cos, sin = m[0] / far, m[3] / far
         return cos * x + sin * y, cos * y - sin * x
 
-    def _frames(self, body: BodyNow) -> Mapping[str, Frame]:
+    def _frames(self, body: MeasuredBody) -> Mapping[str, Frame]:
         angles = dict(zip(self._legs.joints, body.angles_rad, strict=True))
         return self._tree.frames(angles)
 

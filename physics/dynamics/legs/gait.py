@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from cosim.core.state import Command
-from physics.dynamics.drive import BodyNow
+from physics.dynamics.drive import MeasuredBody
 
 
 class Gait(Protocol):
@@ -19,7 +19,7 @@ class Gait(Protocol):
     def reset(self) -> None:
         """Return to the first state: the robot stands at rest."""
 
-    def step(self, command: Command, body: BodyNow) -> Sequence[float]:
+    def step(self, command: Command, body: MeasuredBody) -> Sequence[float]:
         """Return the torques in Nm for the next substep, in the order of `Legs.joints`.
 
         command: within the robot's limits; `STILL` to stand

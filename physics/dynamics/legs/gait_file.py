@@ -19,7 +19,7 @@ from physics.dynamics.legs.network_gait import NetworkGait, NetworkSetup
 from physics.robots import gait_path
 from physics.robots.make_urdf import MODELS
 
-_MOST_BYTES: Final = 64 << 20
+_MAX_BYTES: Final = 64 << 20
 """Largest size of a gait's network in bytes."""
 
 
@@ -72,7 +72,10 @@ def weights_in_words(robot: Robot) -> str:
 
 
 def network_gait(robot: Robot, legs: Legs, dt_s: float, setup: NetworkSetup) -> NetworkGait:
-    """Return a gait for a robot. dt_s: duration of a substep."""
+    """Return a gait for a robot.
+
+    dt_s: duration of a substep.
+    """
     return NetworkGait(robot, legs, dt_s, setup, MODELS[robot.name])
 
 
@@ -84,7 +87,7 @@ def _load(manifest_path: Path, robot: Robot, substep_s: float) -> NetworkSetup:
         raise SpecError(f"{manifest_path}: {error}") from error
     facts = manifest.files.get(manifest.model)
     path = _model_path(manifest_path, manifest)
-    data = read_file(path, _MOST_BYTES)
+    data = read_file(path, _MAX_BYTES)
     NetworkFile(manifest.model, manifest.source, facts).check(path, data)
     try:
         network = _network(path, data)
@@ -106,7 +109,7 @@ def _model_path(manifest_path: Path, manifest: GaitManifest) -> Path:
 def _network(path: Path, data: bytes) -> Network:
     if path.suffix == ".onnx":
         return network_of_graph(data)
-    return network_of(read_open_npz(io.BytesIO(data), most_bytes=_MOST_BYTES))
+    return network_of(read_open_npz(io.BytesIO(data), max_bytes=_MAX_BYTES))
 
 
 def _check_sizes(manifest: GaitManifest, network: Network) -> None:

@@ -29,12 +29,15 @@ class GaitPart(Ranged, frozen=True, kw_only=True):
     """Part of a manifest; messages name its place in the file."""
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return ""
 
 
 class ObservedTerm(GaitPart, frozen=True, kw_only=True, tag_field="what"):
-    """Part of a network's observation. scale: factor of its numbers."""
+    """Part of a network's observation.
+
+    scale: factor of its numbers.
+    """
 
     scale: Annotated[float, _SCALE] = 1.0
 
@@ -86,7 +89,10 @@ class PastActions(ObservedTerm, frozen=True, kw_only=True, tag="actions"):
 
 
 class Phase(ObservedTerm, frozen=True, kw_only=True, tag="phase"):
-    """Sine and cosine of a phase that grows evenly: 2 numbers. period_s: duration of a cycle."""
+    """Sine and cosine of a phase that grows evenly: 2 numbers.
+
+    period_s: duration of a cycle.
+    """
 
     period_s: Annotated[float, Within(0.05, 10)]
 

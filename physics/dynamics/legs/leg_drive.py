@@ -10,7 +10,7 @@ from typing import Final
 from cosim.core.errors import EngineError, PolicyError
 from cosim.core.state import STILL, Command
 from cosim.spec.robot import Legs, Robot
-from physics.dynamics.drive import BodyNow, Motors
+from physics.dynamics.drive import MeasuredBody, Motors
 from physics.dynamics.legs.gait import Gait
 from physics.dynamics.legs.gait_file import published_gait
 from physics.dynamics.legs.trot import Trot
@@ -61,7 +61,7 @@ class LegDrive:
         self._gait.reset()
         self._waits = self._settle
 
-    def step(self, command: Command, body: BodyNow) -> Motors:
+    def step(self, command: Command, body: MeasuredBody) -> Motors:
         """Return the joints' torques in Nm, in the order of `Legs.joints`."""
         if self._waits:
             self._waits -= 1

@@ -22,7 +22,7 @@ from cosim.core.errors import PolicyError
 from cosim.core.network import Network
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
-from physics.dynamics.drive import BodyNow
+from physics.dynamics.drive import MeasuredBody
 from physics.dynamics.legs.balance import Balance, Stance
 from physics.dynamics.legs.gait_manifest import (
     AngularVelocity,
@@ -77,7 +77,10 @@ class NetworkSetup:
 
 
 class NetworkGait:
-    """Gait of one robot. dt_s: duration of a substep."""
+    """Gait of one robot.
+
+    dt_s: duration of a substep.
+    """
 
     def __init__(
         self, robot: Robot, legs: Legs, dt_s: float, setup: NetworkSetup, model: Model
@@ -127,7 +130,7 @@ class NetworkGait:
         self._stood = 0
         self._lifted: deque[float] = deque(maxlen=self._cycle)
 
-    def step(self, command: Command, body: BodyNow) -> Sequence[float]:
+    def step(self, command: Command, body: MeasuredBody) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
         self._v_mps, self._w_radps = command.v_mps, command.w_radps
         commanded = abs(self._v_mps) > _STILL or abs(self._w_radps) > _STILL
@@ -158,7 +161,7 @@ class NetworkGait:
         if not self._may_stand:
             self._place = place
 
-    def _decide(self, commanded: bool, body: BodyNow) -> None:
+    def _decide(self, commanded: bool, body: MeasuredBody) -> None:
         """Query the network, or let the robot stand."""
         m = body.rotation
         x, y, _ = body.at_m
@@ -209,7 +212,7 @@ class NetworkGait:
             and abs(_wrapped(h1 - h0)) < _SLOW_RADPS * cycle_s
         )
 
-    def _corrected(self, body: BodyNow) -> tuple[float, float, float]:
+    def _corrected(self, body: MeasuredBody) -> tuple[float, float, float]:
         """Return speeds for the network that make the robot follow its command."""
         speed, turn = self._manifest.speed, self._manifest.turn
         m, (vx, vy, _) = body.rotation, body.velocity_mps
@@ -243,7 +246,7 @@ class NetworkGait:
         )
         return v, u, w
 
-    def _query(self, command: tuple[float, float, float], body: BodyNow) -> None:
+    def _query(self, command: tuple[float, float, float], body: MeasuredBody) -> None:
         """Let the network set the target angles. Raises PolicyError for NaN and infinity."""
         manifest = self._manifest
         seen = [
@@ -274,7 +277,7 @@ class NetworkGait:
         self._targets = targets
 
     def _observed(
-        self, term: Term, command: tuple[float, float, float], body: BodyNow
+        self, term: Term, command: tuple[float, float, float], body: MeasuredBody
     ) -> Sequence[float]:
         """Return the numbers of a part of the observation, before its scale."""
         m = body.rotation

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from physics.dynamics.drive import BodyNow
+from physics.dynamics.drive import MeasuredBody
 
 
 def torques_nm(
-    kp: Sequence[float], kd: Sequence[float], target_rad: Sequence[float], body: BodyNow
+    kp: Sequence[float], kd: Sequence[float], target_rad: Sequence[float], body: MeasuredBody
 ) -> list[float]:
     """Return proportional-derivative torques in Nm, without limits.
 

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
-from physics.dynamics.drive import BodyNow, towards
+from physics.dynamics.drive import MeasuredBody, towards
 from physics.dynamics.legs.pd import torques_nm
 from physics.robots.dog import HIP_AHEAD_M, HIP_ASIDE_M, SEGMENT_M, THIGH_ASIDE_M
 
@@ -98,7 +98,10 @@ def leg_angles(x_m: float, y_m: float, z_m: float, side: float) -> tuple[float, 
 
 
 class Trot:
-    """Trot of one robot. dt_s: duration of a substep."""
+    """Trot of one robot.
+
+    dt_s: duration of a substep.
+    """
 
     def __init__(self, robot: Robot, legs: Legs, dt_s: float, gains: TrotGains = GAINS) -> None:
         self._ramps = robot.acceleration_mps2 * dt_s, robot.acceleration_radps2 * dt_s
@@ -121,11 +124,11 @@ class Trot:
         self._swings = 0
         self._left_steps = 0
 
-    def step(self, command: Command, body: BodyNow) -> Sequence[float]:
+    def step(self, command: Command, body: MeasuredBody) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
         return torques_nm(self._legs.kp, self._legs.kd, self.targets(command, body), body)
 
-    def targets(self, command: Command, body: BodyNow) -> Sequence[float]:
+    def targets(self, command: Command, body: MeasuredBody) -> Sequence[float]:
         """Return the 12 target angles for the next substep."""
         gains, dt_s = self._gains, self._dt_s
         m, (vx, vy, vz), spin = body.rotation, body.velocity_mps, body.spin_radps
@@ -201,7 +204,10 @@ class Trot:
             foot[1] = begin[1] + (goal_y - begin[1]) * smooth
 
     def _angles(self, m: tuple[float, ...], lifted: float) -> list[float]:
-        """Return the joint angles for the feet. lifted: share of the swing's height."""
+        """Return the joint angles for the feet.
+
+        lifted: share of the swing's height.
+        """
         gains = self._gains
         swinging = _PAIRS[self._swings] if self._left_steps else ()
         angles: list[float] = []

@@ -63,7 +63,7 @@ class OwnPlace(Ranged, frozen=True, kw_only=True):
     roughness: Annotated[float, Within(0, 1)] = 0.0
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "place "
 
     def contradictions(self) -> Iterator[str]:
@@ -95,7 +95,7 @@ class OwnWay(Ranged, frozen=True, kw_only=True):
     signals: Literal["any", "with", "without"] = "any"
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "way "
 
     def contradictions(self) -> Iterator[str]:
@@ -158,7 +158,7 @@ class OwnEvent(Ranged, frozen=True, kw_only=True):
     speed_mps: Annotated[float, Within(0, 3, above=True)] = 1.3
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "event "
 
 
@@ -177,7 +177,7 @@ class OwnObstacle(Ranged, frozen=True, kw_only=True):
     paint: Annotated[int, Within(0, 3)] = 0
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "obstacle "
 
     @property
@@ -207,7 +207,7 @@ class OwnObstacles(Ranged, frozen=True, kw_only=True):
     placed: tuple[OwnObstacle, ...] = ()
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "obstacles "
 
 
@@ -233,7 +233,7 @@ class OwnCrowd(Ranged, frozen=True, kw_only=True):
             yield _refusal_of(lambda: self.spec)
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "crowd "
 
     @property
@@ -258,7 +258,7 @@ class OwnLimits(Ranged, frozen=True, kw_only=True):
     ends_at: Literal["goal", "stop"] = "goal"
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return "limits "
 
 
@@ -290,5 +290,5 @@ class OwnScenario(Ranged, frozen=True, kw_only=True):
         yield weather_fault(self.weather)
 
     @property
-    def called(self) -> str:
+    def prefix(self) -> str:
         return ""

@@ -178,9 +178,11 @@ def _drive(
 
     def gliding(stage: StagedScenario) -> None:
         nonlocal crowd
-        crowd = cast(SumoCrowd, stage.parts.crowd)
+        crowd = cast(SumoCrowd, stage.engines.crowd)
         timed = cast(Crowd, TimedEngine(crowd, "step", "crowd", spent))
-        stage.parts = replace(stage.parts, world=Glider(stage.parts.world.footprint_m), crowd=timed)
+        stage.engines = replace(
+            stage.engines, world=Glider(stage.engines.world.footprint_m), crowd=timed
+        )
 
     def watch(step: Step, _: Verdict) -> None:
         nonlocal persons

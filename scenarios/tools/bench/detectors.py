@@ -65,7 +65,7 @@ class Detector:
 def detect_fastest(rgb: NDArray[np.uint8], network: Graph) -> Floats:
     """Return (N, 4): left, top, right and bottom in pixels of people in a picture (H, W, 3)."""
     tensor = picture_tensor(rgb, _INPUT).transpose(2, 0, 1)[None]
-    answer = network.ask({"input.1": np.ascontiguousarray(tensor, np.float32)}, ["758"])["758"]
+    answer = network.run({"input.1": np.ascontiguousarray(tensor, np.float32)}, ["758"])["758"]
     return decode_fastest(answer[0], rgb.shape[1], rgb.shape[0])
 
 

@@ -209,7 +209,7 @@ def _bare_query_ms() -> float:
         for _ in range(_QUERIES):
             between += 1.0
             began = time.perf_counter()
-            session.ask("bench", b"", timeout_s=_PATIENCE_S)
+            session.query("bench", b"", timeout_s=_PATIENCE_S)
             found.append(time.perf_counter() - began)
     return 1000.0 * statistics.median(found)
 
@@ -231,12 +231,12 @@ def _drive(size_m: float, policy: Route, robot: str = "") -> _Drive:
     sumo_nets.engine.time_crowd_steps(engine.timed)
 
     def timed(stage: StagedScenario) -> None:
-        parts = stage.parts
-        stage.parts = EpisodeEngines(
-            cast(World, TimedEngine(parts.world, "step", "physics", spent)),
-            cast(Crowd, TimedEngine(parts.crowd, "step", "crowd", spent)),
-            cast(Director, TimedEngine(parts.director, "react", "bridge", spent)),
-            cast(Camera, TimedEngine(parts.camera, "render", "camera", spent)),
+        engines = stage.engines
+        stage.engines = EpisodeEngines(
+            cast(World, TimedEngine(engines.world, "step", "physics", spent)),
+            cast(Crowd, TimedEngine(engines.crowd, "step", "crowd", spent)),
+            cast(Director, TimedEngine(engines.director, "react", "bridge", spent)),
+            cast(Camera, TimedEngine(engines.camera, "render", "camera", spent)),
         )
         stage.scorer = cast("Scorer", TimedEngine(stage.scorer, "score", "referee", spent))
 

@@ -511,7 +511,7 @@ def _streets(
     """Yield a street without a robot tick by tick; people and vehicles are those of `entrances`."""
     robot = RobotState(Pose(*at, 0.0))
     spec = CrowdSpec(persons=1, vehicles=0, radius_m=_RADIUS_M)
-    with sumo_crowd(net, street_map, spec, seed, frozenset(), at, before=entrances) as crowd:
+    with sumo_crowd(net, street_map, spec, seed, frozenset(), at, recorded=entrances) as crowd:
         for _ in range(round(seconds * 1000 / TICK_MS)):
             nobody = EventReply(episode="people", tick=crowd.street.tick, states=(), actors=())
             yield crowd.step(robot, nobody, absent=True)

@@ -34,7 +34,7 @@ from cosim.spec.scenario import City, Place, Scenario
 from physics.street.clearance import clear_widths, props_on_driveways
 from physics.street.furniture import footprints
 from physics.street.placement import props_of
-from sumo_nets.city.census import LEAST_CLEAR_M, Census, census
+from sumo_nets.city.census import MIN_CLEAR_M, Census, census
 from sumo_nets.city.store import city_net
 from sumo_nets.net.snapshot import street_map_of
 
@@ -79,7 +79,7 @@ def survey(city: City) -> Survey:
     widths = clear_widths(sidewalks, props)
     tightest = min(widths, key=lambda strip: widths[strip][0])
     faults = list(found.faults)
-    if (side_m := widths[tightest][0]) < LEAST_CLEAR_M:
+    if (side_m := widths[tightest][0]) < MIN_CLEAR_M:
         faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide beside what stands on it")
     if blocked := props_on_driveways(sidewalks, props):
         faults.append(f"{len(blocked)} props stand on driveways: {', '.join(blocked[:3])}")

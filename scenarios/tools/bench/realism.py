@@ -407,7 +407,7 @@ def count_classes(
 def street_kinds(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.intp]:
     """Return (128, 256) classes of Cityscapes in a picture (H, W, 3)."""
     tensor = picture_tensor(rgb, _STREET_INPUT).transpose(2, 0, 1)[None]
-    scores = network.ask({"picture": np.ascontiguousarray(tensor, np.float32)}, ["scores"])
+    scores = network.run({"picture": np.ascontiguousarray(tensor, np.float32)}, ["scores"])
     return np.asarray(scores["scores"][0].argmax(axis=0))
 
 
@@ -507,7 +507,7 @@ def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> 
     driver = load_policy(_DRIVER)
     surface = surface_of_place(scenario.place)
     robot_model = robot_called(scenario.robot)
-    scenario = options.scenario(scenario)
+    scenario = options.apply_to(scenario)
     if options.weather != CLEAR and surface.scan is not None:
         raise UsageError(
             f"--weather {options.weather}: scanned places are drawn in the light of their scan: "

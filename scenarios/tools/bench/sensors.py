@@ -115,13 +115,13 @@ def _bullet_ms(surface: Surface, robot: RobotState, street: Street) -> float:
             bodies.add_chunk(surface.chunk(key))
         walkers = [Mover(n, (0.6, 0.6), Pose(*p)) for n, p in _posed(people)]
         cars = [Mover(n, (4.5, 1.8), Pose(*p)) for n, p in _posed(vehicles)]
-        bodies.show("pedestrian", walkers)
-        bodies.show("vehicle", cars)
+        bodies.activate("pedestrian", walkers)
+        bodies.activate("vehicle", cars)
         feet = surface.heights(people.xy).tolist()
-        bodies.lead("pedestrian", {one: one.way(1) for one in walkers}, feet)
-        bodies.lead("vehicle", {one: one.way(1) for one in cars}, [0.0] * len(cars))
+        bodies.set_paths("pedestrian", {one: one.poses(1) for one in walkers}, feet)
+        bodies.set_paths("vehicle", {one: one.poses(1) for one in cars}, [0.0] * len(cars))
         bodies.place_robot((x, y, -30.0), (0.0, 0.0, 0.0))
-        bodies.place_led(0)
+        bodies.place_on_paths(0)
         origin, turn = sensor_frame(surface, COURIER, robot, _SPEC.height_m)
         begin = np.tile(origin, (_SPEC.rays, 1))
         end = begin + _SPEC.range_m * (np.array(turn) @ _SPEC.directions).T

@@ -31,7 +31,7 @@ from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
-from cosim.spec.ros2 import CMD_VEL, ROS2_SCHEME, SENT, Ros2Settings
+from cosim.spec.ros2 import CMD_VEL, PUBLISHED_TOPICS, ROS2_SCHEME, Ros2Settings
 from scenarios.ipc.observation_codec import ObservationDecoder
 from scenarios.runs.isolated_policy import isolated_driver
 from scenarios.runs.remote_policy import remote_driver
@@ -167,11 +167,11 @@ def answer_pictures(endpoint: str) -> None:
         picture = "/camera/image_raw"
 
         def answer(got: Received) -> None:
-            sent = from_cdr(got.payload, SENT[picture])
+            sent = from_cdr(got.payload, PUBLISHED_TOPICS[picture])
             time_ns = ns_of(sent.header.stamp)
             node.publish(CMD_VEL, stamped_command(Command(1.0, 0.0), time_ns))
 
-        node.subscribe(picture, (SENT[picture],), answer)
+        node.subscribe(picture, (PUBLISHED_TOPICS[picture],), answer)
         while True:
             time.sleep(3600.0)
 

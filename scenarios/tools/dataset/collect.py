@@ -103,7 +103,7 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
 def _refuse(path: Path, name: str, mine: object, theirs: object) -> None:
     if mine != theirs:
         raise RunError(
-            f"{path} is of another data set: its {name} is {brief(mine)}, now asked for is "
+            f"{path} is of another data set: its {name} is {brief(mine)}, and this command has "
             f"{brief(theirs)}. Continue with the same command, or choose another --out."
         )
 
@@ -339,7 +339,7 @@ class _Rounds:
         self, held: RunFolder, scenarios: Sequence[Scenario], hello: Hello, showing: _Showing
     ) -> None:
         """Drive the missing episodes."""
-        done = held.finished()
+        done = held.finished_ids()
         todo = [one for one in scenarios if one.id not in done]
         if todo:
             with showing(scenarios, done) as hear:
@@ -398,7 +398,7 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
 def _kept(held: RunFolder, scenarios: Sequence[Scenario], dropped: Counter[str]) -> list[Collected]:
     """Return the episodes of a run with a demonstration, in the order of its scenarios."""
     found = []
-    done = held.finished()
+    done = held.finished_ids()
     for scenario in scenarios:
         if scenario.id not in done:
             continue  # the time was up

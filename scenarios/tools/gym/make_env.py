@@ -71,7 +71,7 @@ def make_env(
         )
     loaded = load_suite(suite) if isinstance(suite, str) else suite
     selected = select_scenarios(loaded, scenarios, None, events, split)
-    picked = [options.scenario(scenario) for scenario in selected]
+    picked = [options.apply_to(scenario) for scenario in selected]
     settled = with_goal(manifest, options.goal)
     for name in sorted({scenario.robot for scenario in picked}):
         check_camera(settled, robot_called(name), options.own_camera)

@@ -145,7 +145,7 @@ def _digits(data: list[bytes]) -> str:
 def _pictures(stage: StagedScenario, case: Scenario, step: Step) -> dict[str, Shown]:
     """Return the picture of each available camera after a step."""
     taken: dict[str, Shown] = {}
-    world = stage.parts.world
+    world = stage.engines.world
     assert isinstance(world, BulletWorld)
     for name in CAMERAS:
         with ExitStack() as stack:

@@ -233,7 +233,7 @@ class _Reel:
     def take(self, step: Step, verdict: Verdict) -> None:
         """Process one tick of the episode; draw it if it lies within the cut."""
         self._note(step, verdict)
-        self._plan = self._following.take(step, verdict.reset is not None)
+        self._plan = self._following.update(step, verdict.reset is not None)
         robot = step.motion.robot
         ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
         share = Clock().tick_s / EASE_S

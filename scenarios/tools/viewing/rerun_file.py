@@ -314,7 +314,7 @@ class _Tape:
             [led_to(step.command, Pose(0.0, 0.0, 0.0), _LEADS_S), np.full(16, 0.1)]
         )
         self._log("world/robot/plan", rr.LineStrips3D([led], colors=[_GREEN], radii=[0.04]))
-        self._waypoints(self._following.take(step, verdict.reset is not None))
+        self._waypoints(self._following.update(step, verdict.reset is not None))
         self._street(step.street_after, robot.pose)
         self._say(step, verdict)
         if step.tick % PICTURE_EVERY_TICKS == 0:

@@ -130,7 +130,7 @@ def show_again(
         episode.watch(ReplayChecker(folder, recorded).watch)
 
         def watch(step: Step, verdict: Verdict) -> None:
-            plan = following.take(step, verdict.reset is not None)
+            plan = following.update(step, verdict.reset is not None)
             shots.take(step, plan)
             for reel in reels:
                 reel.take(step, plan)

@@ -495,7 +495,7 @@ def test_a_late_node_gets_the_latched_topics(at: str) -> None:
         with open_session(Connection(role="worker", connect=at)) as session:
             began_s = time.monotonic()
             for topic in (messages.STATIC, messages.GOAL, messages.EPISODE):
-                session.listen(
+                session.subscribe(
                     f"0{topic}/*/*",
                     lambda key, payload, _: late.update({key: payload}),
                     history=True,

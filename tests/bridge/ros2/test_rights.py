@@ -16,7 +16,7 @@ from bridge.security.authority import issue, make_authority
 from bridge.session import Session, open_session
 from cosim.core.errors import AccessError, EngineError
 from cosim.spec.connection import Connection
-from cosim.spec.ros2 import LARGEST_B, SENT, TAKEN
+from cosim.spec.ros2 import COMMAND_TOPICS, MAX_MESSAGE_B, PUBLISHED_TOPICS
 from tests.conftest import wait_until
 from tests.support.plain import free_port, plain_zenoh
 
@@ -27,8 +27,8 @@ def key(topic: str, name: str) -> str:
     return rmw_key(3, topic, name, HASHES[name])
 
 
-OUT = {topic: key(topic, name) for topic, name in SENT.items()}
-IN = {topic: key(topic, names[0]) for topic, names in TAKEN.items()}
+OUT = {topic: key(topic, name) for topic, name in PUBLISHED_TOPICS.items()}
+IN = {topic: key(topic, names[0]) for topic, names in COMMAND_TOPICS.items()}
 FOREIGN = (
     "3/other/std_msgs::msg::dds_::String_/RIHS01_0",
     "cosim/r/env/e/inject",
@@ -62,10 +62,10 @@ class Hub:
         self.tokens: list[str] = []
         for topic, name in OUT.items():
             self.run.advertise(name, latched=int(topic == "/tf_static"))
-        self.run.stand(rmw_token(Endpoint("NN", 3, "cd", "cosim")))
-        self.run.listen("**", lambda name, payload, _: self.heard.append((name, len(payload))))
+        self.run.declare_token(rmw_token(Endpoint("NN", 3, "cd", "cosim")))
+        self.run.subscribe("**", lambda name, payload, _: self.heard.append((name, len(payload))))
         for tokens in ("@ros2_lv/**", "cosim/**"):
-            self.run.watch(tokens, lambda name, alive: self.tokens.append(name))
+            self.run.watch_tokens(tokens, lambda name, alive: self.tokens.append(name))
 
 
 @pytest.fixture(scope="module")
@@ -100,23 +100,23 @@ def test_a_node_hears_sensors_and_tells_commands_alone(certs: Path, hub: Hub) ->
             return set(OUT.values()) <= set(got)
 
         wait_until(all_arrived)
-        hub.run.tell("cosim/r/env/e/robot", b"x")
+        hub.run.publish_lossy("cosim/r/env/e/robot", b"x")
         hub.heard.clear()
         for name in (*FOREIGN, *OUT.values(), IN["/plan"], IN["/cmd_vel"]):
             guest.put(name, b"x")
             guest.delete(name)
-        guest.put(IN["/plan"], bytes(LARGEST_B))
+        guest.put(IN["/plan"], bytes(MAX_MESSAGE_B))
         guest.put(IN["/cmd_vel"], b"last")
         wait_until(lambda: (IN["/cmd_vel"], 4) in hub.heard)
         own = {(name, 1) for name in OUT.values()} | {("cosim/r/env/e/robot", 1)}
         assert set(hub.heard) - own == {
             (IN["/plan"], 1),
-            (IN["/plan"], LARGEST_B),
+            (IN["/plan"], MAX_MESSAGE_B),
             (IN["/cmd_vel"], 1),
             (IN["/cmd_vel"], 4),
         }
         for name in (*IN.values(), *FOREIGN):
-            assert hub.run.answers(name, timeout_s=GIVEN_UP_S) == {}
+            assert hub.run.query_all(name, timeout_s=GIVEN_UP_S) == {}
         assert asked == []
         del token, foreign
 

@@ -42,7 +42,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import Instruction, PointGoal
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER
-from cosim.spec.ros2 import CMD_VEL, LARGEST_B, PLAN, SENT, TAKEN, Ros2Wait
+from cosim.spec.ros2 import CMD_VEL, COMMAND_TOPICS, MAX_MESSAGE_B, PLAN, PUBLISHED_TOPICS, Ros2Wait
 from cosim.spec.sensors import Imu, Scan, ScanSpec
 from tests.conftest import ROOT
 
@@ -79,7 +79,10 @@ def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
     every topic has one."""
     definitions = get_typestore(store)
     assert {name: definitions.hash_rihs01(name) for name in types.HASHES} == dict(types.HASHES)
-    used = {*SENT.values(), *(name for names in TAKEN.values() for name in names)}
+    used = {
+        *PUBLISHED_TOPICS.values(),
+        *(name for names in COMMAND_TOPICS.values() for name in names),
+    }
     assert used == set(types.HASHES)
 
 
@@ -129,7 +132,7 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
     for name, message in sent.items():
         data = types.to_cdr(message)
         assert data[:4] == b"\0\1\0\0" and data == types.to_cdr(message)
-        back[name] = types.from_cdr(data, SENT[name])
+        back[name] = types.from_cdr(data, PUBLISHED_TOPICS[name])
         assert (
             not hasattr(back[name], "header") or messages.ns_of(back[name].header.stamp) == NOW_NS
         )
@@ -244,7 +247,7 @@ def test_what_is_no_command_is_named_and_never_driven() -> None:
     good = twist(1.0, 0.5)
     faults = {
         "both must be finite": verdict(twist(math.nan, 0.0)),
-        "at most 1048576": verdict(good._replace(payload=b"", size_b=LARGEST_B + 1)),
+        "at most 1048576": verdict(good._replace(payload=b"", size_b=MAX_MESSAGE_B + 1)),
         "as std_msgs/msg/String": verdict(good._replace(type="std_msgs/msg/String")),
         "another definition": verdict(good._replace(hash="RIHS01_" + 64 * "0")),
         "--ros2-distro humble": verdict(good._replace(hash=types.NO_HASH)),
@@ -294,7 +297,7 @@ def test_a_plan_is_turned_into_the_robots_frame() -> None:
         "without poses": points(path("odom", [])),
         "not a nav_msgs/msg/Path": points(b"\0\1\0\0x"),
         "not finite": points(path("odom", [(math.nan, 1.0)])),
-        "at most 1048576": points(b"", size_b=LARGEST_B + 1),
+        "at most 1048576": points(b"", size_b=MAX_MESSAGE_B + 1),
         "as std_msgs/msg/String": points(good, type="std_msgs/msg/String"),
     }
     for words, fault in faults.items():
@@ -304,7 +307,7 @@ def test_a_plan_is_turned_into_the_robots_frame() -> None:
 def test_an_inbox_is_bounded_in_messages_and_bytes() -> None:
     """A full inbox drops the newest message, or the oldest one for the rule `rate`."""
     for newest, numbers in ((False, [0, 1, 2]), (True, [7, 8, 9])):
-        for inbox in (Inbox(newest=newest, most=3), Inbox(newest=newest, most_b=300)):
+        for inbox in (Inbox(newest=newest, most=3), Inbox(newest=newest, max_b=300)):
             for number in range(10):
                 inbox.put(Received(bytes([number]) * 100))
             assert len(inbox) == 3
@@ -332,6 +335,6 @@ def test_the_page_names_each_topic_and_its_type() -> None:
         line.split("|")[1:3] for line in page.splitlines() if line.startswith(("| `/", "| in: `/"))
     ]
     topics = {name for row in rows for name in re.findall(r"`([^`]+)`", row[0])}
-    assert topics == {*SENT, *TAKEN}
+    assert topics == {*PUBLISHED_TOPICS, *COMMAND_TOPICS}
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row[1])}
     assert named == set(types.HASHES)

@@ -60,7 +60,7 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
         ("role", str(folder), "guest"): "Valid choices: coordinator, director",
         ("role", str(folder), "director"): "--host NAME",
         ("role", str(folder), "worker", "--host", "a b"): "a name or address of a machine",
-        ("role", str(folder), "worker", "--host", "w.lan"): "the role worker does not",
+        ("role", str(folder), "worker", "--host", "w.lan"): "the role worker connects",
         ("role", str(tmp_path / "none"), "worker"): "holds no authority",
         ("show", str(tmp_path)): "holds no certificate",
     }.items():
@@ -175,7 +175,7 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         with open_session(
             Connection(role="worker", connect=at, tls=str(made / "worker"))
         ) as worker:
-            assert worker.ask("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
+            assert worker.query("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
         monkeypatch.setattr(
             settings, "CONNECTS_WITHIN_S", 0.1
         )  # what is refused is so however long it is tried

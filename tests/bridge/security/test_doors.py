@@ -71,12 +71,12 @@ def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
     with open_session(open_to_all, said.append):
         (line,) = said
         assert line.startswith(
-            f"--insecure: whoever can reach tcp/0.0.0.0:{port} may watch, inject pedestrians, take"
+            f"--insecure: anyone who can reach tcp/0.0.0.0:{port} may watch, inject pedestrians, take"
         )
         at = f"tcp/127.1:{port}"
         tried = cosim("listen", "--connect", at, "--insecure")
     (line,) = [line for line in tried.stderr.splitlines() if line.startswith("--insecure: ")]
-    assert f"whoever stands between here and {at} may read and change all that is sent" in line
+    assert f"anyone between here and {at} may read and change all that is sent" in line
     assert tried.returncode == 3 and "none of its episodes is on the air" in tried.stderr
 
 

@@ -14,7 +14,7 @@ from typing import get_args
 import pytest
 import zenoh
 
-from bridge.live import LARGEST_B
+from bridge.live import MAX_MESSAGE_B
 from bridge.security.authority import issue, make_authority
 from bridge.session import open_session
 from cosim.core.errors import EngineError
@@ -85,9 +85,9 @@ class Air:
                 end = self.run if key.startswith(ENV) else self.hub
                 end.serve(key, lambda _, key=key: self._saw(key), found=key == f"{ENV}/status")  # type: ignore[misc]
         self.policy.declare_queryable(POLICY, self._answer)
-        self.hub.listen("cosim/**", lambda key, *_: self.seen.append(key))
-        self.run.listen("cosim/**", lambda key, *_: self.seen.append(key))
-        wait_until(lambda: self.hub.ask(POLICY, b"", timeout_s=PATIENCE_S) == POLICY.encode())
+        self.hub.subscribe("cosim/**", lambda key, *_: self.seen.append(key))
+        self.run.subscribe("cosim/**", lambda key, *_: self.seen.append(key))
+        wait_until(lambda: self.hub.query(POLICY, b"", timeout_s=PATIENCE_S) == POLICY.encode())
 
     def _saw(self, key: str) -> bytes:
         self.seen.append(key)
@@ -102,7 +102,7 @@ class Air:
         after it."""
         for end in (self.run, self.hub):
             mark = f"{ENV}/mark{time.monotonic_ns()}"
-            end.tell(mark, b"")
+            end.publish_lossy(mark, b"")
             wait_until(lambda mark=mark: self.seen.count(mark) == 2)  # type: ignore[misc]
 
 
@@ -145,7 +145,7 @@ class Guest:
     def answers(self) -> bool:
         """Whether what it answers as a policy is heard."""
         try:
-            return self.air.hub.ask("cosim/r/policy/theirs/info", b"", timeout_s=0.5) == b"FORGED"
+            return self.air.hub.query("cosim/r/policy/theirs/info", b"", timeout_s=0.5) == b"FORGED"
         except (TimeoutError, EngineError):
             return False
 
@@ -185,8 +185,8 @@ def try_all(
     # to hear what is told, and what is asked of a policy
     guest.heard.clear()
     for key in TOLD:
-        air.run.tell(key, b"true")
-    air.hub.ask(POLICY, b"secret", timeout_s=PATIENCE_S)
+        air.run.publish_lossy(key, b"true")
+    air.hub.query(POLICY, b"secret", timeout_s=PATIENCE_S)
     if watches:
         wait_until(lambda: set(TOLD) <= set(guest.heard))
     guest.passed(may_ask)
@@ -195,7 +195,7 @@ def try_all(
     assert watches == bool(set(TOLD) & set(guest.heard))
     # to answer in the place of others, and as a policy
     for key in (*JOBS, *SEEN, f"{ENV}/inject"):
-        assert air.hub.ask(key, b"", timeout_s=PATIENCE_S) == key.encode()
+        assert air.hub.query(key, b"", timeout_s=PATIENCE_S) == key.encode()
     assert guest.answers() is answers
     # to be seen as a worker
     alive = [
@@ -255,7 +255,7 @@ def test_who_is_asked_is_asked_by_runs_alone(certs: Path, hub: Role, key: str) -
                 "its own answer, and nobody else's"
             )
         assert asked == []
-        assert session.ask(key, b"x", timeout_s=PATIENCE_S) == b"honest"
+        assert session.query(key, b"x", timeout_s=PATIENCE_S) == b"honest"
 
 
 COPIED = """
@@ -338,7 +338,7 @@ def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
         guest = stack.enter_context(plain_zenoh(at, certs, "injector"))
         wait_until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
         lengths.clear()
-        for length in (LARGEST_B, LARGEST_B + 1, 1 << 20, 20 << 20):
+        for length in (MAX_MESSAGE_B, MAX_MESSAGE_B + 1, 1 << 20, 20 << 20):
             list(guest.get(f"{ENV}/inject", payload=bytes(length), timeout=GIVEN_UP_S))
         wait_until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
-        assert lengths == [LARGEST_B, len(OWN)]
+        assert lengths == [MAX_MESSAGE_B, len(OWN)]

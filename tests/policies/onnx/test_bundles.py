@@ -94,7 +94,7 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "nan": (
         tiny_graph(bright=NAN),
         {},
-        "model.onnx: weights are NaN or infinite: bright; export it anew",
+        "model.onnx: weights are NaN or infinite: bright; export it again",
     ),
     "half-nan": (tiny_graph(unused=HALF_NAN), {}, "weights are NaN or infinite: unused"),
     "text": (b"once upon a time", {}, "model.onnx: is no ONNX graph: is no protobuf message"),
@@ -119,7 +119,7 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
         graph_bytes(OVERFLOWS, [OBS], [port("action", 1, 5, 2)]),
         ONES,
         "in a grey street the policy output 'action' of the graph holds NaN or infinity: are "
-        "its weights whole?",
+        "its weights intact?",
     ),
     "reshape": (
         graph_bytes(
@@ -312,7 +312,7 @@ def test_the_example_of_a_bundle_is_held_against_its_graph(
     obs = np.ones((1, 6, 4, 8), np.float32)
     goal = np.array([[1, 0]], np.float32)
     right = exemplary(obs=obs, goal=goal)
-    told = right.graph.ask({"obs": obs, "goal": goal}, ["action"])["action"]
+    told = right.graph.run({"obs": obs, "goal": goal}, ["action"])["action"]
     expected = {"expected.action": told + np.float32(0.5)}
     assert example_differences(exemplary(obs=obs, goal=goal, **expected)) == pytest.approx(
         {"action": 0.5}
@@ -329,14 +329,14 @@ def test_the_hash_of_a_bundle_is_another_where_a_processor_answers_otherwise(
     """A runtime that rounds otherwise makes another policy of the same files."""
     folder = bundle(tmp_path / "tiny", tiny_graph())
     here = OnnxPolicy(folder).digest
-    ask = Graph.ask
+    run = Graph.run
 
     def next_number(graph: Graph, *words: Any) -> dict[str, Any]:
         return {
             name: np.nextafter(told, told.dtype.type(9))
-            for name, told in ask(graph, *words).items()
+            for name, told in run(graph, *words).items()
         }
 
     assert OnnxPolicy(folder).digest == here
-    monkeypatch.setattr(Graph, "ask", next_number)
+    monkeypatch.setattr(Graph, "run", next_number)
     assert OnnxPolicy(folder).digest != here

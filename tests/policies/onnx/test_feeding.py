@@ -61,7 +61,7 @@ def test_history_is_the_last_frames_with_the_first_before_the_beginning() -> Non
     assert first_pixels(told, 1) == [1, 1, 1]
     assert first_pixels(told, 2) == [1, 1, 2]
     assert first_pixels(told, 3, 4, 5) == [3, 4, 5]
-    told.forget()
+    told.clear()
     assert first_pixels(told, 6) == [6, 6, 6]
     newest = feeder(
         (3, 3, 2, 4),
@@ -250,7 +250,7 @@ def test_past_positions_are_seen_from_where_the_robot_is_now() -> None:
     for place in ((0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 1.0, math.pi / 2)):
         seen = told.feed(replace(SEEN, odometry=Odometry(*place)))["one"]
     np.testing.assert_allclose(seen[0], [[-1, 2], [-1, 0], [0, 0]], atol=1e-6)
-    told.forget()
+    told.clear()
     again = told.feed(replace(SEEN, odometry=Odometry(9.0, 9.0, 0.0)))["one"]
     np.testing.assert_array_equal(again, np.zeros((1, 3, 2)))
 
@@ -261,7 +261,7 @@ def test_what_a_graph_remembers_comes_back_to_it_until_the_robot_is_put_elsewher
     assert whole.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
     whole.remember({"memory": np.array([[1.0, 2.0]])})
     assert whole.feed(SEEN)["one"].tolist() == [[1.0, 2.0]]
-    whole.forget()
+    whole.clear()
     assert whole.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
     rows = feeder((1, 3, 2), one={"what": "state", "output": "memory", "append": True})
     for number in (1.0, 2.0):

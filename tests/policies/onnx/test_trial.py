@@ -141,7 +141,7 @@ def test_a_graph_that_ends_its_process_is_refused(
 ) -> None:
     """As a fault of compiled code would: this process goes on, and the signal is named."""
     place = bundle(tmp_path / "net", tiny_graph())
-    monkeypatch.setattr(Graph, "ask", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+    monkeypatch.setattr(Graph, "run", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
     with pytest.raises(
         UsageError, match="ends onnxruntime: the process that ran it was killed by SIGKILL"
     ):

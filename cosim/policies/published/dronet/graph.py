@@ -79,7 +79,7 @@ class _Layers:
         write("Identity", "steering", steering)
         write("Identity", "collision_prob", collision)
         self._weights.check_all_used()
-        return self._writer.whole(
+        return self._writer.serialized(
             {"image": ("N", 1, _SIDE, _SIDE)}, {"steering": ("N", 1), "collision_prob": ("N", 1)}
         )
 

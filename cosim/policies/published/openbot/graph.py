@@ -35,7 +35,7 @@ def openbot_graph(model: LiteModel) -> bytes:
     Inputs are `img` (N, 96, 256, 3), RGB / 255, and `cmd` (N, 1): -1 left, 0 straight, 1 right.
     Output `left_right` (N, 2) is the wheel speeds.
     """
-    return _Translation(model).whole()
+    return _Translation(model).serialized()
 
 
 class _Translation:
@@ -46,7 +46,7 @@ class _Translation:
         self._writer = GraphWriter("openbot_cil_mobile")
         self._names: dict[int, str] = {}
 
-    def whole(self) -> bytes:
+    def serialized(self) -> bytes:
         shapes = {self._tensor(i).name: self._tensor(i).shape for i in self._model.inputs}
         wanted = {name: (1, *shape) for name, (_, shape) in _INPUTS.items()}
         found = [self._tensor(i).shape for i in self._model.outputs]
@@ -66,7 +66,7 @@ class _Translation:
             self._names[operator.output] = self._translated(number, operator)
         self._writer.operator("Identity", name, self._name(self._model.outputs[0]))
         inputs: PortShapes = {called: ("N", *sides) for called, sides in _INPUTS.values()}
-        return self._writer.whole(inputs, {name: ("N", *shape)})
+        return self._writer.serialized(inputs, {name: ("N", *shape)})
 
     def _translated(self, number: int, operator: LiteOperator) -> str:
         """Convert an operator; return the name of its output."""

@@ -163,7 +163,10 @@ class _Row:
         self._table: Any = Table(data, at)
 
     def number(self, field: int, kind: str) -> int:
-        """Return a number. kind: format character of `struct`."""
+        """Return a number.
+
+        kind: format character of `struct`.
+        """
         at = self._at(field)
         return (
             int(struct.unpack_from(f"<{kind}", self._table.Bytes, at + self._table.Pos)[0])

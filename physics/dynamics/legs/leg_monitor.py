@@ -24,8 +24,8 @@ _FLIES_M: Final = 3.0
 """Height in metres of the trunk's middle over its height at rest that no sound simulation gives."""
 
 
-class LegWatch:
-    """Observer of one robot with legs.
+class LegMonitor:
+    """Monitor of one robot with legs: mean speeds, falls and impossible states.
 
     cycle_s: duration of a gait cycle, over which speeds are averaged
     dt_s: duration of a substep
@@ -37,14 +37,14 @@ class LegWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the motion: the robot was put elsewhere, at rest."""
+        """Clear the motion: the robot was reset and is at rest."""
         self._speeds = deque([(0.0, 0.0)] * self._count, maxlen=self._count)
 
     def add(self, speeds: tuple[float, float]) -> None:
         """Add the speed along the heading and the yaw rate after a substep."""
         self._speeds.append(speeds)
 
-    def judged(self, robot: RobotState, ground_m: float, touches: bool) -> tuple[RobotState, bool]:
+    def assess(self, robot: RobotState, ground_m: float, touches: bool) -> tuple[RobotState, bool]:
         """Return a state with mean speeds, and whether the robot is down.
 
         robot: state after the last substep

@@ -11,22 +11,22 @@ from cosim.results.record import Record
 from cosim.results.run_folder import (
     DATABASE,
     RUN_AGAIN,
+    check_not_in_use,
     read_records,
     read_scenarios,
     read_spec,
     record_difference,
     record_file,
-    refuse_in_use,
 )
 from cosim.results.run_setup import METRIC_SCHEMA
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Scenario, content_hash
 
-_UNKNOWN_SCHEMA = "an earlier version, which did not tell its metric schema"
+_UNKNOWN_SCHEMA = "an earlier version, which did not record its metric schema"
 
 
-class WholeRun(NamedTuple):
-    """Run with at least one ended episode.
+class VerifiedRun(NamedTuple):
+    """Run whose files are consistent, with at least one ended episode.
 
     scenarios: all scheduled scenarios by id
     records: records of the ended episodes by scenario id
@@ -38,7 +38,7 @@ class WholeRun(NamedTuple):
     records: Mapping[str, Record]
 
 
-def read_whole_run(path: Path) -> WholeRun:
+def read_verified_run(path: Path) -> VerifiedRun:
     """Read and verify the run in a folder.
 
     Raises UsageError if the folder holds no run, SpecError for a damaged `scenarios.json`. Raises
@@ -46,7 +46,7 @@ def read_whole_run(path: Path) -> WholeRun:
     holds for a missing, damaged or inconsistent record, edited scenarios and another metric schema.
     """
     spec = read_spec(path)
-    refuse_in_use(path)
+    check_not_in_use(path)
     records = {
         record.scenario.id: record
         for record in sorted(read_records(path), key=lambda r: r.scenario.id)
@@ -57,7 +57,7 @@ def read_whole_run(path: Path) -> WholeRun:
         )
     scenarios = read_scenarios(path)
     check_records(path, records, scenarios)
-    return WholeRun(path, spec, scenarios, records)
+    return VerifiedRun(path, spec, scenarios, records)
 
 
 def check_records(
@@ -65,7 +65,7 @@ def check_records(
 ) -> None:
     """Check records of `results.sqlite` against the files of a run folder.
 
-    Raises RunError as `read_whole_run` does.
+    Raises RunError as `read_verified_run` does.
     """
     for name, record in records.items():
         _check_schema(path, record)
