@@ -249,6 +249,19 @@ def _lowest(frame: Frame) -> np.ndarray:
     return np.asarray(0.6 - down < 0.3)
 
 
+def _ground_at(frame: Frame) -> np.ndarray:
+    """Return (160, 240, 2) points of the map that the pixels of `_picture` show."""
+    taken = shot((-3.0, 2.0, 0.6), (0.0, 2.0, 0.5), (240, 160), LOW.fov_deg)
+    right, up, ahead = taken.axes
+    across, down = np.meshgrid(
+        (np.arange(240) + 0.5) / 120.0 - 1.0, (np.arange(160) + 0.5) / 80.0 - 1.0
+    )
+    wide, tall = taken.half_picture
+    ray = across[..., None] * wide * right - down[..., None] * tall * up + ahead
+    assert frame.depth is not None
+    return np.asarray((taken.eye_m + frame.depth[..., None] * ray)[..., :2])
+
+
 def _shares(x_m: float) -> tuple[float, float, float]:
     """Return shares of the visible pixels of people that show them, of their lowest 0.3 m, and of
     the hidden ones that do not."""
@@ -348,23 +361,27 @@ def test_labels_and_depth_are_those_of_the_mesh() -> None:
 
 @pytest.mark.parametrize("sun", [SUN, None], ids=["sun", "contact"])
 def test_people_darken_the_splats_around_their_feet(sun: ScanSun | None) -> None:
-    """A shadow beside a person, on the side away from the sun, or below it without a known sun;
-    people behind the wall cast none on the street before it."""
+    """A shadow beside a person, on the side away from the sun, or below it without a known sun, and
+    on all sides of its feet; people behind the wall cast none on the street before it."""
     scan = street_scan(sun=sun)
+    full_street = walkers(2)
     empty, full, behind = (
         _picture(scan, "splats", street)
-        for street in (walkers(0), walkers(2), line_of_people(WALL_X_M + 2.0))
+        for street in (walkers(0), full_street, line_of_people(WALL_X_M + 2.0))
     )
     ground = (full.labels == LABELS["sidewalk"]) & (empty.labels == LABELS["sidewalk"])
     darker = empty.rgb.astype(int).sum(axis=2) - full.rgb.astype(int).sum(axis=2)
     shadow = ground & (darker > 30)
-    assert 10 < shadow.sum() < 1500
+    assert 26 < shadow.sum() < 1500
     assert np.abs(darker[ground & ~shadow]).max() <= 30
     middle_m = 3.0 + (1.0 if sun is None else 0.4)
     at_m = full.depth[shadow].mean()  # type: ignore[index]
-    assert at_m == pytest.approx(middle_m, abs=1.5)
+    assert at_m == pytest.approx(middle_m, abs=1.2)
     near = np.s_[120:]
     assert np.array_equal(behind.rgb[near], empty.rgb[near])
+    away_m = _ground_at(full)[None] - full_street.people.xy[:, None, None]
+    at_feet = [ground & (np.hypot(*one.T).T < 0.25) for one in away_m]
+    assert min(darker[one].mean() for one in at_feet) > 5.0
 
 
 def test_exposure_brightens_people_alone() -> None:

@@ -385,7 +385,7 @@ class BatchDrawing:
             self.street.draw_panes(part, True, style)
 
     def _draw_layers(self, part: PictureRange, picture: PictureOrder, layers: Layers) -> None:
-        """Draw objects before the sky, and the scan's mesh apart."""
+        """Draw objects before the sky, and the scan's mesh apart, with the shade at feet."""
         gl = self._context
         self._bind(part.first, picture)
         gl.depth_func = "<"
@@ -399,6 +399,10 @@ class BatchDrawing:
         gl.depth_func = "<"
         gl.enable_only(moderngl.DEPTH_TEST)
         self.street.draw_mesh(part, picture.stage.scene.style)
+        layers.feet.use()
+        layers.feet.clear(red=1.0)
+        with polygon_offset(gl, -3.0, -8.0):
+            self._crowd.draw_contact(0, part.number)
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
     def _draw_sky(self, part: PictureRange, stage: Stage) -> None:

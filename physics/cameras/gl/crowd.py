@@ -38,7 +38,7 @@ from physics.people.lofted_mesh import ROWS
 from physics.people.poses import bodies_of, loops_of, poses_of
 from physics.people.wardrobe import ALL, Season
 
-LEVEL_PX: Final = (200.0, 96.0, 58.0, 40.0, 24.0)
+LEVEL_PX: Final = (200.0, 92.0, 54.0, 40.0, 24.0)
 """Drawn heights of a body, in pixels, below which the next coarser level is used."""
 CAST_M: Final = 18.0
 """Maximum distance from the eye of people that cast shadows, metres."""

@@ -29,9 +29,9 @@ SHADOW_REACH_M: Final = 32.0
 """Half the side of the square that has shadows, metres."""
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
-_MOVING_PX: Final = 512
+_MOVING_PX: Final = 768
 _SMALL_PX: Final = (300, 160)
-"""Picture heights up to which a half-size map looks the same: static map, moving map."""
+"""Picture heights up to which maps have half these sides: static map, moving map."""
 TO_TEXTURE: Final = np.array(
     [[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
 )

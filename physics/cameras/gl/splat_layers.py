@@ -2,7 +2,7 @@
 
 A picture has three layers: objects (people, vehicles, robot, obstacles) before the sky, normals and
 labels of the scan's mesh, and the splats. The mesh decides whether splats cover an object. It also
-gives the labels, and receives the shadows of objects.
+gives the labels, and receives the shadows of objects and the shade at feet.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
 _SIZES_MAX: Final = 4
 _ALWAYS: Final = "1"
 """Depth function of moderngl that passes every pixel."""
+_FEET_UNIT: Final = 19
+"""Texture unit of the light that is left at feet."""
 _CLOUDS_MAX: Final = 2
 """Unused clouds that stay on the renderer."""
 _CONTACT: Final = 0.5
@@ -52,6 +54,7 @@ layout(binding = {glsl.MESH_DEPTH_UNIT}) uniform sampler2D mesh_depth;
 layout(binding = {glsl.COLOUR_UNIT}) uniform sampler2D splats;
 layout(binding = {glsl.MEDIAN_UNIT}) uniform sampler2D median;
 layout(binding = {glsl.LIMITS_UNIT}) uniform sampler2D limits;
+layout(binding = {_FEET_UNIT}) uniform sampler2D at_feet;
 uniform int first_row;
 in vec2 spot;
 {glsl.METRES}
@@ -80,7 +83,7 @@ void main() {{
     if (far < 1.0 && limit > 0.0) {{
         vec3 ray = ahead.xyz + spot.x * right.w * right.xyz - spot.y * up.w * up.xyz;
         vec3 at = eye.xyz + metres(far) * ray;
-        colour *= shaded(at, normalize(2.0 * surface.rgb - 1.0));
+        colour *= shaded(at, normalize(2.0 * surface.rgb - 1.0)) * texelFetch(at_feet, here, 0).r;
     }}
     bool own = !none && !covered, hidden = none && object < 1.0;
     vec3 rest = hidden ? colour / max(1.0 - blended.a, 0.05) : behind.rgb;
@@ -93,16 +96,22 @@ void main() {{
 
 
 class Layers:
-    """Layers of a picture that are drawn by triangles."""
+    """Layers of a picture that are drawn by triangles.
+
+    feet: light left on the mesh at feet, 0 to 1, with the depths of the mesh
+    """
 
     def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
         self._objects = context.texture(size, 4, dtype="f2")
         self._mesh = context.texture(size, 4)
+        self._feet = context.texture(size, 1)
         self._depths = [context.depth_texture(size) for _ in range(2)]
         for depth in self._depths:
             depth.compare_func = ""
         self.objects = context.framebuffer([self._objects], self._depths[0])
         self.mesh = context.framebuffer([self._mesh], self._depths[1])
+        self.feet = context.framebuffer([self._feet], self._depths[1])
+        self.feet.depth_mask = False
 
     def bind(self) -> None:
         """Bind the layers to their texture units."""
@@ -111,13 +120,15 @@ class Layers:
             (self._depths[0], glsl.OBJECTS_DEPTH_UNIT),
             (self._mesh, glsl.MESH_UNIT),
             (self._depths[1], glsl.MESH_DEPTH_UNIT),
+            (self._feet, _FEET_UNIT),
         ):
             texture.use(unit)
 
     def release(self) -> None:
         self.objects.release()
         self.mesh.release()
-        for texture in (self._objects, self._mesh, *self._depths):
+        self.feet.release()
+        for texture in (self._objects, self._mesh, self._feet, *self._depths):
             texture.release()
 
 
