@@ -15,7 +15,7 @@ from typing import Final
 from cosim.spec.robot import Legs
 from physics.dynamics.drive import BodyNow
 from physics.dynamics.legs.pd import torques_nm
-from physics.robots.kinematics import Frame, LinkTree, centre_of_mass, rotate, rows_of
+from physics.robots.kinematics import Frame, LinkTree, centre_of_mass, inverse, rotate, rows_of
 from physics.robots.model import Model, Triple
 
 _GRAVITY_MPS2: Final = 9.81
@@ -60,10 +60,11 @@ class Balance:
         self._omega_hz = 1.0
 
     def lifted_m(self, body: BodyNow) -> float:
-        """Return the height of the left ankle over the right one."""
-        left, right = self._feet(self._frames(body))
-        apart = left[0] - right[0], left[1] - right[1], left[2] - right[2]
-        return rotate(rows_of(body.rotation), apart)[2]
+        """Return the largest distance of a foot from the plane of the other foot's sole."""
+        frames = self._frames(body)
+        (turn_a, a), (turn_b, b) = (frames[foot] for foot in self._legs.feet)
+        apart = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+        return max(abs(rotate(inverse(turn), apart)[2]) for turn in (turn_a, turn_b))
 
     def begin(self, body: BodyNow) -> None:
         """Freeze the joints at their present angles."""

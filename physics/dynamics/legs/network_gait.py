@@ -56,10 +56,8 @@ _INTEGRAL_MOST: Final = 0.4
 """Largest integral of an error of speed, m/s or rad/s."""
 _LEANS: Final = 0.2
 """Sine of the trunk's lean above which errors of speed are not integrated: the robot stumbles."""
-_LEVEL_M: Final = 0.004
-"""Largest deviation of the feet's heights from those on the ground when the joints are frozen."""
-_EVEN_M: Final = 0.01
-"""Difference of height of the ground under both feet below which it is taken as level."""
+_FLUSH_M: Final = 0.006
+"""Distance of a foot from the plane of the other sole below which both are on the ground."""
 _STEADY_S: Final = 2.0
 """Time of standing after which a robot that loses its balance may try to stand again."""
 _HOLD_AFTER_S: Final = 0.6
@@ -125,7 +123,6 @@ class NetworkGait:
         self._place: tuple[float, float, float] | None = None
         self._idle_s = 0.0
         self._stood = 0
-        self._lifted: deque[float] = deque(maxlen=self._cycle)
 
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
@@ -166,18 +163,16 @@ class NetworkGait:
         self._past.append((x, y, heading))
         if commanded:
             self._place, self._idle_s, self._may_stand = None, 0.0, self._balance is not None
-            self._lifted.clear()
             command = self._corrected(body)
         else:
             self._v_more = self._w_more = 0.0
             slow = self._is_slow()
-            if self._may_stand and self._balance is not None:
-                self._lifted.append(self._balance.lifted_m(body))
-            if self._balance is not None and self._may_stand and slow and self._on_both_feet():
-                self._balance.begin(body)
-                self._stands = self._frozen = self._balance.holds(body)
-            if self._stands:
-                return
+            if self._balance is not None and self._may_stand and slow:
+                if self._balance.lifted_m(body) < _FLUSH_M:
+                    self._balance.begin(body)
+                    self._stands = self._frozen = self._balance.holds(body)
+                if self._stands:
+                    return
             self._idle_s += self._decision_s
             if self._place is not None and math.dist(self._place[:2], (x, y)) > _ANCHOR_M:
                 self._place = x, y, heading
@@ -185,18 +180,6 @@ class NetworkGait:
                 self._place = x, y, heading
             command = self._holding(x, y, heading)
         self._query(command, body)
-
-    def _on_both_feet(self) -> bool:
-        """Return whether both feet are on the ground.
-
-        A robot that marks time lifts them in turn. On the ground, their difference of height is in
-        the middle of its range, also on a slope.
-        """
-        ground_m = 0.5 * (max(self._lifted) + min(self._lifted))
-        if abs(ground_m) < _EVEN_M:
-            ground_m = 0.0
-        full = len(self._lifted) == self._cycle
-        return full and abs(self._lifted[-1] - ground_m) < _LEVEL_M
 
     def _is_slow(self) -> bool:
         """Return whether the robot has hardly moved in the last gait cycle."""
