@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from cosim.spec.robot import Legs
 from physics.dynamics.drive import BodyNow
@@ -44,6 +44,18 @@ class Stance:
     kd: tuple[float, ...]
 
 
+class Feet(NamedTuple):
+    """Placement of two feet, in the world.
+
+    apart_m: vector from the right foot to the left one.
+    left, right: unit vectors upwards from the soles.
+    """
+
+    apart_m: Triple
+    left: Triple
+    right: Triple
+
+
 class Balance:
     """Balance of one robot that stands on both feet."""
 
@@ -59,12 +71,14 @@ class Balance:
         self._behind_m: Triple = (0.0, 0.0, 0.0)
         self._omega_hz = 1.0
 
-    def lifted_m(self, body: BodyNow) -> float:
-        """Return the largest distance of a foot from the plane of the other foot's sole."""
+    def feet(self, body: BodyNow) -> Feet:
+        """Return how both feet are placed."""
         frames = self._frames(body)
-        (turn_a, a), (turn_b, b) = (frames[foot] for foot in self._legs.feet)
-        apart = a[0] - b[0], a[1] - b[1], a[2] - b[2]
-        return max(abs(rotate(inverse(turn), apart)[2]) for turn in (turn_a, turn_b))
+        (turn_left, left), (turn_right, right) = (frames[foot] for foot in self._legs.feet)
+        turn = rows_of(body.rotation)
+        apart = left[0] - right[0], left[1] - right[1], left[2] - right[2]
+        normals = (rotate(turn, inverse(one)[2]) for one in (turn_left, turn_right))
+        return Feet(rotate(turn, apart), *normals)
 
     def begin(self, body: BodyNow) -> None:
         """Freeze the joints at their present angles."""

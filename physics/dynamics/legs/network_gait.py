@@ -23,7 +23,7 @@ from cosim.core.network import Network
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import BodyNow
-from physics.dynamics.legs.balance import Balance, Stance
+from physics.dynamics.legs.balance import Balance, Feet, Stance
 from physics.dynamics.legs.gait_manifest import (
     AngularVelocity,
     CommandTerm,
@@ -40,10 +40,12 @@ from physics.robots import urdf_path
 from physics.robots.kinematics import inverse, link_tree, rotate, rows_of
 from physics.robots.model import Model
 
-_HOLD_HZ: Final = 2.0
+_HOLD_HZ: Final = 2.5
 """Speed per distance from the place that is held."""
-_HOLD_MPS: Final = 0.2
-"""Largest speed of a robot that holds its place."""
+_HOLD_MPS: Final = 0.3
+"""Largest speed of a robot that holds its place, and largest integral of its error."""
+_HOLD_MORE_HZ2: Final = 1.5
+"""Rate of the speed per distance from the held place, against a slope that carries it off."""
 _HOLD_RADPS: Final = 0.6
 """Largest yaw rate of a robot that holds its place."""
 _ANCHOR_M: Final = 0.1
@@ -56,8 +58,10 @@ _INTEGRAL_MOST: Final = 0.4
 """Largest integral of an error of speed, m/s or rad/s."""
 _LEANS: Final = 0.2
 """Sine of the trunk's lean above which errors of speed are not integrated: the robot stumbles."""
-_FLUSH_M: Final = 0.006
-"""Distance of a foot from the plane of the other sole below which both are on the ground."""
+_LEVEL_M: Final = 0.004
+"""Largest distance of a foot from the ground when the joints are frozen."""
+_EVEN_M: Final = 0.02
+"""Height of an edge between both feet below which the ground is taken as a plane."""
 _STEADY_S: Final = 2.0
 """Time of standing after which a robot that loses its balance may try to stand again."""
 _HOLD_AFTER_S: Final = 0.6
@@ -119,10 +123,12 @@ class NetworkGait:
         self._actions = [0.0] * len(self._order)
         self._count = 0
         self._v_more = self._w_more = 0.0
+        self._hold_more = 0.0, 0.0
         self._past: deque[tuple[float, float, float]] = deque(maxlen=self._cycle + 1)
         self._place: tuple[float, float, float] | None = None
         self._idle_s = 0.0
         self._stood = 0
+        self._steps: deque[Feet] = deque(maxlen=self._cycle)
 
     def step(self, command: Command, body: BodyNow) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
@@ -148,12 +154,12 @@ class NetworkGait:
 
         If the robot has not stood for long, as across a slope, it marks time until it walks again.
         """
-        place = self._place
+        place, more = self._place, self._hold_more
         self._may_stand = commanded or self._stood >= self._steady
         self._stands = self._frozen = False
         self._start()
         if not self._may_stand:
-            self._place = place
+            self._place, self._hold_more = place, more
 
     def _decide(self, commanded: bool, body: BodyNow) -> None:
         """Query the network, or let the robot stand."""
@@ -163,12 +169,15 @@ class NetworkGait:
         self._past.append((x, y, heading))
         if commanded:
             self._place, self._idle_s, self._may_stand = None, 0.0, self._balance is not None
+            self._steps.clear()
+            self._hold_more = 0.0, 0.0
             command = self._corrected(body)
         else:
             self._v_more = self._w_more = 0.0
             slow = self._is_slow()
-            if self._balance is not None and self._may_stand and slow:
-                if self._balance.lifted_m(body) < _FLUSH_M:
+            if self._balance is not None and self._may_stand:
+                self._steps.append(self._balance.feet(body))
+                if slow and self._on_both_feet():
                     self._balance.begin(body)
                     self._stands = self._frozen = self._balance.holds(body)
                 if self._stands:
@@ -180,6 +189,23 @@ class NetworkGait:
                 self._place = x, y, heading
             command = self._holding(x, y, heading)
         self._query(command, body)
+
+    def _on_both_feet(self) -> bool:
+        """Return whether both feet are on the ground.
+
+        A robot that marks time lifts its feet in turn. Where a foot is lifted most, the other sole
+        lies on the ground: both soles give its plane. On an edge the feet are lifted unequally.
+        """
+        if len(self._steps) < self._cycle:
+            return False
+        highest = max(self._steps, key=lambda one: one.apart_m[2])
+        lowest = min(self._steps, key=lambda one: one.apart_m[2])
+        ground = [0.5 * (a + b) for a, b in zip(highest.right, lowest.left, strict=True)]
+        high, low, now = (
+            math.fsum([a * b for a, b in zip(ground, one.apart_m, strict=True)])
+            for one in (highest, lowest, self._steps[-1])
+        )
+        return abs(now) < _LEVEL_M and abs(0.5 * (high + low)) < _EVEN_M
 
     def _is_slow(self) -> bool:
         """Return whether the robot has hardly moved in the last gait cycle."""
@@ -218,6 +244,13 @@ class NetworkGait:
         if self._place is None:
             return 0.0, 0.0, 0.0
         dx, dy = self._place[0] - x_m, self._place[1] - y_m
+        gain = _HOLD_MORE_HZ2 * self._decision_s
+        x_more, y_more = (
+            min(max(more + gain * error, -_HOLD_MPS), _HOLD_MPS)
+            for more, error in zip(self._hold_more, (dx, dy), strict=True)
+        )
+        self._hold_more = x_more, y_more
+        dx, dy = dx + x_more / _HOLD_HZ, dy + y_more / _HOLD_HZ
         cos, sin = math.cos(heading_rad), math.sin(heading_rad)
         errors = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
         v, u, w = (
