@@ -40,7 +40,7 @@ from physics.robots import urdf_path
 from physics.robots.kinematics import inverse, link_tree, rotate, rows_of
 from physics.robots.model import Model
 
-_HOLD_HZ: Final = 2.5
+_HOLD_HZ: Final = 2.0
 """Speed per distance from the place that is held."""
 _HOLD_MPS: Final = 0.3
 """Largest speed of a robot that holds its place, and largest integral of its error."""
@@ -48,6 +48,8 @@ _HOLD_MORE_HZ2: Final = 1.5
 """Rate of the speed per distance from the held place, against a slope that carries it off."""
 _HOLD_RADPS: Final = 0.6
 """Largest yaw rate of a robot that holds its place."""
+_THERE_M: Final = 0.02
+"""Distance from the held place within which its error is not integrated."""
 _ANCHOR_M: Final = 0.1
 """Distance from the held place above which a displaced robot holds its present place."""
 _SLOW_MPS: Final = 0.08
@@ -244,18 +246,22 @@ class NetworkGait:
         if self._place is None:
             return 0.0, 0.0, 0.0
         dx, dy = self._place[0] - x_m, self._place[1] - y_m
-        gain = _HOLD_MORE_HZ2 * self._decision_s
-        x_more, y_more = (
-            min(max(more + gain * error, -_HOLD_MPS), _HOLD_MPS)
-            for more, error in zip(self._hold_more, (dx, dy), strict=True)
+        if math.hypot(dx, dy) > _THERE_M:
+            gain = _HOLD_MORE_HZ2 * self._decision_s
+            x_more, y_more = (
+                min(max(more + gain * error, -_HOLD_MPS), _HOLD_MPS)
+                for more, error in zip(self._hold_more, (dx, dy), strict=True)
+            )
+            self._hold_more = x_more, y_more
+        dx, dy = (
+            _HOLD_HZ * error + more for error, more in zip((dx, dy), self._hold_more, strict=True)
         )
-        self._hold_more = x_more, y_more
-        dx, dy = dx + x_more / _HOLD_HZ, dy + y_more / _HOLD_HZ
         cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-        errors = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
+        turn = _HOLD_HZ * _wrapped(self._place[2] - heading_rad)
+        wished = cos * dx + sin * dy, cos * dy - sin * dx, turn
         v, u, w = (
-            min(max(_HOLD_HZ * one, -most), most)
-            for one, most in zip(errors, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
+            min(max(one, -most), most)
+            for one, most in zip(wished, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
         )
         return v, u, w
 
