@@ -50,6 +50,11 @@ class Skid:
         """Duration of a gait cycle: 0, without a gait."""
         return 0.0
 
+    @property
+    def delay_s(self) -> float:
+        """Time until a commanded speed takes effect: 0, wheels follow the ramps at once."""
+        return 0.0
+
 
 @dataclass(frozen=True, slots=True)
 class Legs:
@@ -66,6 +71,8 @@ class Legs:
     stand_m: height of the base link's frame above the ground at rest.
     span_m: length and width of the rectangle of the feet at rest.
     cycle_s: duration of a cycle of its own gait, over which speeds and positions are averaged.
+    delay_s: time until a commanded speed takes effect, for planning: with the robot's ramp it gives
+        the measured way of a stop.
     gait: row of `physics.dynamics.legs.GAITS`.
     """
 
@@ -79,6 +86,7 @@ class Legs:
     stand_m: float
     span_m: tuple[float, float]
     cycle_s: float
+    delay_s: float
     gait: Literal["trot", "network"]
 
     @property
@@ -232,6 +240,7 @@ DOG = Robot(
         stand_m=0.27,
         span_m=(0.3868, 0.284),
         cycle_s=0.21,
+        delay_s=0.1,
         gait="trot",
     ),
     mounts={
@@ -269,6 +278,7 @@ WALKER = Robot(
         stand_m=0.7846,
         span_m=(0.17, 0.237),
         cycle_s=0.8,
+        delay_s=0.2,
         gait="network",
     ),
     mounts={
@@ -279,7 +289,7 @@ WALKER = Robot(
     cruise_mps=0.9,
     v_max_mps=1.2,
     w_max_radps=0.65,
-    acceleration_mps2=1.5,
+    acceleration_mps2=2.0,
     acceleration_radps2=4.0,
 )
 """Humanoid of 32 kg with the published masses and lengths of a G1."""
