@@ -51,6 +51,11 @@ class Skid:
         return 0.0
 
     @property
+    def stride_m(self) -> tuple[float, float]:
+        """Length and width of the rectangle of the contacts in motion: that at rest."""
+        return self.span_m
+
+    @property
     def delay_s(self) -> float:
         """Time until a commanded speed takes effect: 0, wheels follow the ramps at once."""
         return 0.0
@@ -70,6 +75,8 @@ class Legs:
     trunk: links that touch the ground only in a fall; "base" is the base link.
     stand_m: height of the base link's frame above the ground at rest.
     span_m: length and width of the rectangle of the feet at rest.
+    stride_m: length and width of the rectangle that the legs fill in walking and turning, measured,
+        for planning. It is centred on the base frame.
     cycle_s: duration of a cycle of its own gait, over which speeds and positions are averaged.
     delay_s: time until a commanded speed takes effect, for planning: with the robot's ramp it gives
         the measured way of a stop.
@@ -85,6 +92,7 @@ class Legs:
     trunk: tuple[str, ...]
     stand_m: float
     span_m: tuple[float, float]
+    stride_m: tuple[float, float]
     cycle_s: float
     delay_s: float
     gait: Literal["trot", "network"]
@@ -239,6 +247,7 @@ DOG = Robot(
         trunk=("base",),
         stand_m=0.27,
         span_m=(0.3868, 0.284),
+        stride_m=(0.83, 0.39),
         cycle_s=0.21,
         delay_s=0.1,
         gait="trot",
@@ -277,6 +286,7 @@ WALKER = Robot(
         trunk=("base",),
         stand_m=0.7846,
         span_m=(0.17, 0.237),
+        stride_m=(0.65, 0.36),
         cycle_s=0.8,
         delay_s=0.2,
         gait="network",

@@ -20,6 +20,7 @@ from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Polyline, Pose, wrap_angle
 from cosim.core.progress import Progress
 from cosim.core.state import STILL, Command, LegState, Motion, RobotState, Street
+from cosim.policies.privileged.orca import axis_points
 from cosim.policies.privileged.rollout import Plans, SampledPath, roll_out
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import DOG, ROBOTS, Legs, Robot
@@ -164,12 +165,29 @@ def test_a_stop_is_as_long_as_the_oracle_plans(robot: Robot, share: float) -> No
             walk.drive(STILL, 0.5)
             walk.drive(Command(v_mps, 0.0), 3.0 + 0.15 * k)
             begin = walk.robot.pose
-            stopping = walk.drive(STILL, 3.0)
+            stopping = walk.drive(STILL, 2.0)
             ways_m.append(max(math.dist(begin.xy, motion.robot.pose.xy) for motion in stopping))
     line = SampledPath(Polyline([(0.0, 0.0), (9.0, 0.0)]))
     waits = Plans(*np.zeros((4, 1)))
     ahead = roll_out(line, waits, robot, Pose(0.0, 0.0, 0.0), 0.0, (v_mps, 0.0), v_mps)
     assert ahead.pose[-1, 0, 0] == pytest.approx(np.mean(ways_m), abs=0.05)
+
+
+def test_the_oracle_plans_with_the_outline_of_the_moving_legs(robot: Robot, walk: Walk) -> None:
+    """Walking, turning and stopping, every point of the body is within the disks around the points
+    that the oracle checks."""
+    tree, parts = link_tree(urdf_path(robot)), link_parts(urdf_path(robot))
+    axis = np.array([(x, 0.0) for x in axis_points(robot)])
+    v, w = robot.cruise_mps, robot.w_max_radps
+    for command in (Command(v, 0.0), Command(0.5 * v, w), Command(0.0, -w), STILL):
+        for motion in walk.drive(command, 1.5):
+            posture = posture_of(FLAT, robot, motion.robot)
+            base = turned(posture.roll_rad, posture.pitch_rad, 0.0)
+            for link, (turn, shift) in tree.places(posture.angles_rad).items():
+                for part in parts[link]:
+                    points = (part.mesh.vertices @ (base @ turn).T + base @ shift)[:, None, :2]
+                    off_m = np.hypot(*(points - axis).transpose(2, 0, 1)).min(axis=1)
+                    assert off_m.max() < robot.width_m / 2 + 0.05
 
 
 def test_it_stands_for_a_minute(walk: Walk) -> None:
