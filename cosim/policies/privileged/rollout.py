@@ -131,7 +131,7 @@ def roll_out(
     poses = np.empty((STEPS, 3, count))
     arcs = np.empty((STEPS, count))
     command = np.empty((2, count))
-    turns = plans.speed_mps > 0.0
+    turns = (plans.speed_mps > 0.0).astype(float)
     late = robot.drive.delay_s / STEP_S
     for k in range(STEPS):
         x_0, y_0, left_x, left_y = way.at(along)

@@ -4,8 +4,8 @@ Commands reach the network at once, without the ramps of the robot's row: the ne
 speed about as fast as these ramps, and stops later with ramps in front of it (docs/robots.md).
 
 The network decides at its own rate; torques follow its targets in every substep. Without a command
-a biped balances on frozen joints (`balance.py`). Other robots, and a biped whose feet are not
-level, hold their place by small commands to the network.
+a biped balances on frozen joints (`balance.py`). Other robots, and a biped with an edge between its
+feet, hold their place by small commands to the network.
 """
 
 from __future__ import annotations
