@@ -55,11 +55,6 @@ class Skid:
         """Length and width of the rectangle of the contacts in motion: that at rest."""
         return self.span_m
 
-    @property
-    def delay_s(self) -> float:
-        """Time until a commanded speed takes effect: 0, wheels follow the ramps at once."""
-        return 0.0
-
 
 @dataclass(frozen=True, slots=True)
 class Legs:
@@ -78,8 +73,6 @@ class Legs:
     stride_m: length and width of the rectangle that the legs fill in walking and turning, measured,
         for planning. It is centred on the base frame.
     cycle_s: duration of a cycle of its own gait, over which speeds and positions are averaged.
-    delay_s: time until a commanded speed takes effect, for planning: with the robot's ramp it gives
-        the measured way of a stop.
     gait: row of `physics.dynamics.legs.GAITS`.
     """
 
@@ -94,7 +87,6 @@ class Legs:
     span_m: tuple[float, float]
     stride_m: tuple[float, float]
     cycle_s: float
-    delay_s: float
     gait: Literal["trot", "network"]
 
     @property
@@ -249,7 +241,6 @@ DOG = Robot(
         span_m=(0.3868, 0.284),
         stride_m=(0.83, 0.39),
         cycle_s=0.21,
-        delay_s=0.1,
         gait="trot",
     ),
     mounts={
@@ -288,7 +279,6 @@ WALKER = Robot(
         span_m=(0.17, 0.237),
         stride_m=(0.65, 0.36),
         cycle_s=0.8,
-        delay_s=0.2,
         gait="network",
     ),
     mounts={
@@ -299,7 +289,7 @@ WALKER = Robot(
     cruise_mps=0.9,
     v_max_mps=1.2,
     w_max_radps=0.65,
-    acceleration_mps2=2.0,
+    acceleration_mps2=1.5,
     acceleration_radps2=4.0,
 )
 """Humanoid of 32 kg with the published masses and lengths of a G1."""

@@ -82,7 +82,6 @@ def _row_faults(robot: Robot) -> Iterator[str]:
     else:
         values += [("drive.stand_m", drive.stand_m, _LENGTH_M)]
         values += [("drive.cycle_s", drive.cycle_s, Within(0.05, 10))]
-        values += [("drive.delay_s", drive.delay_s, Within(0, 2))]
         for name, rule in (("torque_nm", _TORQUE_NM), ("kp", _GAIN), ("kd", _GAIN)):
             given: Sequence[float] = getattr(drive, name)
             values += [(f"drive.{name}[{k}]", one, rule) for k, one in enumerate(given)]

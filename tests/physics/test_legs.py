@@ -17,11 +17,10 @@ import pytest
 
 from cosim.cli.legs import bench_legs
 from cosim.core.errors import EngineError, UsageError
-from cosim.core.geometry import Polyline, Pose, wrap_angle
+from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.progress import Progress
 from cosim.core.state import STILL, Command, LegState, Motion, RobotState, Street
 from cosim.policies.privileged.orca import axis_points
-from cosim.policies.privileged.rollout import Plans, SampledPath, roll_out
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import DOG, ROBOTS, Legs, Robot
 from cosim.spec.scenario import Barrier
@@ -153,24 +152,6 @@ def test_it_walks_straight_turns_and_stops(robot: Robot) -> None:
     with walking(robot, FLAT, START) as walk:
         _, way_m = stop(walk, v_mps)
     assert way_m < 0.5
-
-
-@pytest.mark.parametrize("share", [1.0, 0.5])
-def test_a_stop_is_as_long_as_the_oracle_plans(robot: Robot, share: float) -> None:
-    """From the travelling speed and half of it, in several phases of the gait: on average within 5
-    cm."""
-    v_mps, ways_m = share * robot.cruise_mps, []
-    for k in range(4):
-        with walking(robot, FLAT, START) as walk:
-            walk.drive(STILL, 0.5)
-            walk.drive(Command(v_mps, 0.0), 3.0 + 0.15 * k)
-            begin = walk.robot.pose
-            stopping = walk.drive(STILL, 2.0)
-            ways_m.append(max(math.dist(begin.xy, motion.robot.pose.xy) for motion in stopping))
-    line = SampledPath(Polyline([(0.0, 0.0), (9.0, 0.0)]))
-    waits = Plans(*np.zeros((4, 1)))
-    ahead = roll_out(line, waits, robot, Pose(0.0, 0.0, 0.0), 0.0, (v_mps, 0.0), v_mps)
-    assert ahead.pose[-1, 0, 0] == pytest.approx(np.mean(ways_m), abs=0.05)
 
 
 def test_the_oracle_plans_with_the_outline_of_the_moving_legs(robot: Robot, walk: Walk) -> None:

@@ -168,7 +168,6 @@ class Orca:
         self.reset("", 0)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        self._commanded_mps = 0.0
         self._lane_m = 0.0
         self._stuck_s = 0.0
         self._yielding = Yielding()
@@ -208,9 +207,7 @@ class Orca:
         wished = orca_velocity(known, robot, here, people, aim_m, limit_mps)
         plans = all_plans(lanes_inside(here), [min(speed, limit_mps) for speed in speeds_of(robot)])
         state = known.robot
-        speeds = state.v_mps, state.w_radps
-        before_mps = 0.0 if observation.reset else self._commanded_mps
-        ahead = roll_out(here.way, plans, robot, state.pose, here.s_m, speeds, before_mps)
+        ahead = roll_out(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
         gaps = gaps_to_people(known, robot, ahead, people, ends)
         weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
         out, deeper = outside_area(known, here, ahead, axis_points(robot))
@@ -223,8 +220,8 @@ class Orca:
         best = int(np.argmax(score))
         if plans.speed_mps[best] > 0.0:
             self._lane_m = float(plans.lane_m[best]) if plans.delay_s[best] == 0.0 else self._lane_m
-        self._commanded_mps, w_radps = ahead.command[:, best].tolist()
-        return Command(self._commanded_mps, w_radps)
+        v_mps, w_radps = ahead.command[:, best]
+        return Command(float(v_mps), float(w_radps))
 
     def _scores(
         self,
@@ -332,7 +329,7 @@ def crowd_limit(known: Privileged, robot: Robot) -> float:
         return math.inf
     room_m = np.maximum(far[rows] - PERSON_RADIUS_M, 0.0)
     brake_mps2 = 0.8 * robot.acceleration_mps2
-    reacted_mps = (_REACTS_S + robot.drive.delay_s) * brake_mps2
+    reacted_mps = _REACTS_S * brake_mps2
     speed = (np.sqrt(reacted_mps**2 + 2.0 * brake_mps2 * room_m) - reacted_mps) / ahead[rows]
     return max(float(speed.min()), _CREEPS_MPS)
 

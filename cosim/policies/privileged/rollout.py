@@ -1,7 +1,7 @@
 """Rollout of many plans at once with the robot's steering.
 
 A plan is a lane parallel to the path, a speed, the slope of the lane change and its delay. The
-robot is a unicycle with the limits and the delay of its drive.
+robot is a unicycle with the limits of its drive.
 """
 
 from __future__ import annotations
@@ -113,13 +113,11 @@ def roll_out(
     pose: Pose,
     s_m: float,
     speeds: tuple[float, float],
-    commanded_mps: float = 0.0,
 ) -> Rollout:
     """Roll out every plan. A waiting plan does not turn either.
 
     s_m: Arc length of the robot in metres.
     speeds: Current v in m/s and w in rad/s.
-    commanded_mps: Commanded speed until now, which a robot with a delay follows at first.
     """
     count = len(plans.lane_m)
     v_step, w_step = (
@@ -131,8 +129,7 @@ def roll_out(
     poses = np.empty((STEPS, 3, count))
     arcs = np.empty((STEPS, count))
     command = np.empty((2, count))
-    turns = (plans.speed_mps > 0.0).astype(float)
-    late = robot.drive.delay_s / STEP_S
+    turns = plans.speed_mps > 0.0
     for k in range(STEPS):
         x_0, y_0, left_x, left_y = way.at(along)
         x_1, y_1, there_x, there_y = way.at(along, _LOOK_CELLS)
@@ -151,11 +148,8 @@ def roll_out(
         )
         if k == 0:
             command[:] = v_goal, w_goal
-        share = min(max(k + 1 - late, 0.0), 1.0)
-        if share < 1.0:
-            v = _towards(v, commanded_mps, (1.0 - share) * v_step)
-        v = _towards(v, v_goal, share * v_step)
-        w = _towards(w, w_goal, w_step)
+        v = v + np.minimum(np.maximum(v_goal - v, -v_step), v_step)
+        w = w + np.minimum(np.maximum(w_goal - w, -w_step), w_step)
         middle = heading + 0.5 * STEP_S * w
         v_x, v_y = v * np.cos(middle), v * np.sin(middle)
         x, y, heading = x + STEP_S * v_x, y + STEP_S * v_y, heading + STEP_S * w
@@ -163,9 +157,3 @@ def roll_out(
         poses[k] = x, y, heading
         arcs[k] = along
     return Rollout(poses, arcs, command)
-
-
-def _towards(values: Floats, goal: Floats | float, step: float) -> Floats:
-    """Return values moved towards a goal by at most a step."""
-    moved: Floats = values + np.minimum(np.maximum(goal - values, -step), step)
-    return moved
