@@ -40,7 +40,7 @@ from physics.robots import urdf_path
 from physics.robots.kinematics import inverse, link_tree, rotate, rows_of
 from physics.robots.model import Model
 
-_HOLD_HZ: Final = 2.0
+_HOLD_HZ: Final = 2.5
 """Speed per distance from the place that is held."""
 _HOLD_MPS: Final = 0.3
 """Largest speed of a robot that holds its place, and largest integral of its error."""
