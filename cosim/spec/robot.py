@@ -50,6 +50,11 @@ class Skid:
         """Duration of a gait cycle: 0, without a gait."""
         return 0.0
 
+    @property
+    def stride_m(self) -> tuple[float, float]:
+        """Length and width of the rectangle of the contacts in motion: that at rest."""
+        return self.span_m
+
 
 @dataclass(frozen=True, slots=True)
 class Legs:
@@ -65,6 +70,8 @@ class Legs:
     trunk: links that touch the ground only in a fall; "base" is the base link.
     stand_m: height of the base link's frame above the ground at rest.
     span_m: length and width of the rectangle of the feet at rest.
+    stride_m: length and width of the rectangle that the legs fill in walking and turning, measured,
+        for planning. It is centred on the base frame.
     cycle_s: duration of a cycle of its own gait, over which speeds and positions are averaged.
     gait: row of `physics.dynamics.legs.GAITS`.
     """
@@ -78,6 +85,7 @@ class Legs:
     trunk: tuple[str, ...]
     stand_m: float
     span_m: tuple[float, float]
+    stride_m: tuple[float, float]
     cycle_s: float
     gait: Literal["trot", "network"]
 
@@ -231,6 +239,7 @@ DOG = Robot(
         trunk=("base",),
         stand_m=0.27,
         span_m=(0.3868, 0.284),
+        stride_m=(0.83, 0.39),
         cycle_s=0.21,
         gait="trot",
     ),
@@ -268,6 +277,7 @@ WALKER = Robot(
         trunk=("base",),
         stand_m=0.7846,
         span_m=(0.17, 0.237),
+        stride_m=(0.65, 0.36),
         cycle_s=0.8,
         gait="network",
     ),

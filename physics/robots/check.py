@@ -72,6 +72,7 @@ def _row_faults(robot: Robot) -> Iterator[str]:
         ("acceleration_mps2", robot.acceleration_mps2, _RAMP),
         ("acceleration_radps2", robot.acceleration_radps2, _RAMP),
         *((f"drive.span_m[{k}]", side, _LENGTH_M) for k, side in enumerate(drive.span_m)),
+        *((f"drive.stride_m[{k}]", side, _LENGTH_M) for k, side in enumerate(drive.stride_m)),
     ]
     if isinstance(drive, Skid):
         values.append(("drive.wheel_radius_m", drive.wheel_radius_m, _LENGTH_M))

@@ -20,6 +20,7 @@ from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.progress import Progress
 from cosim.core.state import STILL, Command, LegState, Motion, RobotState, Street
+from cosim.policies.privileged.orca import axis_points
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import DOG, ROBOTS, Legs, Robot
 from cosim.spec.scenario import Barrier
@@ -151,6 +152,23 @@ def test_it_walks_straight_turns_and_stops(robot: Robot) -> None:
     with walking(robot, FLAT, START) as walk:
         _, way_m = stop(walk, v_mps)
     assert way_m < 0.5
+
+
+def test_the_oracle_plans_with_the_outline_of_the_moving_legs(robot: Robot, walk: Walk) -> None:
+    """Walking, turning and stopping, every point of the body is within the disks around the points
+    that the oracle checks."""
+    tree, parts = link_tree(urdf_path(robot)), link_parts(urdf_path(robot))
+    axis = np.array([(x, 0.0) for x in axis_points(robot)])
+    v, w = robot.cruise_mps, robot.w_max_radps
+    for command in (Command(v, 0.0), Command(0.5 * v, w), Command(0.0, -w), STILL):
+        for motion in walk.drive(command, 1.5):
+            posture = posture_of(FLAT, robot, motion.robot)
+            base = turned(posture.roll_rad, posture.pitch_rad, 0.0)
+            for link, (turn, shift) in tree.places(posture.angles_rad).items():
+                for part in parts[link]:
+                    points = (part.mesh.vertices @ (base @ turn).T + base @ shift)[:, None, :2]
+                    off_m = np.hypot(*(points - axis).transpose(2, 0, 1)).min(axis=1)
+                    assert off_m.max() < robot.width_m / 2 + 0.05
 
 
 def test_it_stands_for_a_minute(walk: Walk) -> None:

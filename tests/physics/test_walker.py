@@ -71,27 +71,46 @@ def test_a_push_while_it_stands_makes_it_step_and_stand_again(walk: Walk) -> Non
         assert walk.fallen == 0 and abs(walk.robot.v_mps) < 0.1
 
 
+SLOPE = Course([(-48.0, 0.0), (0.0, 4.0), (48.0, 0.0)])
+"""1:12 along x."""
+
+
 @pytest.mark.parametrize(
-    "course",
-    [STEPS, Course([(-48.0, 0.0), (0.0, 4.0), (48.0, 0.0)])],
-    ids=["step", "slope"],
+    ("course", "heading_deg", "seconds"),
+    [
+        (STEPS, 60.0, 1.55),
+        (SLOPE, 45.0, 1.55),
+        (SLOPE, 90.0, 1.55),
+        (SLOPE, 135.0, 1.5),
+        (SLOPE, -90.0, 1.5),
+    ],
 )
-def test_it_holds_its_place_where_it_cannot_stand_flat(course: Course) -> None:
-    """On an edge of 3 cm, and across a slope of 1:12: it stands or marks time, and drifts less than
-    10 cm in 10 s."""
-    across = Pose(-40.0, 0.0, 0.5 * math.pi)
-    with walking(WALKER, course, across) as walk:
-        walk.drive(Command(0.5, 0.0), 1.5)
+def test_it_holds_its_place_where_the_ground_is_not_level(
+    course: Course, heading_deg: float, seconds: float
+) -> None:
+    """Beside an edge of 3 cm, and across a slope of 1:12, after walks that end in different phases:
+    less than 5 cm and 3 degrees in a minute."""
+    with walking(WALKER, course, Pose(-40.0, 0.0, math.radians(heading_deg))) as walk:
+        walk.drive(Command(0.5, 0.0), seconds)
         walk.drive(STILL, 2.0)
-        drift_m, _ = stand(walk, 10.0)
-        assert drift_m < 0.1 and walk.fallen == 0
+        drift_m, turned_deg = stand(walk, 60.0)
+        assert drift_m < 0.05 and turned_deg < 3.0 and walk.fallen == 0
+
+
+def test_it_is_not_carried_off_where_it_marks_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Across a slope, without standing: less than 5 cm in 20 s."""
+    monkeypatch.setattr(NetworkGait, "_on_both_feet", lambda gait: False)
+    with walking(WALKER, SLOPE, Pose(-40.0, 0.0, 0.5 * math.pi)) as walk:
+        walk.drive(Command(0.5, 0.0), 1.55)
+        walk.drive(STILL, 2.0)
+        drift_m, _ = stand(walk, 20.0)
+        assert drift_m < 0.05 and walk.fallen == 0 and not stands(walk)
 
 
 def test_a_displaced_robot_without_a_command_stays_where_it_is() -> None:
     """Carried 1 m aside while it marks time on a slope, it does not walk back: it drifts by less than
     0.4 m."""
-    slope = Course([(-48.0, 0.0), (0.0, 4.0), (48.0, 0.0)])
-    with walking(WALKER, slope, Pose(-40.0, 0.0, 0.5 * math.pi)) as walk:
+    with walking(WALKER, SLOPE, Pose(-40.0, 0.0, 0.5 * math.pi)) as walk:
         walk.drive(Command(0.5, 0.0), 1.5)
         walk.drive(STILL, 1.0)
         assert not stands(walk)

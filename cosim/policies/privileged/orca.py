@@ -210,7 +210,7 @@ class Orca:
         ahead = roll_out(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
         gaps = gaps_to_people(known, robot, ahead, people, ends)
         weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
-        out, deeper = outside_area(known, here, ahead, robot.length_m * 2 / 7)
+        out, deeper = outside_area(known, here, ahead, axis_points(robot))
         cost = (
             weights.edge * out
             + _SOLID_COST * deeper
@@ -442,20 +442,36 @@ def vehicle_violation(known: Privileged, disks: BodyDisks, ahead: Rollout) -> Fl
     return nearness
 
 
+def axis_points(robot: Robot) -> list[float]:
+    """Return the points on the robot's axis that are checked against obstacles.
+
+    Metres ahead of the base centre. Disks around them, _SOLID_M larger than half the width of the
+    robot, cover its outline, and the legs in motion.
+    """
+    radius_m = robot.width_m / 2 + _SOLID_M
+    nose_m, between_m = robot.length_m * 2 / 7, math.inf
+    for length_m, width_m in (robot.footprint_m, robot.drive.stride_m):
+        covered_m = math.sqrt(max(radius_m**2 - (width_m / 2) ** 2, _SOLID_M**2))
+        nose_m = max(nose_m, length_m / 2 - covered_m)
+        between_m = min(between_m, 2.0 * covered_m)
+    count = math.ceil(nose_m / between_m)
+    return [nose_m * (k / count) for k in range(-count, count + 1)]
+
+
 def outside_area(
-    known: Privileged, here: PathState, ahead: Rollout, nose_m: float
+    known: Privileged, here: PathState, ahead: Rollout, axis_m: Sequence[float]
 ) -> tuple[Floats, Floats]:
     """Return how far each plan leaves the free area.
 
-    nose_m: Distance in metres from the base centre to the points checked before and behind it.
+    axis_m: Points checked, as of `axis_points`.
     Returns: (K,) weighted fraction of the plan outside the free area, where early steps weigh most;
         and (K,) metres that the body soon gets deeper into obstacles.
     """
     present = np.array(known.robot.pose)[:, None]
     pose = np.concatenate([np.broadcast_to(present, (1, *ahead.pose.shape[1:])), ahead.pose[::2]])
-    along = nose_m * np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
+    along = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
     middle = np.stack([pose[:, 0], pose[:, 1]], axis=-1)
-    room = here.clearance.at(np.stack([middle - along, middle, middle + along]))
+    room = here.clearance.at(np.stack([middle + one_m * along for one_m in axis_m]))
     room[:, 1:][:, ahead.s_m[::2] >= here.way.length_m] = np.inf
     off = room[1:, 1:].min(axis=0) < _EDGE_M
     body = room.min(axis=0)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from cosim.spec.robot import Legs
 from physics.dynamics.drive import MeasuredBody
 from physics.dynamics.legs.pd import torques_nm
-from physics.robots.kinematics import Frame, LinkTree, centre_of_mass, rotate, rows_of
+from physics.robots.kinematics import Frame, LinkTree, centre_of_mass, inverse, rotate, rows_of
 from physics.robots.model import Model, Triple
 
 _GRAVITY_MPS2: Final = 9.81
@@ -44,6 +44,18 @@ class Stance:
     kd: tuple[float, ...]
 
 
+class Feet(NamedTuple):
+    """Placement of two feet, in the world.
+
+    apart_m: vector from the right foot to the left one.
+    left, right: unit vectors upwards from the soles.
+    """
+
+    apart_m: Triple
+    left: Triple
+    right: Triple
+
+
 class Balance:
     """Balance of one robot that stands on both feet."""
 
@@ -59,11 +71,14 @@ class Balance:
         self._behind_m: Triple = (0.0, 0.0, 0.0)
         self._omega_hz = 1.0
 
-    def lifted_m(self, body: MeasuredBody) -> float:
-        """Return the height of the left ankle over the right one."""
-        left, right = self._feet(self._frames(body))
+    def feet(self, body: MeasuredBody) -> Feet:
+        """Return how both feet are placed."""
+        frames = self._frames(body)
+        (turn_left, left), (turn_right, right) = (frames[foot] for foot in self._legs.feet)
+        turn = rows_of(body.rotation)
         apart = left[0] - right[0], left[1] - right[1], left[2] - right[2]
-        return rotate(rows_of(body.rotation), apart)[2]
+        normals = (rotate(turn, inverse(one)[2]) for one in (turn_left, turn_right))
+        return Feet(rotate(turn, apart), *normals)
 
     def begin(self, body: MeasuredBody) -> None:
         """Freeze the joints at their present angles."""

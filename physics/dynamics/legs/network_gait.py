@@ -4,8 +4,8 @@ Commands reach the network at once, without the ramps of the robot's row: the ne
 speed about as fast as these ramps, and stops later with ramps in front of it (docs/robots.md).
 
 The network decides at its own rate; torques follow its targets in every substep. Without a command
-a biped balances on frozen joints (`balance.py`). Other robots, and a biped whose feet are not
-level, hold their place by small commands to the network.
+a biped balances on frozen joints (`balance.py`). Other robots, and a biped with an edge between its
+feet, hold their place by small commands to the network.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cosim.core.network import Network
 from cosim.core.state import Command
 from cosim.spec.robot import Legs, Robot
 from physics.dynamics.drive import MeasuredBody
-from physics.dynamics.legs.balance import Balance, Stance
+from physics.dynamics.legs.balance import Balance, Feet, Stance
 from physics.dynamics.legs.gait_manifest import (
     AngularVelocity,
     CommandTerm,
@@ -40,12 +40,16 @@ from physics.robots import urdf_path
 from physics.robots.kinematics import inverse, link_tree, rotate, rows_of
 from physics.robots.model import Model
 
-_HOLD_HZ: Final = 2.0
+_HOLD_HZ: Final = 2.5
 """Speed per distance from the place that is held."""
-_HOLD_MPS: Final = 0.2
-"""Largest speed of a robot that holds its place."""
+_HOLD_MPS: Final = 0.3
+"""Largest speed of a robot that holds its place, and largest integral of its error."""
+_HOLD_MORE_HZ2: Final = 1.5
+"""Rate of the speed per distance from the held place, against a slope that carries it off."""
 _HOLD_RADPS: Final = 0.6
 """Largest yaw rate of a robot that holds its place."""
+_THERE_M: Final = 0.02
+"""Distance from the held place within which its error is not integrated."""
 _ANCHOR_M: Final = 0.1
 """Distance from the held place above which a displaced robot holds its present place."""
 _SLOW_MPS: Final = 0.08
@@ -57,9 +61,9 @@ _INTEGRAL_MOST: Final = 0.4
 _LEANS: Final = 0.2
 """Sine of the trunk's lean above which errors of speed are not integrated: the robot stumbles."""
 _LEVEL_M: Final = 0.004
-"""Largest deviation of the feet's heights from those on the ground when the joints are frozen."""
-_EVEN_M: Final = 0.01
-"""Difference of height of the ground under both feet below which it is taken as level."""
+"""Largest distance of a foot from the ground when the joints are frozen."""
+_EVEN_M: Final = 0.02
+"""Height of an edge between both feet below which the ground is taken as a plane."""
 _STEADY_S: Final = 2.0
 """Time of standing after which a robot that loses its balance may try to stand again."""
 _HOLD_AFTER_S: Final = 0.6
@@ -124,11 +128,12 @@ class NetworkGait:
         self._actions = [0.0] * len(self._order)
         self._count = 0
         self._v_more = self._w_more = 0.0
+        self._hold_more = 0.0, 0.0
         self._past: deque[tuple[float, float, float]] = deque(maxlen=self._cycle + 1)
         self._place: tuple[float, float, float] | None = None
         self._idle_s = 0.0
         self._stood = 0
-        self._lifted: deque[float] = deque(maxlen=self._cycle)
+        self._steps: deque[Feet] = deque(maxlen=self._cycle)
 
     def step(self, command: Command, body: MeasuredBody) -> Sequence[float]:
         """Return the joints' torques in Nm for the next substep, without limits."""
@@ -154,12 +159,12 @@ class NetworkGait:
 
         If the robot has not stood for long, as across a slope, it marks time until it walks again.
         """
-        place = self._place
+        place, more = self._place, self._hold_more
         self._may_stand = commanded or self._stood >= self._steady
         self._stands = self._frozen = False
         self._start()
         if not self._may_stand:
-            self._place = place
+            self._place, self._hold_more = place, more
 
     def _decide(self, commanded: bool, body: MeasuredBody) -> None:
         """Query the network, or let the robot stand."""
@@ -169,18 +174,19 @@ class NetworkGait:
         self._past.append((x, y, heading))
         if commanded:
             self._place, self._idle_s, self._may_stand = None, 0.0, self._balance is not None
-            self._lifted.clear()
+            self._steps.clear()
+            self._hold_more = 0.0, 0.0
             command = self._corrected(body)
         else:
             self._v_more = self._w_more = 0.0
             slow = self._is_slow()
-            if self._may_stand and self._balance is not None:
-                self._lifted.append(self._balance.lifted_m(body))
-            if self._balance is not None and self._may_stand and slow and self._on_both_feet():
-                self._balance.begin(body)
-                self._stands = self._frozen = self._balance.holds(body)
-            if self._stands:
-                return
+            if self._balance is not None and self._may_stand:
+                self._steps.append(self._balance.feet(body))
+                if slow and self._on_both_feet():
+                    self._balance.begin(body)
+                    self._stands = self._frozen = self._balance.holds(body)
+                if self._stands:
+                    return
             self._idle_s += self._decision_s
             if self._place is not None and math.dist(self._place[:2], (x, y)) > _ANCHOR_M:
                 self._place = x, y, heading
@@ -192,14 +198,19 @@ class NetworkGait:
     def _on_both_feet(self) -> bool:
         """Return whether both feet are on the ground.
 
-        A robot that marks time lifts them in turn. On the ground, their difference of height is in
-        the middle of its range, also on a slope.
+        A robot that marks time lifts its feet in turn. Where a foot is lifted most, the other sole
+        lies on the ground: both soles give its plane. On an edge the feet are lifted unequally.
         """
-        ground_m = 0.5 * (max(self._lifted) + min(self._lifted))
-        if abs(ground_m) < _EVEN_M:
-            ground_m = 0.0
-        full = len(self._lifted) == self._cycle
-        return full and abs(self._lifted[-1] - ground_m) < _LEVEL_M
+        if len(self._steps) < self._cycle:
+            return False
+        highest = max(self._steps, key=lambda one: one.apart_m[2])
+        lowest = min(self._steps, key=lambda one: one.apart_m[2])
+        ground = [0.5 * (a + b) for a, b in zip(highest.right, lowest.left, strict=True)]
+        high, low, now = (
+            math.fsum([a * b for a, b in zip(ground, one.apart_m, strict=True)])
+            for one in (highest, lowest, self._steps[-1])
+        )
+        return abs(now) < _LEVEL_M and abs(0.5 * (high + low)) < _EVEN_M
 
     def _is_slow(self) -> bool:
         """Return whether the robot has hardly moved in the last gait cycle."""
@@ -238,11 +249,22 @@ class NetworkGait:
         if self._place is None:
             return 0.0, 0.0, 0.0
         dx, dy = self._place[0] - x_m, self._place[1] - y_m
+        if math.hypot(dx, dy) > _THERE_M:
+            gain = _HOLD_MORE_HZ2 * self._decision_s
+            x_more, y_more = (
+                min(max(more + gain * error, -_HOLD_MPS), _HOLD_MPS)
+                for more, error in zip(self._hold_more, (dx, dy), strict=True)
+            )
+            self._hold_more = x_more, y_more
+        dx, dy = (
+            _HOLD_HZ * error + more for error, more in zip((dx, dy), self._hold_more, strict=True)
+        )
         cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-        errors = (cos * dx + sin * dy, cos * dy - sin * dx, _wrapped(self._place[2] - heading_rad))
+        turn = _HOLD_HZ * _wrapped(self._place[2] - heading_rad)
+        wished = cos * dx + sin * dy, cos * dy - sin * dx, turn
         v, u, w = (
-            min(max(_HOLD_HZ * one, -most), most)
-            for one, most in zip(errors, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
+            min(max(one, -most), most)
+            for one, most in zip(wished, (_HOLD_MPS, _HOLD_MPS, _HOLD_RADPS), strict=True)
         )
         return v, u, w
 
