@@ -23,9 +23,9 @@ from cosim.core.files import atomic_file
 from cosim.core.packed_demos import packed_digest
 from cosim.core.progress import Progress
 from cosim.core.units import duration
-from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
+from cosim.learning.bundle import bundle_facts, source_of, write_bundle
 from cosim.learning.curve import CURVE, draw_curve, write_curve
-from cosim.learning.graph import load_parameters
+from cosim.learning.graph import MODEL, load_parameters
 from cosim.learning.kind import ExampleSet
 from cosim.learning.networks import NETWORKS
 from cosim.learning.settings import (
@@ -105,6 +105,8 @@ def _train(
     )
     base = None if training.begin is None else bundle_facts(training.begin)
     examples = network.examples(paths, training, device)
+    if weighting := examples.meta.get("weighting"):
+        progress(weighting)
     folder.mkdir(parents=True, exist_ok=True)
     spec = training.spec | {
         "data": ", ".join(map(packed_digest, paths)),

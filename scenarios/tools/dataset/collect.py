@@ -485,6 +485,8 @@ def _write_about(out: Path, about: dict[str, Any]) -> None:
 def _about(spec: CollectSpec, demonstrator: Demonstrator, robot: str) -> dict[str, Any]:
     """Return how the data set was collected."""
     camera = spec.collecting.camera
+    learner = "" if demonstrator.learner is None else demonstrator.learner.manifest.name
+    explores = spec.collecting.explore > 0.0
     return {
         "rate_hz": spec.collecting.rate_hz,
         "waypoint_s": spec.collecting.waypoint_s,
@@ -496,10 +498,12 @@ def _about(spec: CollectSpec, demonstrator: Demonstrator, robot: str) -> dict[st
         "people": demonstrator.manifest.people,
         "robot": robot,
         "weather": spec.weather,
-        "policy": demonstrator.manifest.name,
+        "policy": "" if explores else demonstrator.manifest.name,
         "policy_source": spec.policy_source,
         "noise": spec.collecting.noise,
-        "learner": "" if demonstrator.learner is None else demonstrator.learner.manifest.name,
+        "learner": "" if explores else learner,
+        "explorer": learner if explores else "",
+        "explore": spec.collecting.explore,
         "learner_source": spec.learner_source,
         "suite": spec.suite,
         "seed": spec.seed,

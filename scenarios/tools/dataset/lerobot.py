@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.packed_demos import LABELS
+from cosim.core.packed_demos import LABELS, REWARD
 from scenarios.episodes.clip import CODEC, PIXELS, join_clips
 from scenarios.tools.dataset.collected import Collected
 
@@ -47,11 +47,13 @@ _SPEEDS: Final = ("v_mps", "w_radps")
 
 
 def feature_of(extra: str) -> str:
-    """Return the name of the feature of a sensor or a label.
+    """Return the name of the feature of a sensor, a label or the reward.
 
-    >>> feature_of("imu"), feature_of("free")
-    ('observation.imu', 'label.free')
+    >>> feature_of("imu"), feature_of("free"), feature_of("reward")
+    ('observation.imu', 'label.free', 'next.reward')
     """
+    if extra == REWARD:
+        return f"next.{REWARD}"
     return f"{'label' if extra in LABELS else 'observation'}.{extra}"
 
 
