@@ -92,7 +92,8 @@ def source_of(meta: Mapping[str, Any], seed: int, begun: BundleFacts | None = No
         *([f"on what {experts} drove{corrections}"] if experts else []),
         *([f"on what {explorers} drove with rewards"] if explorers else []),
     ]
-    return f"cosim train, seed {seed}, {' and '.join(parts)}" + (
+    weighting = f"; {meta['weighting']}" if "weighting" in meta else ""
+    return f"cosim train, seed {seed}, {' and '.join(parts)}{weighting}" + (
         f"; begun with {begun.name}" if begun else ""
     )
 

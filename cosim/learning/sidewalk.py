@@ -43,8 +43,8 @@ _WEIGHTS: Final = {**PLAN_WEIGHTS, "near": 0.5, "free": 1.0, "signal": 0.2, "eve
 _MOST_WINDOWS: Final = 96
 """Largest number of held-out windows of an evaluation."""
 _AT_ONCE: Final = 16
-_LEAST_REWARDED: Final = 1000
-"""Least number of training rows with rewards for a regression on the features."""
+_LEAST_REWARDED: Final = 50
+"""Least number of training rows with rewards."""
 
 
 def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOutput:

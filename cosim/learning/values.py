@@ -24,7 +24,7 @@ HORIZON_S: Final = 5.0
 """Time in which the weight of a reward in a return falls by the factor e."""
 MOST_WEIGHT: Final = 20.0
 """Largest weight, before weights are scaled to the mean 1."""
-_RIDGE: Final = 1e-2
+_RIDGE: Final = 1e-3
 """Penalty of the squared coefficients of standardised features, per row."""
 
 

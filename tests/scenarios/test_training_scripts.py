@@ -18,13 +18,15 @@ while [ $# -gt 0 ]; do
   case $1 in
     collect) command=$1 ;;
     compare) command=$1 ;;
-    -o | --out) out=$2 ;;
+    -o | --out) out=$2; outs+=("$2") ;;
   esac
   shift
 done
 case ${command:-} in
   collect) exit "$CODE" ;;
-  compare) echo "a table" > "$out" ;;
+  compare) for out in "${outs[@]}"; do
+      case $out in *.csv) echo "$TABLE" > "$out" ;; *) echo "a table" > "$out" ;; esac
+    done ;;
   *) case $out in *.npz) touch "${out%.npz}-000.npz" ;; *) mkdir -p "$out"; touch "$out/run.json" ;; esac ;;
 esac
 """
@@ -48,10 +50,12 @@ def called(
         | {"COSIM": str(folder / "cosim"), "PYTHON": str(folder / "python"), "CALLS": str(calls)}
         | {
             "CODE": str(code),
+            "TABLE": "",
             "JOBS": "1",
             "ROUNDS": "1",
             "ROBOTS": "",
             "SEEDS": "0",
+            "VALUES": "",
             "SUITES": "unit",
         }
         | settings,
@@ -93,6 +97,38 @@ def test_the_script_ends_with_a_table(
     trained = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
     assert trained[: len(names)] == names and len(trained) == len(set(trained))
     assert sum("compare" in call for call in calls) == table
+
+
+HEAD = "by,metric,value_before,value_after,verdict\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "kept"),
+    [
+        ("suite,success,0.5,0.6,better\nsuite,discerned,0.5,0.5,within noise", "values"),
+        ("suite,success,0.5,0.6,better\nsuite,discerned,0.5,0.4,within noise", "sidewalk-0"),
+        ("suite,success,0.5,0.5,within noise\nevent,success,0.5,0.6,better", "sidewalk-0"),
+    ],
+    ids=["one rises", "one falls", "none rises"],
+)
+def test_fine_tuning_is_kept_if_val_improves(tmp_path: Path, rows: str, kept: str) -> None:
+    """The learner explores, what it drove is weighted, and the better one drives with black
+    pictures. Questions train on one event, and with goals of both kinds."""
+    settings = {"VALUES": "0.5", "QUESTIONS": "1", "SUITES": "reactive", "SPLIT": "test"}
+    done, calls = called(tmp_path, **settings, TABLE=HEAD + rows)
+    assert done.returncode == 0 and f"kept: {kept}\n" in done.stdout, done
+    net = tmp_path / "work/nets/sidewalk-0"
+    explored = [call for call in calls if f"--learner onnx:{net} --explore 0.3" in call]
+    assert len(explored) == 3 and not any("--noise" in call for call in explored)
+    (tuned,) = [call for call in calls if "--values 0.5" in call]
+    assert f"--from {net}" in tuned and "values-reactive-0-000.npz" in tuned
+    assert sum("--split val" in call for call in calls) == 2
+    (one,) = [call for call in calls if "--event gesturing" in call]
+    assert f"--learner onnx:{net}" in one and "--decoys" in one
+    for goal in ("route", "random"):
+        assert sum(f"--goal {goal}_point" in call for call in calls) == 1
+    names = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
+    assert names[-3:] == ["sidewalk-event", "sidewalk-route-goals", "sidewalk-random-goals"]
 
 
 def test_a_collection_must_fit_in_a_piece(tmp_path: Path) -> None:
