@@ -15,7 +15,7 @@
 # trains with random goals and with route goals. SPLIT, SUITES: what is scored (val; all three). RUN: more words for cosim run.
 # The table of a suite is WORK/SUITE.md, its picture WORK/SUITE.png: all policies, compared with the first one.
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
-# MOST: most episodes of a collection with events (100000).
+# MOST: most episodes of a collection (100000); small ones are drawn faster, which matters on few cores.
 # ROBOTS: further robots that collect, besides the courier ("scout dog"). WEATHERS: names from which each episode's is drawn.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
@@ -31,13 +31,17 @@ awk "BEGIN { exit !($COLLECT < ${MINUTES:-9}) }" || { echo "COLLECT=$COLLECT mus
 
 gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes as fit in COLLECT minutes, over all calls
   name=$1 gpu=$3 most=$4 jobs=$(awk "BEGIN { n = int($2 * $JOBS + 0.5); print n < 1 ? 1 : n }"); shift 4
-  export USED=$W/log/collect-$name.seconds LAST
+  export USED=$W/log/collect-$name.seconds DEMO=$W/demos/$name LAST
   [ -e "$W/log/collect-$name.done" ] && return 0
   rest=$(awk "BEGIN { n = int(60 * $COLLECT) - $(cat "$USED" 2> /dev/null || echo 0); print n < 1 ? 1 : n }")
   now=$((END - SECONDS - MARGIN_S)); [ "$now" -lt "$rest" ] || now=$rest
   LAST=$((now == rest))
-  # Exit code 4: the time is up. The collection is done if this was the rest of its time.
+  [ "$most" -lt "$MOST" ] || most=$MOST
+  # Exit code 4: the time is up. The collection is done if this was the rest of its time, and an episode is finished.
   GLCONTEXT_DEVICE_INDEX=$gpu step "collect-$name" bash -c '"$@"; code=$?; [ $code = 4 ] || exit $code
+    if [ $LAST = 1 ] && ! compgen -G "$DEMO/runs/*/episodes/*/demonstration.npz" > /dev/null; then
+      rm -f "$USED"; echo "no episode in COLLECT minutes: continuing"; exit 1
+    fi
     echo $(($(cat "$USED" 2> /dev/null || echo 0) + SECONDS)) > "$USED"; [ $LAST = 1 ]' - \
     $COSIM collect "$@" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --fov 60 --labels --format raw \
     --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
@@ -50,7 +54,7 @@ packed() { # names...: packs their collections, when all are done
   mkdir -p "$W/packed"
   for name in "$@"; do [ -e "$W/log/collect-$name.done" ] || exit 1; done
   for name in "$@"; do
-    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --jobs "$JOBS"
+    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --part 32 --jobs "$JOBS"
   done
 }
 round() { # name, number, words of the driver...: collects in parallel, then packs

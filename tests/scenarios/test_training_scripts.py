@@ -23,7 +23,8 @@ while [ $# -gt 0 ]; do
   shift
 done
 case ${command:-} in
-  collect) exit "$CODE" ;;
+  collect) [ -n "$EMPTY" ] || { mkdir -p "$out/runs/00/episodes/a"; touch "$out/runs/00/episodes/a/demonstration.npz"; }
+    exit "$CODE" ;;
   compare) for out in "${outs[@]}"; do
       case $out in *.csv) echo "$TABLE" > "$out" ;; *) echo "a table" > "$out" ;; esac
     done ;;
@@ -51,6 +52,7 @@ def called(
         | {
             "CODE": str(code),
             "TABLE": "",
+            "EMPTY": "",
             "JOBS": "1",
             "ROUNDS": "1",
             "ROBOTS": "",
@@ -75,6 +77,15 @@ def test_a_collection_that_crashed_is_not_done(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.glob("work/log/*.done")] == ["collect-0-unit.done"]
     minutes = {call.split()[2]: float(call.split("--minutes ")[1].split()[0]) for call in calls}
     assert minutes["unit"] < 0.1 and 3.0 < minutes["long-horizon"] <= 3.5
+
+
+def test_a_collection_without_episodes_is_not_done(tmp_path: Path) -> None:
+    """If its time was too short for one, the next call collects again, for as long."""
+    done, calls = called(tmp_path, EMPTY="1")
+    assert done.returncode == 1 and "no episode in COLLECT minutes" in done.stdout
+    assert not [*tmp_path.glob("work/log/*.done")] and not any("pack" in call for call in calls)
+    done, _ = called(tmp_path)
+    assert done.stdout.endswith("all done\n")
 
 
 @pytest.mark.parametrize(
