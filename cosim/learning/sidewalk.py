@@ -187,7 +187,13 @@ def _weigh(
         for part in np.array_split(starts, -(-len(starts) // _AT_ONCE)):
             known = _run(parameters, examples.windows(part, STEPS), training).known
             features.append(known.float().cpu().numpy())
-    found = weights_of(np.concatenate(features), examples.returns[rows], learned, training.values)
+    found = weights_of(
+        np.concatenate(features),
+        examples.returns[rows],
+        examples.episode[rows],
+        learned,
+        training.values,
+    )
     examples.weight[torch.from_numpy(rows[learned])] = torch.from_numpy(found.weight[learned]).to(
         examples.weight.device
     )

@@ -7,9 +7,9 @@ regression (Peng et al., 2019, arXiv 1910.00177), as in MARWIL (Wang et al., Neu
 (Wang et al., 2020, arXiv 2006.15134). It is a step to a better policy near the one that drove.
 
 The value is a ridge regression on features of the network that drove. It is fitted once, before
-the training, on training episodes alone. It can be noisy where chance decides: a lucky episode is
-imitated like a good one (Paster et al., 2022, arXiv 2205.15967). Therefore exploration changes
-commands in every episode, and weights are bounded.
+the training, on other training episodes than those that it judges. It can be noisy where chance
+decides: a lucky episode is imitated like a good one (Paster et al., 2022, arXiv 2205.15967).
+Therefore exploration changes commands in every episode, and weights are bounded.
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ HORIZON_S: Final = 5.0
 """Time in which the weight of a reward in a return falls by the factor e."""
 MOST_WEIGHT: Final = 20.0
 """Largest weight, before weights are scaled to the mean 1."""
-_RIDGE: Final = 1e-3
-"""Penalty of the squared coefficients of standardised features, per row."""
+_RIDGES: Final = (1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0)
+"""Penalties of the squared coefficients of standardised features, per row, to choose from."""
+_FOLDS: Final = 5
+"""Number of parts of the training episodes; the value of each is fitted on the others."""
+_TOGETHER: Final = 8
+"""Number of consecutive episodes in a part: an event, its decoy and what follows a reset."""
 
 
 def discounted_returns(
@@ -75,6 +79,7 @@ class Weighting(NamedTuple):
 def weights_of(
     features: NDArray[np.float32],
     returns: NDArray[np.float64],
+    episode: NDArray[np.int64],
     learned: NDArray[np.bool_],
     temperature: float,
 ) -> Weighting:
@@ -82,16 +87,11 @@ def weights_of(
 
     features: (N, F) of what the network sees
     returns: (N,) discounted returns
+    episode: (N,) numbers, of which neighbours may be alike
     learned: (N,) whether a row is trained on; the others judge the value
     temperature: in standard deviations of the advantage
     """
-    mean, spread = features[learned].mean(axis=0), features[learned].std(axis=0)
-    scaled = (features - mean) / np.where(spread > 0.0, spread, 1.0)
-    inputs = scaled[learned].astype(np.float64)
-    middle = returns[learned].mean()
-    moments = inputs.T @ inputs + _RIDGE * len(inputs) * np.eye(inputs.shape[1])
-    factors = np.linalg.solve(moments, inputs.T @ (returns[learned] - middle))
-    advantage = returns - middle - scaled @ factors
+    advantage = _advantages(features, returns, episode, learned)
     others = ~learned
     variance = float(returns[others].var()) if others.any() else 0.0
     explained = 1.0 - float(np.mean(advantage[others] ** 2)) / variance if variance else math.nan
@@ -100,3 +100,36 @@ def weights_of(
     total, squares = weight[learned].sum(), (weight[learned] ** 2).sum()
     effective = float(total**2 / squares / learned.sum())
     return Weighting((weight * (learned.sum() / total)).astype(np.float32), explained, effective)
+
+
+def _advantages(
+    features: NDArray[np.float32],
+    returns: NDArray[np.float64],
+    episode: NDArray[np.int64],
+    learned: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Return the returns minus values (N,), see `weights_of`.
+
+    The value of a training row is fitted on the other folds of training episodes: one that has
+    seen the row's own return would hide its advantage. The penalty is that of the least error.
+    """
+    mean, spread = features[learned].mean(axis=0), features[learned].std(axis=0)
+    scaled = ((features - mean) / np.where(spread > 0.0, spread, 1.0)).astype(np.float64)
+    off = returns - returns[learned].mean()
+    fold = np.where(learned, episode // _TOGETHER % _FOLDS, _FOLDS)
+    rows = [fold == k for k in range(_FOLDS + 1)]
+    squares = np.stack([scaled[of].T @ scaled[of] for of in rows[:-1]])
+    products = np.stack([scaled[of].T @ off[of] for of in rows[:-1]])
+    values = np.zeros((len(off), len(_RIDGES)))
+    for k, of in enumerate(rows):
+        others = [other for other in range(_FOLDS) if other != k]
+        count = max(sum(int(rows[other].sum()) for other in others), 1)
+        square, product = squares[others].sum(axis=0), products[others].sum(axis=0)
+        factors = [
+            np.linalg.solve(square + ridge * count * np.eye(len(square)), product)
+            for ridge in _RIDGES
+        ]
+        values[of] = scaled[of] @ np.stack(factors, axis=1)
+    errors = ((off[:, None] - values)[learned] ** 2).mean(axis=0)
+    found: NDArray[np.float64] = off - values[:, int(errors.argmin())]
+    return found

@@ -96,6 +96,7 @@ class WindowExamples:
 
     learned, held_out: rows (M,) of training and held-out episodes
     episodes: numbers of both
+    episode: (M,) ascending numbers of the episodes
     returns: (M,) discounted returns, NaN without rewards
     weight: (M,) float32 on the device, of the plan's loss; all 1 at first
     meta: common metadata of the files, with the drivers of all of them
@@ -110,6 +111,7 @@ class WindowExamples:
         firsts = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         episode = np.concatenate([one.episode + n for one, n in zip(packed, firsts, strict=False)])
         frame = np.concatenate([one.frame for one in packed])
+        self.episode = episode
         rows = np.arange(len(episode))
         self._first = rows - frame
         self._last = self._first + np.bincount(episode)[episode] - 1
