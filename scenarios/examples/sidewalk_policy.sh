@@ -12,7 +12,7 @@
 # VALUES: temperature of the fine-tuning on rewards (1; "" for none). The first seed's policy explores, and is trained on what it drove,
 # weighted by values, for MORE steps (2000). WORK/kept.txt has the better one of both on val.
 # ABLATIONS=1: trains seed 0 again with each change of docs/learning.md. QUESTIONS=1: fine-tunes on one EVENT (gesturing) alone, and
-# trains with random goals and with route goals. SPLIT, SUITES: what is scored (val; all three). RUN: more words for cosim run.
+# scores the first seed's policy with random goals in place of route goals. SPLIT, SUITES: what is scored (val; all three). RUN: more words for cosim run.
 # The table of a suite is WORK/SUITE.md, its picture WORK/SUITE.png: all policies, compared with the first one.
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
 # MOST: most episodes of a collection (100000); small ones are drawn faster, which matters on few cores.
@@ -46,9 +46,6 @@ gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes
     $COSIM collect "$@" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --fov 60 --labels --format raw \
     --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
 )
-cities() { # number: the range of cities of a round
-  echo "$((900 + 100 * $1)):$((900 + 100 * $1 + CITIES))"
-}
 packed() { # names...: packs their collections, when all are done
   local name
   mkdir -p "$W/packed"
@@ -76,12 +73,6 @@ round() { # name, number, words of the driver...: collects in parallel, then pac
   wait
   packed "${names[@]}"
 }
-alone() { # name, number, words...: collects reactive scenarios on all processes, then packs
-  local name=$1 number=$2; shift 2
-  gather "$name" 1 0 "$MOST" reactive --decoys --cities "$(cities "$number")" --city-size 1000 --seed "$number" --astray 0.3 --unsolved "$@" &
-  wait
-  packed "$name"
-}
 parts() { # last round: the packed files up to it
   for k in $(seq "$FIRST" "$1"); do ls "$W"/packed/"$k"-*.npz; done
 }
@@ -107,9 +98,10 @@ ablation() {
   local words=(); case $1 in share-*) words=(--share "${1#share-}") ;; no-*) words=("--$1") ;; esac
   sidewalk "$1" $((FIRST + ROUNDS - 1)) --seed 0 "${words[@]}"
 }
-score() { # name, suite, policy, split
-  local more=(); [ -e "$W/runs/$1/run.json" ] && more=(--resume)
-  step "run-$1" $COSIM run "$2" --split "${4:-$SPLIT}" --seed 1 --jobs "$JOBS" --policy "$3" --out "$W/runs/$1" $RUN "${more[@]}"
+score() { # name, suite, policy, split, words...
+  local name=$1 suite=$2 policy=$3 split=${4:-$SPLIT}; shift "$(($# < 4 ? $# : 4))"
+  local more=(); [ -e "$W/runs/$name/run.json" ] && more=(--resume)
+  step "run-$name" $COSIM run "$suite" --split "$split" --seed 1 --jobs "$JOBS" --policy "$policy" --out "$W/runs/$name" $RUN "$@" "${more[@]}"
 }
 compared() { # name, words...: compares runs, and shows the end of the output if that fails
   local name=$1; shift
@@ -131,13 +123,12 @@ values() { # learner: fine-tunes it on rewards; writes the better one of both on
   mv "$W/kept.txt.part" "$W/kept.txt"
   echo "kept: $(cat "$W/kept.txt")"
 }
-questions() { # learner: does fine-tuning on one event cost others? are random goals as good as route goals?
-  alone event $((FIRST + ROUNDS + 1)) --event "$EVENT" --learner "onnx:$W/nets/$1" --noise 0.7
+questions() { # learner: does fine-tuning on one event cost others?
+  local number=$((FIRST + ROUNDS + 1))
+  gather event 1 0 "$MOST" reactive --event "$EVENT" --decoys --cities $((900 + 100 * number)):$((900 + 100 * number + CITIES)) \
+    --city-size 1000 --seed "$number" --astray 0.3 --unsolved --learner "onnx:$W/nets/$1" --noise 0.7
+  packed event
   network event "$W"/packed/event-*.npz --from "$W/nets/$1" --steps "$MORE" --rate 1e-4 --seed 0
-  for goal in route random; do
-    alone "$goal-goals" $((FIRST + ROUNDS + 2)) --noise 0.3 --goal "${goal}_point"
-    network "$goal-goals" "$W/packed/$goal"-goals-*.npz --steps "$STEPS" --rate 5e-4 --seed 0
-  done
 }
 
 learner=$FROM
@@ -163,7 +154,7 @@ if [ -n "$first" ] && [ -n "$VALUES" ]; then
 fi
 if [ -n "$first" ] && [ "${QUESTIONS:-0}" = 1 ]; then
   questions "$first"
-  names+=(event route-goals random-goals)
+  names+=(event)
 fi
 if [ "${ABLATIONS:-0}" = 1 ]; then
   changes=(share-0.01 share-0.1 no-memory no-auxiliary no-decoys no-weather)
@@ -173,6 +164,9 @@ if [ "${ABLATIONS:-0}" = 1 ]; then
 fi
 for suite in $SUITES; do
   for name in "${names[@]}"; do score "$suite-$name" "$suite" "onnx:$W/nets/$name"; done
+  if [ -n "$first" ] && [ "${QUESTIONS:-0}" = 1 ]; then
+    score "$suite-random-goals" "$suite" "onnx:$W/nets/$first" "$SPLIT" --goal random_point
+  fi
 done
 if [ -n "$first" ] && [[ " $SUITES " = *" reactive "* ]]; then
   export POLICY=onnx:$W/nets/$kept
@@ -180,7 +174,7 @@ if [ -n "$first" ] && [[ " $SUITES " = *" reactive "* ]]; then
 fi
 for suite in $SUITES; do
   runs=()
-  for name in "${names[@]}" black; do [ -e "$W/runs/$suite-$name/run.json" ] && runs+=("$W/runs/$suite-$name"); done
+  for name in "${names[@]}" black random-goals; do [ -e "$W/runs/$suite-$name/run.json" ] && runs+=("$W/runs/$suite-$name"); done
   [ ${#runs[@]} -gt 1 ] || continue
   compared "$suite" "${runs[@]}" -o "$W/$suite.md" -o "$W/$suite.png" --by policy
   echo "$suite:"; cat "$W/$suite.md"
