@@ -109,7 +109,7 @@ def _picture_of(comparison: RunComparison, by: str) -> bytes:
         return draw_curves(summary_by_weather(comparison), ("weather", "policy"), DRAWN, title)
     summary = summary_by_policy(comparison)
     drawn = [name for name in DRAWN_BY_POLICY if (summary["metric"] == name).any()]
-    return draw_curves(summary, ("policy",), drawn, title)
+    return draw_curves(summary, ("policy",), drawn, title, joined=False)
 
 
 def print_comparison(out: Console, comparison: RunComparison) -> None:

@@ -62,11 +62,16 @@ _OFFSET: Final = 0.012
 
 
 def draw_curves(
-    summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[str], title: str
+    summary: pd.DataFrame,
+    fields: Sequence[str],
+    metrics: Sequence[str],
+    title: str,
+    joined: bool = True,
 ) -> bytes:
     """Draw the means with their intervals as PNG.
 
     summary: rows of fields, metric, mean, low, high, n
+    joined: whether lines join the means
 
     Raises MachineError if matplotlib is not installed.
     """
@@ -107,6 +112,8 @@ def draw_curves(
                 marker=marker,
                 capsize=3,
                 lw=1.6,
+                linestyle="-" if joined else "",
+                elinewidth=1.6,
                 ms=5,
                 label=named,
             )
