@@ -130,6 +130,13 @@ class DemoConfig:
             metavar="POLICY",
         ),
     ] = ""
+    explore: Annotated[
+        float,
+        Option(
+            "The learner drives alone, and rows have its commands and rewards, for `cosim train "
+            "--values`; they are changed at random in this share of the time."
+        ),
+    ] = 0.0
     unsolved: Annotated[
         bool, Option("Store unsolved episodes, too, up to where the robot is put back.")
     ] = False
@@ -189,6 +196,7 @@ class DemoConfig:
             waypoint_s=self.waypoint_s,
             noise=self.noise,
             learner=self.learner,
+            explore=self.explore,
             unsolved=self.unsolved,
             format=self.format,
             scan=ScanSpec(rays=self.lidar) if self.lidar else None,

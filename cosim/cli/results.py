@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.console import Console
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 compare_app = typer.Typer()
 _OUTPUT_HELP = (
     "Write it too: .csv (all metrics; flipped scenarios go into NAME.flipped.csv), .md, .tex, "
-    ".png (means by weather, a line for each policy); repeatable."
+    ".png (see --by); repeatable."
 )
 
 
@@ -50,17 +50,26 @@ def compare(
         list[Path], typer.Argument(metavar="RUN OTHER...", help="Run folders of one suite.")
     ],
     outputs: Annotated[list[Path] | None, typer.Option("-o", "--output", help=_OUTPUT_HELP)] = None,
+    by: Annotated[
+        str,
+        typer.Option(
+            metavar="weather|policy",
+            help="Axis of the .png: the weather, with a line for each policy, or the policies in "
+            "the order given.",
+        ),
+    ] = "weather",
 ) -> None:
     """Compare runs with the first one, paired by scenario; runs in several weathers also by these.
 
     Prints differences with their intervals over the suite, and by event, structure and split.
     Lists the scenarios whose result flipped.
     """
-    from cosim.report.compared import FORMATS, summary_by_weather
-    from cosim.report.curves import DRAWN, draw_curves
+    from cosim.report.compared import FORMATS
     from cosim.results.compare import compare_runs
     from scenarios.suites.exploits import exploit_of
 
+    if by not in _AXES:
+        raise unknown("axis of --by", by, _AXES)
     for path in outputs or ():
         if path.suffix not in (".csv", ".png", *FORMATS):
             raise UsageError(
@@ -75,10 +84,7 @@ def compare(
             _write(path, comparison.differences.to_csv(index=False))
             _write(path.with_suffix(".flipped.csv"), comparison.flipped.to_csv(index=False))
         elif path.suffix == ".png":
-            title = f"{comparison.suite} by weather"
-            fields = ("weather", "policy")
-            picture = draw_curves(summary_by_weather(comparison), fields, DRAWN, title)
-            _write(path, picture)
+            _write(path, _picture_of(comparison, by))
         else:
             _write(path, FORMATS[path.suffix](comparison))
     print_comparison(out, comparison)
@@ -89,6 +95,22 @@ def compare(
         out.print(exploit.in_words, soft_wrap=not out.is_terminal, highlight=False)
     for path, remark in instead.items():
         say(f"Written: {path}{remark}")
+
+
+_AXES: Final = ("weather", "policy")
+
+
+def _picture_of(comparison: RunComparison, by: str) -> bytes:
+    """Draw the means of all runs with their intervals, as PNG. by: one of _AXES."""
+    from cosim.report.compared import summary_by_policy, summary_by_weather
+    from cosim.report.curves import DRAWN, DRAWN_BY_POLICY, draw_curves
+
+    title = f"{comparison.suite} by {by}"
+    if by == "weather":
+        return draw_curves(summary_by_weather(comparison), ("weather", "policy"), DRAWN, title)
+    summary = summary_by_policy(comparison)
+    drawn = [name for name in DRAWN_BY_POLICY if (summary["metric"] == name).any()]
+    return draw_curves(summary, ("policy",), drawn, title, joined=False)
 
 
 def print_comparison(out: Console, comparison: RunComparison) -> None:

@@ -100,6 +100,15 @@ def train_command(
     no_weather: Annotated[
         bool, typer.Option("--no-weather", help="Ablation of sidewalk: clear weather alone.")
     ] = False,
+    values: Annotated[
+        float,
+        typer.Option(
+            metavar="TEMPERATURE",
+            help="Fine-tuning of sidewalk on rewards: weigh what the bundle of --from drove with "
+            "`cosim collect --explore` by how well it went on; 1 is usual, more is milder.",
+            show_default="0, equal weights",
+        ),
+    ] = 0.0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the training in the folder.")
     ] = False,
@@ -132,6 +141,7 @@ def train_command(
         auxiliary=not no_auxiliary,
         decoys=not no_decoys,
         weather=not no_weather,
+        values=values,
     )
     if not train_and_report(data, out, training, resume, notice):
         raise typer.Exit(TIME_IS_UP)

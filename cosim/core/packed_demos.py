@@ -20,13 +20,15 @@ one for each picture, ordered by episode and time:
 | near      | (N, 8, 6) float32        | label: people ahead, see `scenarios/episodes/labels.py`   |
 | free      | (N, 25) float32          | label: free distances, m, from left to right              |
 | scene     | (N, 2) float32           | label: signal and event ahead                             |
+| reward    | (N, 1) float32           | reward until the next picture (`--explore`)               |
 | meta      | () str                   | JSON, see `Packed.meta`                                   |
 
-The file has scan, imu, people and the labels only if the data set has them. Labels are the
+The file has scan, imu, people, the labels and rewards only if the data set has them. Labels are the
 simulator's truth, for training alone. Waypoints are metres in the robot's frame at the picture.
 Those after `driven` extrapolate the expert's command, because the episode ended or the drive was
-disturbed. A picture is taken frame / rate_hz seconds after the episode's
-start.
+disturbed. With rewards (`scenarios/episodes/reward.py`), commands are the learner's own.
+
+A picture is taken frame / rate_hz seconds after the episode's start.
 """
 
 from __future__ import annotations
@@ -57,7 +59,9 @@ LABELLED_PEOPLE: Final = 8
 """Number of people in a row of `near`."""
 FREE_RAYS: Final = 25
 """Number of bearings in a row of `free`."""
-EXTRAS: Final = (*SENSORS, *LABELS)
+REWARD: Final = "reward"
+"""Name of the array of rewards, which a file may lack."""
+EXTRAS: Final = (*SENSORS, *LABELS, REWARD)
 
 
 def _nothing() -> NDArray[np.float32]:
@@ -70,9 +74,11 @@ class Packed:
 
     scan, imu, people: sensors, empty (0, 0) arrays without them.
     near, free, scene: labels, empty (0, 0) arrays without them.
+    reward: empty (0, 0) without rewards.
     meta: rate_hz and waypoint_s; goal, the name of its protocol or "none"; camera, as in
-        `CameraSpec`; robot; lidar, imu and people, the settings of the sensors. policy, noise and
-        learner are lists with one value for each data set. structures, scenarios and weathers are
+        `CameraSpec`; robot; lidar, imu and people, the settings of the sensors. policy, noise,
+        learner and explorer are lists with one value for each data set; explorer is the learner
+        of one with rewards. structures, scenarios and weathers are
         lists with the structure, the id and the weather of each episode's scenario.
     """
 
@@ -92,6 +98,7 @@ class Packed:
     near: NDArray[np.float32] = field(default_factory=_nothing)
     free: NDArray[np.float32] = field(default_factory=_nothing)
     scene: NDArray[np.float32] = field(default_factory=_nothing)
+    reward: NDArray[np.float32] = field(default_factory=_nothing)
 
     def __len__(self) -> int:
         return len(self.episode)

@@ -34,6 +34,9 @@ def _main() -> None:
     parser.add_argument("--minutes", type=float, default=default.minutes, help="stop after so long")
     parser.add_argument("--name", default=default.name, help="by default that of the network")
     parser.add_argument("--share", type=float, default=default.share, help="of training episodes")
+    parser.add_argument(
+        "--values", type=float, default=default.values, help="weigh rows with rewards: 1"
+    )
     for ablated in ("memory", "auxiliary", "decoys", "weather"):
         parser.add_argument(f"--no-{ablated}", dest=ablated, action="store_false")
     parser.add_argument("--resume", action="store_true", help="continue the training in the folder")

@@ -15,13 +15,12 @@ import torch
 
 from cosim.core.errors import RunError
 from cosim.core.files import write_atomic
-from cosim.learning.graph import PLAN, run_graph
+from cosim.learning.graph import MODEL, PLAN, run_graph
 from cosim.learning.kind import ExampleSet
 from cosim.learning.network import Parameters
 from cosim.learning.networks import NETWORKS
 from cosim.learning.settings import Training
 
-MODEL: Final = "model.onnx"
 _TOLERANCE: Final = 1e-4
 
 
@@ -87,8 +86,14 @@ def source_of(meta: Mapping[str, Any], seed: int, begun: BundleFacts | None = No
     experts, learners = (
         ", ".join(dict.fromkeys(filter(None, meta[name]))) for name in ("policy", "learner")
     )
+    explorers = ", ".join(dict.fromkeys(filter(None, meta.get("explorer", ()))))
     corrections = f", and would have done where {learners} drove" if learners else ""
-    return f"cosim train, seed {seed}, on what {experts} drove{corrections}" + (
+    parts = [
+        *([f"on what {experts} drove{corrections}"] if experts else []),
+        *([f"on what {explorers} drove with rewards"] if explorers else []),
+    ]
+    weighting = f"; {meta['weighting']}" if "weighting" in meta else ""
+    return f"cosim train, seed {seed}, {' and '.join(parts)}{weighting}" + (
         f"; begun with {begun.name}" if begun else ""
     )
 

@@ -32,6 +32,8 @@ INPUTS: Final = {
     "goal": (1, 2),
     "speeds": (1, 2),
 }
+MODEL: Final = "model.onnx"
+"""File of the graph in a bundle."""
 PLAN: Final = "plan"
 _OPSET: Final = 17
 _IR: Final = 8

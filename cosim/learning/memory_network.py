@@ -98,6 +98,7 @@ class MemoryOutput(NamedTuple):
     signal: (N, SIGNALS) log odds
     event: (N, EVENTS) log odds
     memory: (B, MEMORY) after the last step
+    known: (N, _JOINED) features that all heads get
     """
 
     plan: NetworkOutput
@@ -106,6 +107,7 @@ class MemoryOutput(NamedTuple):
     signal: Tensor
     event: Tensor
     memory: Tensor
+    known: Tensor
 
 
 def new_memory_parameters(seed: int) -> dict[str, Tensor]:
@@ -194,4 +196,5 @@ def forward_steps(
         raw["signal"],
         raw["event"],
         after[:, -1] if carries else torch.zeros_like(memory),
+        known,
     )

@@ -38,24 +38,31 @@ class PlanTargets(Protocol):
     def driven(self) -> Tensor: ...
 
 
-def plan_losses(output: NetworkOutput, targets: PlanTargets) -> dict[str, Tensor]:
+def plan_losses(
+    output: NetworkOutput, targets: PlanTargets, weight: Tensor | None = None
+) -> dict[str, Tensor]:
     """Return the parts of the loss.
 
     Speed and turn count only if the expert does not stop; waypoints only if they were driven.
+
+    weight: (N,) of the rows; None for equal ones
     """
-    moves = 1.0 - targets.stop
+    weight = torch.ones_like(targets.speed) if weight is None else weight
+    moves = weight * (1.0 - targets.stop)
+    driven = weight[:, None] * targets.driven
     per_moving = 1.0 / moves.sum().clamp(min=1.0)
     turn_errors = turns_radps(targets.turn.device) - targets.turn[:, None]
     # The bin of the expert's turn, and its neighbours with less weight.
     shares = (-0.5 * (turn_errors / _TURN_SPREAD_RADPS) ** 2).softmax(1)
     turn = -(shares * output.turn.log_softmax(1)).sum(1)
     speed = functional.smooth_l1_loss(output.speed, targets.speed, reduction="none", beta=0.1)
+    stop = functional.binary_cross_entropy_with_logits(output.stop, targets.stop, reduction="none")
     way = functional.smooth_l1_loss(output.way, targets.way, reduction="none", beta=0.2).sum(2)
     return {
         "speed": (speed * moves).sum() * per_moving,
         "turn": (turn * moves).sum() * per_moving / math.log(TURN_BINS),
-        "stop": functional.binary_cross_entropy_with_logits(output.stop, targets.stop),
-        "way": (way * targets.driven).sum() / targets.driven.sum().clamp(min=1.0),
+        "stop": (stop * weight).sum() / weight.sum().clamp(min=1.0),
+        "way": (way * driven).sum() / driven.sum().clamp(min=1.0),
     }
 
 

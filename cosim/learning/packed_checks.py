@@ -13,14 +13,14 @@ from cosim.core.errors import RunError
 from cosim.core.packed_demos import Packed
 from cosim.learning.network import HEIGHT_PX, WAYPOINTS, WIDTH_PX
 
-_LISTED: Final = ("policy", "learner")
+_LISTED: Final = ("policy", "learner", "explorer")
 """Metadata with a value for each data set."""
 
 
 def common_meta(
     paths: Sequence[Path], packed: Sequence[Packed], same: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the metadata of all files, with policy and learner of all of them.
+    """Return the metadata of all files, with the drivers of all of them.
 
     same: fields that must be equal. Raises RunError if one is not.
     """

@@ -16,7 +16,7 @@ class NetworkDefaults(NamedTuple):
     """Row of a network.
 
     batch: default number of examples or windows per step
-    has_ablations: whether it has the settings of ablations
+    has_ablations: whether it has the settings of ablations, and `values`
     """
 
     batch: int
@@ -43,7 +43,7 @@ TO_INSTALL: Final = (
 )
 
 
-_ABLATIONS: Final = ("share", "memory", "auxiliary", "decoys", "weather")
+_ABLATIONS: Final = ("share", "memory", "auxiliary", "decoys", "weather", "values")
 
 
 def batches_in_words() -> str:
@@ -73,6 +73,10 @@ class Training:
     share: share of the training episodes that are used
     memory, auxiliary: whether it has a memory, and auxiliary heads
     decoys, weather: whether decoys and episodes in other weather than clear are used
+
+    Fine-tuning of `sidewalk` on rewards, from the network that drove:
+
+    values: temperature of the weights of rows with rewards, see `values.py`; 0 for equal weights
     """
 
     network: str = "small"
@@ -89,6 +93,7 @@ class Training:
     auxiliary: bool = True
     decoys: bool = True
     weather: bool = True
+    values: float = 0.0
 
     def __post_init__(self) -> None:
         if self.network not in NETWORK_DEFAULTS:
@@ -99,6 +104,10 @@ class Training:
         if changed and not NETWORK_DEFAULTS[self.network].has_ablations:
             able = " or ".join(name for name, one in NETWORK_DEFAULTS.items() if one.has_ablations)
             raise UsageError(f"--network {self.network} has no {', '.join(changed)}: use {able}")
+        if not 0.0 <= self.values < math.inf:
+            raise UsageError(f"--values must be a temperature such as 1, not {self.values:g}")
+        if self.values and self.begin is None:
+            raise UsageError("--values needs --from, the bundle that drove with --explore")
         for field in ("steps", "batch", "rate", "minutes", "share"):
             value = getattr(self, field)
             if value is not None and not value > 0:

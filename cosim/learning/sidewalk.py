@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from cosim.learning.graph import PLAN
+from cosim.core.errors import RunError
+from cosim.learning.graph import MODEL, PLAN, load_parameters
 from cosim.learning.kind import GOAL_INPUT, SPEEDS_INPUT, Arrays, Network, pictures_input
 from cosim.learning.memory_graph import MEMORY_INPUTS, NEXT, build_memory_graph
 from cosim.learning.memory_network import (
@@ -27,6 +28,7 @@ from cosim.learning.memory_network import (
 from cosim.learning.network import NetworkOutput, Parameters, plan
 from cosim.learning.objective import PLAN_WEIGHTS, PlanErrors, plan_losses
 from cosim.learning.settings import Training
+from cosim.learning.values import weights_of
 from cosim.learning.windows import STEPS, WindowExamples, Windows
 
 NEAR_UNIT_M: Final = 10.0
@@ -41,6 +43,8 @@ _WEIGHTS: Final = {**PLAN_WEIGHTS, "near": 0.5, "free": 1.0, "signal": 0.2, "eve
 _MAX_WINDOWS: Final = 96
 """Largest number of held-out windows of an evaluation."""
 _AT_ONCE: Final = 16
+_MIN_REWARDED: Final = 50
+"""Least number of training rows with rewards."""
 
 
 def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOutput:
@@ -51,7 +55,7 @@ def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOu
         output = forward_steps(
             parameters, batch.pictures, batch.goal, batch.speeds, memory, training.memory
         )
-    valid = batch.valid.flatten()
+    valid = batch.places
     return MemoryOutput(
         NetworkOutput(*(one[valid] for one in output.plan)),
         near=output.near[valid],
@@ -59,6 +63,7 @@ def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOu
         signal=output.signal[valid],
         event=output.event[valid],
         memory=output.memory,
+        known=output.known[valid],
     )
 
 
@@ -69,7 +74,7 @@ def _losses(parameters: Parameters, batch: Windows, training: Training) -> dict[
 
 def _parts(output: MemoryOutput, batch: Windows, training: Training) -> dict[str, Tensor]:
     """Return the parts of the loss; those of auxiliary heads if they are trained."""
-    parts = plan_losses(output.plan, batch)
+    parts = plan_losses(output.plan, batch, batch.weight)
     if not training.auxiliary:
         return parts
     classes = batch.scene.long()
@@ -154,7 +159,45 @@ _CLASSES: Final = ("signals_right", "events_right")
 
 
 def _examples(paths: Sequence[Path], training: Training, device: torch.device) -> WindowExamples:
-    return WindowExamples(paths, training, device)
+    examples = WindowExamples(paths, training, device)
+    if training.values and training.begin:
+        begin = load_parameters(training.begin / MODEL, new_memory_parameters(0))
+        parameters = {name: value.to(device) for name, value in begin.items()}
+        _weigh(parameters, examples, training, paths[0])
+    return examples
+
+
+def _weigh(
+    parameters: Parameters, examples: WindowExamples, training: Training, path: Path
+) -> None:
+    """Weigh the rows with rewards by the values of the network that drove.
+
+    Raises RunError without such rows.
+    """
+    starts = examples.rewarded_starts()
+    rows = np.flatnonzero(np.isfinite(examples.returns))
+    learned = np.isin(rows, examples.learned)
+    if learned.sum() < _MIN_REWARDED:
+        raise RunError(
+            f"{path}: {learned.sum()} training rows have rewards, at least {_MIN_REWARDED} are "
+            f"needed for --values: collect with cosim collect --explore"
+        )
+    features = []
+    with torch.no_grad():
+        for part in np.array_split(starts, -(-len(starts) // _AT_ONCE)):
+            known = _run(parameters, examples.windows(part, STEPS), training).known
+            features.append(known.float().cpu().numpy())
+    found = weights_of(
+        np.concatenate(features),
+        examples.returns[rows],
+        examples.episode[rows],
+        learned,
+        training.values,
+    )
+    examples.weight[torch.from_numpy(rows[learned])] = torch.from_numpy(found.weight[learned]).to(
+        examples.weight.device
+    )
+    examples.meta["weighting"] = found.in_words
 
 
 def _graph(parameters: Parameters, training: Training) -> bytes:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
@@ -23,9 +25,9 @@ from cosim.core.files import atomic_file
 from cosim.core.packed_demos import packed_digest
 from cosim.core.progress import Progress
 from cosim.core.units import duration
-from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
+from cosim.learning.bundle import bundle_facts, source_of, write_bundle
 from cosim.learning.curve import CURVE, draw_curve, write_curve
-from cosim.learning.graph import load_parameters
+from cosim.learning.graph import MODEL, load_parameters
 from cosim.learning.kind import ExampleSet
 from cosim.learning.networks import NETWORKS
 from cosim.learning.settings import (
@@ -105,6 +107,8 @@ def _train(
     )
     base = None if training.begin is None else bundle_facts(training.begin)
     examples = network.examples(paths, training, device)
+    if weighting := examples.meta.get("weighting"):
+        progress(weighting)
     folder.mkdir(parents=True, exist_ok=True)
     spec = training.spec | {
         "data": ", ".join(map(packed_digest, paths)),
@@ -119,8 +123,9 @@ def _train(
     first = state.step
     saved_s = time.monotonic()
     over = False
+    batches = _batches(examples, training, state.step, steps, ahead=device.type == "cuda")
     while state.step < steps and not over:
-        loss_parts = _take_step(state, examples, training, steps)
+        loss_parts = _take_step(state, next(batches), training, steps)
         state.step += 1
         over = time.monotonic() - began_s > 60.0 * training.minutes
         scheduled = is_evaluated(state.step, steps)
@@ -195,15 +200,32 @@ def _optimiser(parameters: Mapping[str, Tensor], training: Training) -> torch.op
     return torch.optim.AdamW(parameters.values(), lr=training.rate, weight_decay=_WEIGHT_DECAY)
 
 
-def _take_step(
-    state: _State, examples: ExampleSet, training: Training, steps: int
-) -> dict[str, Tensor]:
+def _batches(
+    examples: ExampleSet, training: Training, first: int, steps: int, ahead: bool
+) -> Iterator[Any]:
+    """Draw the batches of the steps from `first` on.
+
+    ahead: whether a thread draws the next batch during a step, while a GPU computes
+    """
+    draw = partial(examples.drawn, training.seed, size=training.size)
+    if not ahead:
+        yield from map(draw, range(first, steps))
+        return
+    with ThreadPoolExecutor(1) as thread:
+        drawn = thread.submit(draw, first)
+        for step in range(first, steps):
+            batch = drawn.result()
+            if step + 1 < steps:
+                drawn = thread.submit(draw, step + 1)
+            yield batch
+
+
+def _take_step(state: _State, batch: Any, training: Training, steps: int) -> dict[str, Tensor]:
     """Take one step and return the parts of its loss."""
     step = state.step
     for group in state.optimiser.param_groups:
         group["lr"] = training.rate * rate_share(step, steps)
     network = NETWORKS[training.network]
-    batch = examples.drawn(training.seed, step, training.size)
     parts = network.losses(state.parameters, batch, training)
     state.optimiser.zero_grad(set_to_none=True)
     torch.stack([network.weights[name] * part for name, part in parts.items()]).sum().backward()

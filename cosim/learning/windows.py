@@ -13,7 +13,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Final
 
@@ -34,9 +34,8 @@ from cosim.learning.examples import (
     TINT,
     scaled_goal,
     scaled_speeds,
-    shifted,
 )
-from cosim.learning.memory_network import EVENTS, MEMORY, PICTURES, SIGNALS
+from cosim.learning.memory_network import EVENTS, MEMORY, SIGNALS
 from cosim.learning.network import (
     CRUISE_MPS,
     HEIGHT_PX,
@@ -46,6 +45,7 @@ from cosim.learning.network import (
 )
 from cosim.learning.packed_checks import check_pictures, check_rows, common_meta
 from cosim.learning.settings import Training
+from cosim.learning.values import discounted_returns
 
 STEPS: Final = 40
 """Steps of a window; 8 s at 5 Hz."""
@@ -68,7 +68,9 @@ class Windows:
     pictures: (B, T, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1
     goal, speeds: (B, T, 2) inputs
     valid: (B, T) whether a step belongs to the episode; of the fields below only such rows exist
+    places: (N,) their indices in the B T steps
     speed, turn, stop, way, driven: see `objective.PlanTargets`
+    weight: (N,) of the plan's loss; 1 unless rows are weighted by value
     near: (N, LABELLED_PEOPLE, 6), free: (N, FREE_RAYS), scene: (N, 2) labels; (N, 0) unless
         auxiliary heads are trained
     """
@@ -77,11 +79,13 @@ class Windows:
     goal: Tensor
     speeds: Tensor
     valid: Tensor
+    places: Tensor
     speed: Tensor
     turn: Tensor
     stop: Tensor
     way: Tensor
     driven: Tensor
+    weight: Tensor
     near: Tensor
     free: Tensor
     scene: Tensor
@@ -92,7 +96,10 @@ class WindowExamples:
 
     learned, held_out: rows (M,) of training and held-out episodes
     episodes: numbers of both
-    meta: common metadata of the files, with policy and learner of all of them
+    episode: (M,) ascending numbers of the episodes
+    returns: (M,) discounted returns, NaN without rewards
+    weight: (M,) float32 on the device, of the plan's loss; all 1 at first
+    meta: common metadata of the files, with the drivers of all of them
     """
 
     def __init__(self, paths: Sequence[Path], training: Training, device: torch.device) -> None:
@@ -104,6 +111,7 @@ class WindowExamples:
         firsts = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         episode = np.concatenate([one.episode + n for one, n in zip(packed, firsts, strict=False)])
         frame = np.concatenate([one.frame for one in packed])
+        self.episode = episode
         rows = np.arange(len(episode))
         self._first = rows - frame
         self._last = self._first + np.bincount(episode)[episode] - 1
@@ -132,6 +140,11 @@ class WindowExamples:
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
         changes = self.learned[((command < STOPS_MPS) != (state < STOPS_MPS))[self.learned]]
         self._changes = changes if len(changes) else self.learned
+        rewards = [_rewards(one) for one in packed]
+        self.returns = discounted_returns(
+            np.concatenate(rewards), episode, 1.0 / float(self.meta["rate_hz"])
+        )
+        self.weight = torch.ones(len(rows), device=device)
 
     def drawn(self, seed: int, step: int, size: int) -> Windows:
         """Draw the augmented batch of a step: a function of seed and step."""
@@ -143,75 +156,57 @@ class WindowExamples:
         )
         start = np.maximum(row - draws.integers(0, STEPS, size), self._first[row])
         start = np.where(draws.random(size) < _FROM_START, self._first[row], start)
-        batch = self.windows(start, STEPS)
         light = draws.uniform(np.log(DARK), np.log(BRIGHT), (size, 1)) + draws.uniform(
             -TINT, TINT, (size, 3)
         )
         visible = draws.random(size) >= _HIDDEN_SPEEDS
-        off_px = draws.integers(0, 2 * SHIFT_PX + 1, (2, size, 1, 1))
+        off_px = draws.integers(0, 2 * SHIFT_PX + 1, (2, size, 1))
         mirrored = draws.random(size) < 0.5
-        return self._augmented(batch, np.exp(light), visible, off_px, mirrored)
+        return self.windows(start, STEPS, _Changes(np.exp(light), visible, off_px, mirrored))
 
-    def _augmented(
-        self,
-        batch: Windows,
-        light: NDArray[np.float64],
-        visible: NDArray[np.bool_],
-        off_px: NDArray[np.int64],
-        mirrored: NDArray[np.bool_],
+    def windows(
+        self, start: NDArray[np.int64], steps: int, changes: _Changes | None = None
     ) -> Windows:
-        gain = torch.from_numpy(np.tile(light, (1, PICTURES)).astype(np.float32)).to(self._device)
-        pictures = shifted(batch.pictures.flatten(1, 2), torch.from_numpy(off_px).to(self._device))
-        pictures = pictures.unflatten(1, batch.pictures.shape[1:3])
-        pictures = (pictures * gain[:, None, :, None, None]).clamp(max=1.0)
-        seen = torch.from_numpy(visible.astype(np.float32)).to(self._device)
-        values = {one.name: getattr(batch, one.name) for one in fields(batch)}
-        values |= {"pictures": pictures, "speeds": batch.speeds * seen[:, None, None]}
-        lit = Windows(**values)
-        there = torch.from_numpy(mirrored).to(self._device)
-        other = mirror_windows(lit)
-        which = there[:, None].expand_as(batch.valid)[batch.valid]
-        return Windows(
-            **{
-                name: torch.where(
-                    _shaped(there if name in _PER_WINDOW else which, value),
-                    getattr(other, name),
-                    value,
-                )
-                for name, value in values.items()
-            }
-        )
-
-    def windows(self, start: NDArray[np.int64], steps: int) -> Windows:
-        """Return the windows that begin at some rows, without augmentation.
+        """Return the windows that begin at some rows.
 
         Steps after the end of an episode repeat its last row, and are not valid. The batch is as
         long as its longest window.
+
+        changes: augmentation; None for none
         """
         steps = min(steps, int((self._last[start] - start).max()) + 1)
         rows = start[:, None] + np.arange(steps)
-        valid = torch.from_numpy(rows <= self._last[start][:, None]).to(self._device)
+        valid = rows <= self._last[start][:, None]
         rows = np.minimum(rows, self._last[start][:, None])
         before = np.maximum(start - 1, self._first[start])[:, None]
         shown = torch.from_numpy(np.concatenate([before, rows], 1)).to(self._frames.device)
-        frames = self._frames[shown].to(self._device).permute(0, 1, 4, 2, 3).float() / 255.0
+        frames = _pictures_of(self._frames[shown].to(self._device), changes)
         at = torch.from_numpy(rows).to(self._device)
-        here = at[valid]
+        here = torch.from_numpy(rows[valid]).to(self._device)
         command = self._rows["command"][here]
         driven = self._rows["driven"][here]
         nothing = torch.zeros((len(here), 0), device=self._device)
-        return Windows(
-            pictures=torch.cat([frames[:, :-1], frames[:, 1:]], 2),
+        batch = Windows(
+            pictures=torch.cat([frames[:, :-1], frames[:, 1:]], 4).permute(0, 1, 4, 2, 3),
             goal=scaled_goal(self._rows["goal"][at]),
             speeds=scaled_speeds(self._rows["state"][at]),
-            valid=valid,
+            valid=torch.from_numpy(valid).to(self._device),
+            places=torch.from_numpy(np.flatnonzero(valid)).to(self._device),
             speed=command[:, 0] / CRUISE_MPS,
             turn=command[:, 1].clamp(-TURN_UNIT_RADPS, TURN_UNIT_RADPS),
             stop=(command[:, 0] < STOPS_MPS).float(),
             way=self._rows["waypoints"][here][:, :WAYPOINTS],
             driven=(torch.arange(WAYPOINTS, device=self._device) < driven[:, None]).float(),
+            weight=self.weight[here],
             **{name: self._rows[name][here] if name in self._rows else nothing for name in LABELS},
         )
+        return batch if changes is None else _changed(batch, changes, np.nonzero(valid)[0])
+
+    def rewarded_starts(self) -> NDArray[np.int64]:
+        """Return the rows at which windows with rewards begin, one after another."""
+        rows = np.flatnonzero(np.isfinite(self.returns))
+        found: NDArray[np.int64] = rows[(rows - self._first[rows]) % STEPS == 0]
+        return found
 
     def held_out_starts(self, most: int) -> NDArray[np.int64]:
         """Return the rows at which held-out windows begin: one after another, at most `most`."""
@@ -230,7 +225,69 @@ class WindowExamples:
         return inputs | {"memory": np.linspace(-0.5, 0.5, MEMORY, dtype=np.float32)[None]}
 
 
-_PER_WINDOW: Final = ("pictures", "goal", "speeds", "valid")
+@dataclass(frozen=True)
+class _Changes:
+    """Augmentation of B windows.
+
+    light: (B, 3) factors of red, green and blue
+    visible: (B,) whether speeds are shown
+    off_px: (2, B, 1) shift of the pictures down and right, from 0 to 2 SHIFT_PX
+    mirrored: (B,) whether left and right are exchanged
+    """
+
+    light: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+    off_px: NDArray[np.int64]
+    mirrored: NDArray[np.bool_]
+
+
+def _pictures_of(frames: Tensor, changes: _Changes | None) -> Tensor:
+    """Return pictures (B, T, H, W, 3), 0 to 1, shifted, mirrored and lit.
+
+    The channels stay last: GPUs convolve such pictures faster.
+
+    frames: (B, T, H, W, 3) uint8
+    """
+    if changes is None:
+        return frames.float() / 255.0
+    down, right = changes.off_px - SHIFT_PX
+    high, wide = frames.shape[2:4]
+    row = (np.arange(high) + down).clip(0, high - 1)
+    column = (np.arange(wide) + right).clip(0, wide - 1)
+    column = np.where(changes.mirrored[:, None], column[:, ::-1], column)
+    there = (row[:, :, None] * wide + column[:, None, :]).reshape(len(row), -1)
+    index = torch.from_numpy(there).to(frames.device)[:, None, :, None]
+    pixels = frames.flatten(2, 3)
+    seen = pixels.gather(2, index.expand(-1, pixels.shape[1], -1, 3)).view(frames.shape)
+    gain = torch.from_numpy(changes.light.astype(np.float32)).to(frames.device)
+    return (seen.float() / 255.0 * gain[:, None, None, None]).clamp(max=1.0)
+
+
+def _changed(batch: Windows, changes: _Changes, window: NDArray[np.int64]) -> Windows:
+    """Hide speeds and mirror windows whose pictures are changed already.
+
+    window: (N,) window of each valid step
+    """
+    device = batch.goal.device
+    seen = torch.from_numpy(changes.visible.astype(np.float32)).to(device)
+    batch = replace(batch, speeds=batch.speeds * seen[:, None, None])
+    other = mirror_windows(replace(batch, pictures=batch.pictures[:, :0]))
+    mirrored = torch.from_numpy(changes.mirrored).to(device)
+    which = torch.from_numpy(changes.mirrored[window]).to(device)
+    chosen = {
+        name: torch.where(
+            _shaped(mirrored if name in _PER_WINDOW else which, value),
+            getattr(other, name),
+            value,
+        )
+        for name, value in vars(batch).items()
+        if name not in _UNCHANGED
+    }
+    return replace(batch, **chosen)
+
+
+_PER_WINDOW: Final = ("goal", "speeds")
+_UNCHANGED: Final = ("pictures", "valid", "places", "weight")
 
 
 def mirror_windows(batch: Windows) -> Windows:
@@ -293,6 +350,13 @@ def _fill(place: Tensor, path: Path) -> None:
     frames = read_frames(path)
     check_pictures(path, frames)
     place.copy_(torch.from_numpy(frames))
+
+
+def _rewards(packed: Packed) -> NDArray[np.float32]:
+    """Return the rewards (N,) of a file, NaN without."""
+    if packed.reward.size:
+        return packed.reward[:, 0]
+    return np.full(len(packed), np.nan, np.float32)
 
 
 def _checked(path: Path, training: Training) -> Packed:

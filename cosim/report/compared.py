@@ -148,6 +148,16 @@ def summary_by_weather(result: RunComparison) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+def summary_by_policy(result: RunComparison) -> pd.DataFrame:
+    """Return a row for each run and metric: `summary_of` with the run's name as policy."""
+    parts = []
+    for run in (result.before, *result.others):
+        part = summary_of(run.table).reset_index()
+        part.insert(0, "policy", run.label)
+        parts.append(part)
+    return pd.concat(parts, ignore_index=True)
+
+
 def table_by_weather(summary: pd.DataFrame) -> TextTable:
     """Build the table of `summary_by_weather`: a row for each weather and policy."""
     rows = []

@@ -18,15 +18,18 @@ if TYPE_CHECKING:
 
 _TITLES: Final = {
     "success": "success (SR)",
+    "discerned": "events and decoys both solved (D)",
     "spl": "success by path length (SPL)",
     "route_completion": "share of the route done (RC)",
     "failures_per_100m": "failures per 100 m, pooled (FC)",
     "pedestrian_distance_min_m": "nearest to a person's centre, m",
     "time_to_goal_s": "time to the goal, s",
 }
-DRAWN: Final = tuple(_TITLES)
+DRAWN: Final = tuple(name for name in _TITLES if name != "discerned")
 """Metrics of a picture."""
-_SHARES: Final = ("success", "spl", "route_completion")
+DRAWN_BY_POLICY: Final = ("success", "discerned", "route_completion", "failures_per_100m")
+"""Metrics of a picture of policies; `discerned` only if there are decoys."""
+_SHARES: Final = ("success", "discerned", "spl", "route_completion")
 _COLOURS: Final = (
     "#0072b2",
     "#d55e00",
@@ -59,11 +62,16 @@ _OFFSET: Final = 0.012
 
 
 def draw_curves(
-    summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[str], title: str
+    summary: pd.DataFrame,
+    fields: Sequence[str],
+    metrics: Sequence[str],
+    title: str,
+    joined: bool = True,
 ) -> bytes:
     """Draw the means with their intervals as PNG.
 
     summary: rows of fields, metric, mean, low, high, n
+    joined: whether lines join the means
 
     Raises MachineError if matplotlib is not installed.
     """
@@ -85,7 +93,10 @@ def draw_curves(
         layout="constrained",
     )
     FigureCanvasAgg(figure)
-    for panel, metric in zip(figure.subplots(2, -(-len(metrics) // 2)).flat, metrics, strict=True):
+    panels = figure.subplots(2, -(-len(metrics) // 2)).flat
+    for panel in panels[len(metrics) :]:
+        panel.set_axis_off()
+    for panel, metric in zip(panels, metrics, strict=False):
         shift = _OFFSET * (float(np.ptp(x)) or 1.0)
         for number, (values, rows) in enumerate(lines):
             colour, marker = _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)]
@@ -101,6 +112,8 @@ def draw_curves(
                 marker=marker,
                 capsize=3,
                 lw=1.6,
+                linestyle="-" if joined else "",
+                elinewidth=1.6,
                 ms=5,
                 label=named,
             )

@@ -37,6 +37,8 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     noise: share of the time in which another command than the expert's is driven, in bursts.
     learner: policy that drives in this time; "" for the expert's command, slowed and turned at
         random.
+    explore: if above 0, the learner drives all the time, and its commands are the stored ones. In
+        this share of the time, they are changed at random. Rows have rewards.
     format: form of the data set: LeRobot, a ROS 2 bag of each episode, or raw demonstrations.
     unsolved: also record episodes that the expert fails, up to the first reset of the robot, raw
         ones to their end.
@@ -54,6 +56,7 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     waypoint_s: float = 0.2
     noise: float = 0.0
     learner: str = ""
+    explore: float = 0.0
     unsolved: bool = False
     format: DataFormat = "lerobot"
     scan: ScanSpec | None = None
@@ -76,10 +79,19 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
             raise SpecError(
                 f"noise must be in [0, {_MAX_NOISE:g}], a share of the time, not {self.noise:g}"
             )
-        if self.learner and not self.noise:
+        if not 0.0 <= self.explore <= _MAX_NOISE:
+            raise SpecError(
+                f"explore must be in [0, {_MAX_NOISE:g}], a share of the time, not {self.explore:g}"
+            )
+        if self.explore and not (self.learner and self.unsolved and not self.noise):
+            raise SpecError(
+                "explore changes the commands of a learner, also in episodes that it fails: give "
+                "--learner and --unsolved, and no --noise"
+            )
+        if self.learner and not (self.noise or self.explore):
             raise SpecError(
                 f"learner '{self.learner}' drives in the share of the time that is noise: "
-                f"give --noise 0.6"
+                f"give --noise 0.6, or --explore 0.3 for drives of its own"
             )
         if not 0.0 <= self.astray <= 1.0:
             raise SpecError(f"astray must be in [0, 1], a share of the episodes, not {self.astray}")
@@ -188,8 +200,9 @@ def recording_manifest(
 ) -> Manifest:
     """Return the manifest of an expert for recording, with the recording camera and rate.
 
-    A disturbed expert gets another name. Raises UsageError for goals that a data set cannot hold.
-    An expert with a camera must keep its rate, because it remembers pictures at that interval.
+    A disturbed expert gets another name, and so does an exploring learner in its place. An expert
+    with a camera must keep its rate, because it remembers pictures at that interval. Raises
+    UsageError for goals that a data set cannot hold.
 
     goal: goal protocol of the run, in place of the expert's.
     """
@@ -212,6 +225,7 @@ def recording_manifest(
             f"{collecting.rate_hz:g}: give --rate {expert.rate_hz:g}"
         )
     name = f"{expert.name}-disturbed" if collecting.noise else expert.name
+    name = "explorer" if collecting.explore else name
     settled = replace(
         expert, name=name, rate_hz=collecting.rate_hz, goal=goal, **_sensors(expert, collecting)
     )

@@ -108,14 +108,25 @@ def read_pictures(film_or_bytes: Path | bytes) -> Iterator[tuple[Fraction, NDArr
             )
 
 
-_TO_YUV: Final = np.array([[16829, 33039, 6416], [-9714, -19070, 28784], [28784, -24103, -4681]]).T
-"""Matrix from RGB to YUV in units of 1 / 65536, with one row for each input channel."""
-_TO_RGB: Final = np.array([[76309, 0, 104597], [76309, -25675, -53279], [76309, 132201, 0]]).T
-"""Matrix from YUV to RGB in units of 1 / 65536, with one row for each input channel."""
-_BLACK: Final = np.array([16, 128, 128])
+_TO_YUV: Final = ((16829, 33039, 6416), (-9714, -19070, 28784), (28784, -24103, -4681))
+"""Factors of red, green and blue in Y, U and V, in units of 1 / 65536."""
+_TO_RGB: Final = ((76309, 0, 104597), (76309, -25675, -53279), (76309, 132201, 0))
+"""Factors of Y, U and V in red, green and blue, in units of 1 / 65536."""
+_BLACK: Final = (16, 128, 128)
 """YUV of black."""
 _HALF: Final = 1 << 15
 """Half a unit of the result, added before the shift by 16 bits so that it rounds."""
+
+
+def _mixed(channels: Sequence[NDArray[np.int32]], factors: Sequence[int]) -> NDArray[np.int32]:
+    """Return the rounded sum of channels times factors in units of 1 / 65536; exact in 32 bits."""
+    total = channels[0] * np.int32(factors[0])
+    for channel, factor in zip(channels[1:], factors[1:], strict=True):
+        if factor:
+            total += channel * np.int32(factor)
+    total += np.int32(_HALF)
+    total >>= 16
+    return total
 
 
 def _planes_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -123,10 +134,11 @@ def _planes_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     half the size."""
     high, wide, _ = rgb.shape
     small = cv2.resize(rgb, (wide // 2, high // 2), interpolation=cv2.INTER_AREA)
-    bright = ((rgb @ _TO_YUV[:, 0] + _HALF) >> 16) + _BLACK[0]
-    colours = ((small @ _TO_YUV[:, 1:] + _HALF) >> 16) + _BLACK[1:]
-    planes = [bright.ravel(), colours[..., 0].ravel(), colours[..., 1].ravel()]
-    return np.concatenate(planes).astype(np.uint8).reshape(high * 3 // 2, wide)
+    planes = [
+        _mixed(np.moveaxis(of, 2, 0).astype(np.int32), factors) + black
+        for of, factors, black in zip((rgb, small, small), _TO_YUV, _BLACK, strict=True)
+    ]
+    return np.concatenate([one.ravel() for one in planes]).astype(np.uint8).reshape(-1, wide)
 
 
 def _rgb_of(planes: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -135,6 +147,11 @@ def _rgb_of(planes: NDArray[np.uint8]) -> NDArray[np.uint8]:
     wide = planes.shape[1]
     colours = planes[high:].reshape(2, high // 2, wide // 2)
     large = [cv2.resize(one, (wide, high), interpolation=cv2.INTER_LINEAR) for one in colours]
-    yuv = np.stack([planes[:high], *large], axis=-1) - _BLACK
-    rgb: NDArray[np.uint8] = np.clip((yuv @ _TO_RGB + _HALF) >> 16, 0, 255).astype(np.uint8)
+    yuv = [
+        one.astype(np.int32) - np.int32(black)
+        for one, black in zip((planes[:high], *large), _BLACK, strict=True)
+    ]
+    rgb = np.empty((high, wide, 3), np.uint8)
+    for k, factors in enumerate(_TO_RGB):
+        rgb[:, :, k] = _mixed(yuv, factors).clip(0, 255)
     return rgb

@@ -48,6 +48,7 @@ class Demonstration:
     scan (n, R), imu (n, 6), people (n, PEOPLE_ROWS, 5): recorded sensors, as in
         `scan_row` and `people_rows` of `cosim.spec.sensors`; empty without them.
     near, free, scene: labels, as in `scenarios.episodes.labels`; empty without them.
+    reward (n, 1): rewards, as in `scenarios.episodes.reward`; empty without them.
     begins (n,): whether a row is the first one, or the first after the robot was put back; empty
         for one that was never put back.
     """
@@ -68,6 +69,7 @@ class Demonstration:
     near: NDArray[np.float32] = field(default_factory=_nothing)
     free: NDArray[np.float32] = field(default_factory=_nothing)
     scene: NDArray[np.float32] = field(default_factory=_nothing)
+    reward: NDArray[np.float32] = field(default_factory=_nothing)
     begins: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
 
     def __len__(self) -> int:
@@ -75,7 +77,7 @@ class Demonstration:
 
     @property
     def extras(self) -> dict[str, NDArray[np.float32]]:
-        """Return the recorded sensors and labels by name."""
+        """Return the recorded sensors, labels and rewards by name."""
         rows = {name: getattr(self, name) for name in EXTRAS}
         return {name: readings for name, readings in rows.items() if readings.size}
 

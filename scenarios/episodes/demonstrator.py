@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
 from cosim.core.errors import UsageError
+from cosim.core.packed_demos import REWARD
 from cosim.core.state import Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation
@@ -27,15 +28,23 @@ from cosim.spec.sensors import people_rows, scan_row
 from scenarios.episodes.clip import Clip
 from scenarios.episodes.demonstration import Demonstration, drives_ahead, glimpse
 from scenarios.episodes.labels import event_numbers, event_person, label_rows
+from scenarios.episodes.reward import row_rewards
 
 _BURST_S: Final = (0.4, 1.0)
 """Shortest and longest disturbance in seconds."""
 _LEARNER_S: Final = (1.0, 5.0)
 """Shortest and longest time in seconds that a learner drives, enough to reach its own errors."""
+_EXPLORED_S: Final = (0.6, 2.0)
+"""Shortest and longest change of an exploring learner in seconds."""
 _SLOWER: Final = (0.5, 1.2)
 """Range of the factor on the expert's speed during a disturbance."""
 _TURN: Final = 0.8
 """Largest change of the expert's yaw rate in a disturbance, as a share of the robot's maximum."""
+
+_EXPLORED_TURN: Final = 0.3
+"""The same share for an exploring learner, which is to stay on its way."""
+_EXPLORED_MPS: Final = (0.0, 1.0)
+"""Speeds that half of the changes of an exploring learner set. A factor never starts a robot."""
 
 
 class Demonstrator(PolicyCaller):
@@ -43,7 +52,8 @@ class Demonstrator(PolicyCaller):
 
     goal: goal protocol of the run; see `EpisodeOptions`.
     learner: drives at times (`load_learner`; Ross et al., DAgger, 2011). It is queried at every
-        picture, because it may have a memory.
+        picture, because it may have a memory. A learner that explores drives all the time, and
+        the expert is not queried.
     Raises UsageError.
     """
 
@@ -83,11 +93,16 @@ class Demonstrator(PolicyCaller):
 
     def act(self, observation: Observation) -> Command:
         """Return the command to execute: the expert's, in a disturbance another one or the
-        learner's."""
+        learner's. That of an exploring learner is also the recorded one."""
         rgb = observation.pictures[RECORDING_CAMERA].rgb if self._sees else observation.rgb
         assert rgb is not None
-        answer = self._expert.act(observation)
         learned = None if self.learner is None else self.learner.act(observation)
+        if self._collecting.explore:
+            assert learned is not None, "`DemoOptions` demands a learner"
+            explored = self._bursts.driven(learned, observation.robot)
+            self._rows.add(observation, rgb, clipped(explored, observation.robot), False)
+            return explored
+        answer = self._expert.act(observation)
         driven = self._bursts.driven(answer, observation.robot, learned)
         self._rows.add(observation, rgb, answer, driven is not answer)
         return driven
@@ -98,7 +113,12 @@ class Demonstrator(PolicyCaller):
             self.learner.ended()
 
     def encoded_demonstration(self, scenario: Scenario, record: Record, log: Log | None) -> bytes:
-        """Return the encoded demonstration; b"" if the episode crashed or was not solved."""
+        """Return the encoded demonstration; b"" if the episode crashed or was not solved.
+
+        Of an exploring learner, episodes that failed are returned, but not invalid ones.
+        """
+        if self._collecting.explore and record.status != "done":
+            return b""
         if log is None or not (self._collecting.unsolved or solved(record, log)):
             return b""
         return self._rows.demonstration(scenario, record, log).encoded()
@@ -127,8 +147,12 @@ class _Bursts:
     def __init__(self, seed: int, collecting: DemoOptions) -> None:
         self._draws = np.random.default_rng([seed, 0xDA66E5])
         self._period_s = 1.0 / collecting.rate_hz
-        self._share = collecting.noise
-        self._lasts_s = _LEARNER_S if collecting.learner else _BURST_S
+        self._explores = collecting.explore > 0.0
+        self._share = collecting.explore or collecting.noise
+        driver_s = _LEARNER_S if collecting.learner else _BURST_S
+        self._lasts_s = _EXPLORED_S if self._explores else driver_s
+        self._most_turn = _EXPLORED_TURN if self._explores else _TURN
+        self._set_mps: float | None = None
         self._left = self._calm = 0
         if float(self._draws.random()) >= self._share:  # else it begins with a burst
             self._calm = self._steps_of_calm()
@@ -148,12 +172,16 @@ class _Bursts:
             self._left = max(1, round(float(self._draws.uniform(*self._lasts_s)) / self._period_s))
             self._calm = self._steps_of_calm()
             self._slower = float(self._draws.uniform(*_SLOWER))
-            self._turn = float(self._draws.uniform(-_TURN, _TURN))
+            self._turn = float(self._draws.uniform(-self._most_turn, self._most_turn))
+            if self._explores:
+                sets = self._draws.random() < 0.5
+                self._set_mps = float(self._draws.choice(_EXPLORED_MPS)) if sets else None
         self._left -= 1
         if learned is not None:
             return learned
         turned_radps = answer.w_radps + self._turn * robot.w_max_radps
-        return clipped(Command(self._slower * answer.v_mps, turned_radps), robot)
+        v_mps = self._slower * answer.v_mps if self._set_mps is None else self._set_mps
+        return clipped(Command(v_mps, turned_radps), robot)
 
     def _steps_of_calm(self) -> int:
         """Return the number of undisturbed commands before the next disturbance."""
@@ -230,6 +258,8 @@ class _Rows:
                 if one.triggered_at_s is not None
             }
             extras["scene"][:, 1] = event_numbers(scenario, self._persons, self._ticks, triggered)
+        if collecting.explore:
+            extras[REWARD] = row_rewards(record, log, ticks)
         return Demonstration(
             state=numbers[:, 0:2].astype(np.float32),
             goal=numbers[:, 2:4].astype(np.float32),

@@ -23,9 +23,9 @@ from scenarios.events.injected_person import (
     step_injected,
 )
 
-MOST_INJECTED: Final = 100
+MAX_INJECTED: Final = 100
 """Maximum number of injected people at a time, including accepted ones before their first tick."""
-MOST_INJECTED_PER_EPISODE: Final = 5000
+MAX_INJECTED_PER_EPISODE: Final = 5000
 """Maximum number of injected people in an episode, because its record lists all of them."""
 SUGGESTED_AHEAD_M: Final = 10.0
 """Distance in m along the route from the robot to the valid point that a refusal suggests."""
@@ -116,13 +116,11 @@ class InjectedPeople:
                 return f"path[{i}] is {found}: that is not on this map. {self._valid_point()}"
         if injection.id in self._names:
             return "there was one of this id in the episode already: choose another"
-        if len(self._here) + len(self._coming) >= MOST_INJECTED:
+        if len(self._here) + len(self._coming) >= MAX_INJECTED:
+            return f"{MAX_INJECTED} injected pedestrians are here already: wait until some are gone"
+        if len(self._names) >= MAX_INJECTED_PER_EPISODE:
             return (
-                f"{MOST_INJECTED} injected pedestrians are here already: wait until some are gone"
-            )
-        if len(self._names) >= MOST_INJECTED_PER_EPISODE:
-            return (
-                f"{MOST_INJECTED_PER_EPISODE} pedestrians were injected into this episode: no more"
+                f"{MAX_INJECTED_PER_EPISODE} pedestrians were injected into this episode: no more"
             )
         return ""
 

@@ -52,7 +52,7 @@ _STEP_OUT_M: Final = 3.5
 """Metres within which an interaction spot needs a waypoint."""
 _SPUR_M: Final = 0.12
 """Half the width in metres of the path between an interaction spot and its waypoint."""
-_LEAST_NODES: Final = 4
+_MIN_NODES: Final = 4
 """Fewest waypoints of a connected part; smaller parts are removed."""
 
 
@@ -212,7 +212,7 @@ def _joined(
     length = np.hypot(*(xy[ends[:, 0]] - xy[ends[:, 1]]).T)
     arcs = csr_array((length, (ends[:, 0], ends[:, 1])), shape=(len(xy), len(xy)))
     _, part = connected_components(arcs, directed=False)
-    large = np.bincount(part[: len(idle)], minlength=part.max(initial=0) + 1) >= _LEAST_NODES
+    large = np.bincount(part[: len(idle)], minlength=part.max(initial=0) + 1) >= _MIN_NODES
     kept = np.flatnonzero(large[part]) if len(part) else np.zeros(0, dtype=np.intp)
     ways = kept[kept < len(idle)]
     points = kept[kept >= len(idle)]

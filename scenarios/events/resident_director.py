@@ -49,7 +49,7 @@ _ROOM_M: Final = 1.5
 """Smallest distance in metres between a new resident and other people."""
 SETTLED_PROBABILITY: Final = 0.5
 """Probability that a new resident is already at an interaction spot, if one is available."""
-_MOST_NEIGHBOURS: Final = 6
+_MAX_NEIGHBOURS: Final = 6
 """Largest number of people that a resident's steering considers."""
 _KIND: Final = 0x8E51
 """Separates the random generators of residents from others with the same seed."""
@@ -197,8 +197,7 @@ def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neigh
             one = Neighbour(x, y, *moving, AVOIDANCE_SHARE if steers else 1.0)
             found[walking[k].number].append((float(square[k, i]), one))
     return {
-        number: [one for _, one in sorted(near)[:_MOST_NEIGHBOURS]]
-        for number, near in found.items()
+        number: [one for _, one in sorted(near)[:_MAX_NEIGHBOURS]] for number, near in found.items()
     }
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# From nothing to the table of a policy with a memory: demonstrations, rounds of DAgger, seeds, ablations, scores.
+# From nothing to the table of a policy with a memory: demonstrations, rounds of DAgger, seeds, rewards, ablations, scores.
 #
 #   scenarios/examples/sidewalk_policy.sh WORK
 #
@@ -9,15 +9,19 @@
 # COSIM, PYTHON: see small_policy.sh.
 # ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
 # SEEDS: trained on all rounds at the end ("0 1 2"; "" for none). GPUS: number of GPUs (1); each trains one network at a time.
-# ABLATIONS=1: trains seed 0 again with each change of docs/demonstrations.md. SPLIT, SUITES: what is scored (val; all three).
-# The table of a suite is WORK/SUITE.md: all policies, compared with the first one.
+# VALUES: temperature of the fine-tuning on rewards (1; "" for none). The first seed's policy explores, and is trained on what it drove,
+# weighted by values, for MORE steps (2000). WORK/kept.txt has the better one of both on val.
+# ABLATIONS=1: trains seed 0 again with each change of docs/learning.md. QUESTIONS=1: fine-tunes on one EVENT (gesturing) alone, and
+# scores the first seed's policy with random goals in place of route goals. SPLIT, SUITES: what is scored (val; all three). RUN: more words for cosim run.
+# The table of a suite is WORK/SUITE.md, its picture WORK/SUITE.png: all policies, compared with the first one.
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
-# MOST: most episodes of a collection with events (100000).
+# MOST: most episodes of a collection (100000); small ones are drawn faster, which matters on few cores.
 # ROBOTS: further robots that collect, besides the courier ("scout dog"). WEATHERS: names from which each episode's is drawn.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
 W=${1:?a folder to work in}
 . "$here/scenarios/examples/pieces.sh"
+VALUES=${VALUES-1} MORE=${MORE:-2000} EVENT=${EVENT:-gesturing} RUN=${RUN:-}
 ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-7} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
 SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
 MOST=${MOST:-100000} ROBOTS=${ROBOTS-"scout dog"} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
@@ -27,20 +31,32 @@ awk "BEGIN { exit !($COLLECT < ${MINUTES:-9}) }" || { echo "COLLECT=$COLLECT mus
 
 gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes as fit in COLLECT minutes, over all calls
   name=$1 gpu=$3 most=$4 jobs=$(awk "BEGIN { n = int($2 * $JOBS + 0.5); print n < 1 ? 1 : n }"); shift 4
-  export USED=$W/log/collect-$name.seconds LAST
+  export USED=$W/log/collect-$name.seconds DEMO=$W/demos/$name LAST
   [ -e "$W/log/collect-$name.done" ] && return 0
   rest=$(awk "BEGIN { n = int(60 * $COLLECT) - $(cat "$USED" 2> /dev/null || echo 0); print n < 1 ? 1 : n }")
   now=$((END - SECONDS - MARGIN_S)); [ "$now" -lt "$rest" ] || now=$rest
   LAST=$((now == rest))
-  # Exit code 4: the time is up. The collection is done if this was the rest of its time.
+  [ "$most" -lt "$MOST" ] || most=$MOST
+  # Exit code 4: the time is up. The collection is done if this was the rest of its time, and an episode is finished.
   GLCONTEXT_DEVICE_INDEX=$gpu step "collect-$name" bash -c '"$@"; code=$?; [ $code = 4 ] || exit $code
+    if [ $LAST = 1 ] && ! compgen -G "$DEMO/runs/*/episodes/*/demonstration.npz" > /dev/null; then
+      rm -f "$USED"; echo "no episode in COLLECT minutes: continuing"; exit 1
+    fi
     echo $(($(cat "$USED" 2> /dev/null || echo 0) + SECONDS)) > "$USED"; [ $LAST = 1 ]' - \
     $COSIM collect "$@" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --fov 60 --labels --format raw \
     --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
 )
-round() { # number, words of the driver...: collects in parallel, then packs
-  local k=$1 first=$((900 + 100 * $1)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0; shift
-  local common=(--city-size 1000 --seed "$k" --astray 0.3 --unsolved "$@")
+packed() { # names...: packs their collections, when all are done
+  local name
+  mkdir -p "$W/packed"
+  for name in "$@"; do [ -e "$W/log/collect-$name.done" ] || exit 1; done
+  for name in "$@"; do
+    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --part 32 --jobs "$JOBS"
+  done
+}
+round() { # name, number, words of the driver...: collects in parallel, then packs
+  local k=$1 number=$2 first=$((900 + 100 * $2)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0; shift 2
+  local common=(--city-size 1000 --seed "$number" --astray 0.3 --unsolved "$@")
   local all=(--cities $first:$((first + CITIES)) "${common[@]}")
   gather "$k-unit" 0.08 0 "$((60 * JOBS))" unit "${all[@]}" &
   gather "$k-long" 0.22 $((GPUS - 1)) "$((12 * JOBS))" long-horizon "${all[@]}" &
@@ -55,18 +71,18 @@ round() { # number, words of the driver...: collects in parallel, then packs
     gather "$k-$robot" 0.07 $((${#names[@]} % GPUS)) "$((60 * JOBS))" reactive --decoys --robot "$robot" "${all[@]}" &
   done
   wait
-  mkdir -p "$W/packed"
-  for name in "${names[@]}"; do [ -e "$W/log/collect-$name.done" ] || exit 1; done
-  for name in "${names[@]}"; do
-    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --jobs "$JOBS"
-  done
+  packed "${names[@]}"
 }
 parts() { # last round: the packed files up to it
   for k in $(seq "$FIRST" "$1"); do ls "$W"/packed/"$k"-*.npz; done
 }
+network() { # name, words...
+  local name=$1; shift
+  learn "$name" --network sidewalk --batch "$BATCH" --name "sidewalk-${name#sidewalk-}" "$@"
+}
 sidewalk() { # name, last round, words...
   local name=$1 last=$2; shift 2
-  learn "$name" $(parts "$last") --network sidewalk --batch "$BATCH" --steps "$STEPS" --rate 5e-4 --name "sidewalk-${name#sidewalk-}" "$@"
+  network "$name" $(parts "$last") --steps "$STEPS" --rate 5e-4 "$@"
 }
 together() { # what, names...: trains in parallel, one network on each GPU
   local what=$1 number=0 name; shift
@@ -82,17 +98,45 @@ ablation() {
   local words=(); case $1 in share-*) words=(--share "${1#share-}") ;; no-*) words=("--$1") ;; esac
   sidewalk "$1" $((FIRST + ROUNDS - 1)) --seed 0 "${words[@]}"
 }
-score() { # name, suite, policy
-  local more=(); [ -e "$W/runs/$1/run.json" ] && more=(--resume)
-  step "run-$1" $COSIM run "$2" --split "$SPLIT" --seed 1 --jobs "$JOBS" --policy "$3" --out "$W/runs/$1" "${more[@]}"
+score() { # name, suite, policy, split, words...
+  local name=$1 suite=$2 policy=$3 split=${4:-$SPLIT}; shift "$(($# < 4 ? $# : 4))"
+  local more=(); [ -e "$W/runs/$name/run.json" ] && more=(--resume)
+  step "run-$name" $COSIM run "$suite" --split "$split" --seed 1 --jobs "$JOBS" --policy "$policy" --out "$W/runs/$name" $RUN "$@" "${more[@]}"
+}
+compared() { # name, words...: compares runs, and shows the end of the output if that fails
+  local name=$1; shift
+  $COSIM compare "$@" > "$W/log/compare-$name.txt" 2>&1 || { tail -n 3 "$W/log/compare-$name.txt"; exit 1; }
+}
+values() { # learner: fine-tunes it on rewards; writes the better one of both on val to WORK/kept.txt
+  local where=val-reactive name; [ "$SPLIT" = val ] && where=reactive
+  round values $((FIRST + ROUNDS)) --learner "onnx:$W/nets/$1" --explore 0.3
+  network values $(parts $((FIRST + ROUNDS - 1))) "$W"/packed/values-*.npz --from "$W/nets/$1" --values "$VALUES" \
+    --steps "$MORE" --rate 1e-4 --seed 0
+  for name in "$1" values; do score "$where-$name" reactive "onnx:$W/nets/$name" val; done
+  compared values "$W/runs/$where-$1" "$W/runs/$where-values" -o "$W/values.csv"
+  # Kept if of SR and D on val one rises, and none falls.
+  awk -F, -v was="$1" 'NR == 1 { for (i = 1; i <= NF; i++) at[$i] = i; next }
+    $at["by"] == "suite" && ($at["metric"] == "success" || $at["metric"] == "discerned") {
+      change = $at["value_after"] - $at["value_before"]; rises += change > 0; falls += change < 0
+      print "fine-tuning on rewards:", $at["metric"], $at["value_before"], "to", $at["value_after"], $at["verdict"] > "/dev/stderr" }
+    END { print (rises && !falls) ? "values" : was }' "$W/values.csv" > "$W/kept.txt.part" || exit 1
+  mv "$W/kept.txt.part" "$W/kept.txt"
+  echo "kept: $(cat "$W/kept.txt")"
+}
+questions() { # learner: does fine-tuning on one event cost others?
+  local number=$((FIRST + ROUNDS + 1))
+  gather event 1 0 "$MOST" reactive --event "$EVENT" --decoys --cities $((900 + 100 * number)):$((900 + 100 * number + CITIES)) \
+    --city-size 1000 --seed "$number" --astray 0.3 --unsolved --learner "onnx:$W/nets/$1" --noise 0.7
+  packed event
+  network event "$W"/packed/event-*.npz --from "$W/nets/$1" --steps "$MORE" --rate 1e-4 --seed 0
 }
 
 learner=$FROM
 for k in $(seq "$FIRST" $((FIRST + ROUNDS - 1))); do
   if [ -z "$learner" ]; then
-    round "$k" --noise 0.3
+    round "$k" "$k" --noise 0.3
   else
-    round "$k" --noise 0.7 --learner "onnx:$learner"
+    round "$k" "$k" --noise 0.7 --learner "onnx:$learner"
   fi
   if [ "$k" -lt $((FIRST + ROUNDS - 1)) ]; then
     sidewalk "round$k" "$k" --seed 0 ${learner:+--from "$learner"}
@@ -102,7 +146,16 @@ done
 names=()
 for number in $SEEDS; do names+=("sidewalk-$number"); done
 together seed "${names[@]}"
-first=${names[0]:-}
+first=${names[0]:-} kept=${names[0]:-}
+if [ -n "$first" ] && [ -n "$VALUES" ]; then
+  values "$first"
+  kept=$(cat "$W/kept.txt")
+  names+=(values)
+fi
+if [ -n "$first" ] && [ "${QUESTIONS:-0}" = 1 ]; then
+  questions "$first"
+  names+=(event)
+fi
 if [ "${ABLATIONS:-0}" = 1 ]; then
   changes=(share-0.01 share-0.1 no-memory no-auxiliary no-decoys no-weather)
   [ -n "$FROM" ] && changes+=(whole)  # without FROM it is sidewalk-0
@@ -111,16 +164,19 @@ if [ "${ABLATIONS:-0}" = 1 ]; then
 fi
 for suite in $SUITES; do
   for name in "${names[@]}"; do score "$suite-$name" "$suite" "onnx:$W/nets/$name"; done
+  if [ -n "$first" ] && [ "${QUESTIONS:-0}" = 1 ]; then
+    score "$suite-random-goals" "$suite" "onnx:$W/nets/$first" "$SPLIT" --goal random_point
+  fi
 done
 if [ -n "$first" ] && [[ " $SUITES " = *" reactive "* ]]; then
-  export POLICY=onnx:$W/nets/$first
+  export POLICY=onnx:$W/nets/$kept
   score reactive-black reactive "$here/scenarios/examples/black_pictures.py:Blinded"
 fi
 for suite in $SUITES; do
   runs=()
-  for name in "${names[@]}" black; do [ -e "$W/runs/$suite-$name/run.json" ] && runs+=("$W/runs/$suite-$name"); done
+  for name in "${names[@]}" black random-goals; do [ -e "$W/runs/$suite-$name/run.json" ] && runs+=("$W/runs/$suite-$name"); done
   [ ${#runs[@]} -gt 1 ] || continue
-  $COSIM compare "${runs[@]}" -o "$W/$suite.md" > "$W/log/compare-$suite.txt" 2>&1 || { tail -n 3 "$W/log/compare-$suite.txt"; exit 1; }
+  compared "$suite" "${runs[@]}" -o "$W/$suite.md" -o "$W/$suite.png" --by policy
   echo "$suite:"; cat "$W/$suite.md"
 done
 echo "all done"

@@ -19,9 +19,9 @@ _PROGRESS_AT: Final = 32
 """Byte of the header at which the progress begins, after the pending call."""
 _COMMAND: Final = struct.Struct("qqdd")
 """Layout of a command: tick of its observation, delay in ticks, speed in m/s, yaw rate in rad/s."""
-MOST_COMMANDS: Final = 1 << 20
+MAX_COMMANDS: Final = 1 << 20
 """Maximum number of commands of an episode, 14.5 hours at 20 Hz. Unused memory takes no space."""
-LOG_BYTES: Final = MOST_COMMANDS * _COMMAND.size
+LOG_BYTES: Final = MAX_COMMANDS * _COMMAND.size
 """Size of the memory of a log in bytes."""
 
 
@@ -91,7 +91,7 @@ def driven_of(memory: SharedMemory) -> Driven | None:
     """Return what was driven of the episode of a process; None if the log was full or damaged."""
     ticks, count, over = _PROGRESS.unpack_from(memory.map, _PROGRESS_AT)
     end = HEAD_BYTES + count * _COMMAND.size
-    if not 0 <= count <= MOST_COMMANDS or end > len(memory.map) or ticks < 0:
+    if not 0 <= count <= MAX_COMMANDS or end > len(memory.map) or ticks < 0:
         return None
     return Driven(ticks, bool(over), bytes(memory.map[HEAD_BYTES:end]))
 

@@ -53,7 +53,7 @@ _LIMITS: Final = {
 }
 """Further limits of each process: open files, bytes of a file, of a core dump, of locked memory and
 of message queues."""
-_MOST_FILES: Final = 1 << 20
+_MAX_FILES: Final = 1 << 20
 """Number above all descriptors."""
 _SCRATCH: Final = "size=1g"
 """Size of each of the folders in memory that may be written."""
@@ -371,14 +371,14 @@ def _enter_landlock(sandbox: Sandbox, inside: _Inside) -> None:
 
 _EXECUTE, _WRITE, _READ, _LIST, _TRUNCATE, _DEVICE_CALLS = 1, 2, 4, 8, 1 << 14, 1 << 15
 """Rights of Landlock."""
-_LEAST_LANDLOCK: Final = 3
+_MIN_LANDLOCK: Final = 3
 """Oldest version of Landlock that is used; older ones let files be emptied."""
 
 
 def _landlock_version() -> int:
     version = call("find Landlock", "landlock_create_ruleset", None, 0, 1)
-    if version < _LEAST_LANDLOCK:
-        raise SandboxError(f"Landlock has version {version} here, and {_LEAST_LANDLOCK} is needed")
+    if version < _MIN_LANDLOCK:
+        raise SandboxError(f"Landlock has version {version} here, and {_MIN_LANDLOCK} is needed")
     return version
 
 
@@ -444,7 +444,7 @@ def _close_all_but(exceptions: set[int]) -> None:
         if descriptor > last + 1:  # closerange takes an empty range for an endless one
             os.closerange(last + 1, descriptor)
         last = descriptor
-    os.closerange(last + 1, _MOST_FILES)
+    os.closerange(last + 1, _MAX_FILES)
 
 
 def _environment(sandbox: Sandbox, work: Path) -> dict[str, str]:

@@ -16,9 +16,9 @@ from scenarios.places.nets import place
 
 SPACINGS_M = (0.03, 0.5)
 """Smallest and largest distance between splats of a generated scan in metres."""
-MOST_M = 300.0
+MAX_M = 300.0
 """Maximum side of a generated scan in metres."""
-LEAST_M = 10.0
+MIN_M = 10.0
 """Minimum side of a generated scan in metres."""
 
 
@@ -40,9 +40,9 @@ def make_scan(
     _, street_map = place(city)
     box = crossing_box(street_map) if box is None else box
     x0, y0, x1, y1 = box
-    if not all(LEAST_M <= side <= MOST_M for side in (x1 - x0, y1 - y0)):
+    if not all(MIN_M <= side <= MAX_M for side in (x1 - x0, y1 - y0)):
         raise UsageError(
-            f"--box must be x0,y0,x1,y1 with sides of {LEAST_M:g} to {MOST_M:g} m, not "
+            f"--box must be x0,y0,x1,y1 with sides of {MIN_M:g} to {MAX_M:g} m, not "
             f"{x1 - x0:g} x {y1 - y0:g} m"
         )
     if not shapely.box(*street_map.bounds).contains(shapely.box(*box)):

@@ -61,7 +61,7 @@ _LACKS_A_FILE: Final = re.compile(
     r"Errno (1|2|13)\]|No such file|NO_SUCHFILE|Permission denied|No module named|not exist"
 )
 """Words of errors that a file outside of the sandbox may have caused."""
-_MOST_BYTES: Final = 4 << 20
+_MAX_BYTES: Final = 4 << 20
 """Size limit of an answer in bytes."""
 
 
@@ -78,7 +78,7 @@ class _PolicyProcess:
         self._memory = SharedMemory.new(memory_bytes)
         entry_point = _ENTRY_POINT if sandbox is None else _ENTRY_POINT_IN_SANDBOX
         descriptors = (self._memory.descriptor,)
-        self._process = ChildProcess(None, entry_point, "policy", descriptors, _MOST_BYTES, sandbox)
+        self._process = ChildProcess(None, entry_point, "policy", descriptors, _MAX_BYTES, sandbox)
         self._process.send(name.encode())
         self._open = True
 

@@ -26,9 +26,9 @@ from scenarios.ipc.faults import AttemptFailure
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Message, Progress, Waits
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
 from scenarios.runs.protocol import (
-    MOST_DRIVEN_BYTES,
-    MOST_SENT_BYTES,
-    MOST_WORDS,
+    MAX_DRIVEN_BYTES,
+    MAX_SENT_BYTES,
+    MAX_WORDS,
     Assignment,
     Claim,
     CoordinatorReply,
@@ -48,7 +48,7 @@ _FRAMES_BYTES: Final = 4 << 20
 """Size limit in bytes of the camera frames of one report."""
 _PROGRESS_BYTES: Final = 100
 """Size in bytes of any other message of the environment process, about."""
-_RESULT_BYTES: Final = MOST_SENT_BYTES - (1 << 17)
+_RESULT_BYTES: Final = MAX_SENT_BYTES - (1 << 17)
 """Size limit in bytes of a result: the rest is room for the other fields of a report."""
 _LAST_PRINTED: Final = 60_000
 """Number of bytes that are sent of the output of a process."""
@@ -60,7 +60,7 @@ _LONGEST_PAUSE_S: Final = 1.0
 def _driven_in(failure: AttemptFailure | None) -> bytes:
     """Return the record of what was driven, unless it is more than can be sent."""
     driven = b"" if failure is None else failure.driven
-    return driven if len(driven) <= MOST_DRIVEN_BYTES else b""
+    return driven if len(driven) <= MAX_DRIVEN_BYTES else b""
 
 
 class RunEnded(Exception):
@@ -308,7 +308,7 @@ class JobClient:
             done=done,
             digest="" if done is None else digest_of(done),
             fault=None if failure is None else failure.fault,
-            why="" if failure is None else failure.why[:MOST_WORDS],
+            why="" if failure is None else failure.why[:MAX_WORDS],
             found="" if failure is None else failure.found,
             driven=_driven_in(failure),
             printed=printed,

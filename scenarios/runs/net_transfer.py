@@ -33,7 +33,7 @@ from sumo_nets.maps.map_store import (
 
 _PART_BYTES: Final = 2 << 20
 """Size in bytes of a part of a map."""
-_MOST_BYTES: Final = 1 << 30
+_MAX_BYTES: Final = 1 << 30
 """Size limit in bytes of a map, packed and unpacked."""
 _NET: Final = "net.xml"
 _FILES: Final = (_NET, ABOUT, FEATURES_FILE, GROUND_FILE)
@@ -116,7 +116,7 @@ class MapDownload:
         Raises MachineError when it cannot be stored, EngineError when it is not the requested one.
         """
         part = decode(payload, NetPart)
-        if part.whole > _MOST_BYTES:
+        if part.whole > _MAX_BYTES:
             raise EngineError(
                 f"map '{self._where.map}' of {part.whole >> 20} MB is more than is taken"
             )
@@ -133,7 +133,7 @@ class MapDownload:
         folder = maps_folder()
         try:
             opened = zlib.decompressobj()
-            files = decode(opened.decompress(packed, _MOST_BYTES), dict[str, bytes])
+            files = decode(opened.decompress(packed, _MAX_BYTES), dict[str, bytes])
         except zlib.error as error:
             raise EngineError(f"map '{name}' was damaged on its way: {error}") from error
         known = all(name in _FILES or _SCAN_FILE.fullmatch(name) for name in files)

@@ -25,17 +25,17 @@ from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Progress, Waits
 
 PROTOCOL: Final = 3
 """Version of these messages, raised with every change."""
-MOST_SENT_BYTES: Final = 15 << 20
+MAX_SENT_BYTES: Final = 15 << 20
 """Size limit of a message in bytes: Zenoh drops messages of more than 16 MiB."""
-MOST_WORDS: Final = 2000
+MAX_WORDS: Final = 2000
 """Length limit of a reason in characters."""
-MOST_DRIVEN_BYTES: Final = 1 << 20
+MAX_DRIVEN_BYTES: Final = 1 << 20
 """Size limit in bytes of the record of a failed episode."""
 _Name = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,64}$")]
-_Words = Annotated[str, Meta(max_length=MOST_WORDS)]
+_Words = Annotated[str, Meta(max_length=MAX_WORDS)]
 _Count = Annotated[int, Meta(ge=0, lt=1 << 62)]
 _Slot = Annotated[int, Meta(ge=0, lt=4096)]
-_Driven = Annotated[bytes, Meta(max_length=MOST_DRIVEN_BYTES)]
+_Driven = Annotated[bytes, Meta(max_length=MAX_DRIVEN_BYTES)]
 _Printed = Annotated[bytes, Meta(max_length=1 << 16)]
 
 Installed = Mapping[str, str]

@@ -11,7 +11,7 @@ from bridge.ros2.node import Ros2Node
 from bridge.ros2.wire import Endpoint, full_topic, type_hash
 from cosim.spec.ros2 import CMD_VEL, PUBLISHED_TOPICS, TOPIC_OPTIONS, Ros2Distro, Ros2Settings
 
-_MOST_NAMED: Final = 8
+_MAX_NAMED: Final = 8
 """Largest number of nodes or topics that a message names."""
 
 
@@ -45,7 +45,7 @@ def diagnosis(
     publishers = node.publishers_of(CMD_VEL).values()
     here = full_topic(settings.namespace, CMD_VEL)
     if not publishers:
-        names = ", ".join(sorted({end.in_words for end in others})[:_MOST_NAMED])
+        names = ", ".join(sorted({end.in_words for end in others})[:_MAX_NAMED])
         return f"none of the nodes {names} publishes {here} in domain {settings.domain}"
     if settings.wait != "rate" and not node.subscriptions():
         return _reads_nothing(next(iter(publishers)), others)
@@ -109,7 +109,7 @@ def _reads_nothing(publisher: Endpoint, others: Iterable[Endpoint]) -> str:
     topics = {
         end.topic for end in others if end.kind == "MS" and end.in_words == publisher.in_words
     }
-    read = ", ".join(sorted(topics)[:_MOST_NAMED])
+    read = ", ".join(sorted(topics)[:_MAX_NAMED])
     only = f"only to {read}, and the run publishes none of these" if read else "to no topic"
     return f"{publisher.in_words} publishes {CMD_VEL} and subscribes {only}"
 

@@ -27,11 +27,11 @@ CONFLICT: Final = "CONFLICT"
 SILENT_S: Final = 4.0
 """Seconds without a report after which a worker is shown as silent: it reports every second."""
 _WRITTEN_EVERY_S: Final = 2.0
-_MOST_REFUSED: Final = 1000
+_MAX_REFUSED: Final = 1000
 """Number of refused messages that are logged."""
-_MOST_GONE: Final = 1000
+_MAX_GONE: Final = 1000
 """Number of workers that have left or were lost and are still listed."""
-_MOST_PRINTED: Final = 4 << 20
+_MAX_PRINTED: Final = 4 << 20
 """Size limit in bytes of the log of each environment process."""
 
 State = Literal["working", "idle", "silent", "lost", "left", "turned away"]
@@ -214,7 +214,7 @@ class WorkerRegistry:
     def refused(self, words: str) -> None:
         """Note a message that cannot be read, or is of another run."""
         self._refused += 1
-        if self._refused <= _MOST_REFUSED:
+        if self._refused <= _MAX_REFUSED:
             self.note(words)
 
     def note(self, words: str) -> str:
@@ -233,7 +233,7 @@ class WorkerRegistry:
         path = self._held.path / "logs" / f"{report.worker}-{report.slot}.log"
         text = report.printed
         with suppress(OSError):
-            if text and (not path.exists() or path.stat().st_size < _MOST_PRINTED):
+            if text and (not path.exists() or path.stat().st_size < _MAX_PRINTED):
                 with path.open("ab") as log:
                     log.write(text)
 
@@ -278,7 +278,7 @@ class WorkerRegistry:
             absent = [
                 name for name, one in self._workers.items() if one.state not in ("working", "idle")
             ]
-            for name in absent[: max(len(absent) - _MOST_GONE, 0)]:
+            for name in absent[: max(len(absent) - _MAX_GONE, 0)]:
                 del self._workers[name]
             one = self._workers[worker] = WorkerStatus(name=worker, host=host or worker)
             self.note(f"{worker}: is connected")

@@ -24,7 +24,7 @@ from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
 from scenarios.runs.lease import Lease
 from scenarios.runs.net_transfer import RunMaps
 from scenarios.runs.protocol import (
-    MOST_SENT_BYTES,
+    MAX_SENT_BYTES,
     Assignment,
     Claim,
     CoordinatorReply,
@@ -51,7 +51,7 @@ SETTLING_S: Final = 3.0
 PARTING_S: Final = 3.0
 """Seconds for which claims are answered after the run is over."""
 _OVERHEAD_BYTES: Final = 4096
-"""Bytes that a message may have beyond `MOST_SENT_BYTES`."""
+"""Bytes that a message may have beyond `MAX_SENT_BYTES`."""
 
 _SlotKey = tuple[str, int]
 """The name of a worker and the number of its slot."""
@@ -226,7 +226,7 @@ class ZenohWorkers:
             return
         act, query = one
         try:
-            if len(query.payload) > MOST_SENT_BYTES + _OVERHEAD_BYTES:
+            if len(query.payload) > MAX_SENT_BYTES + _OVERHEAD_BYTES:
                 raise EngineError(f"{len(query.payload)} bytes are more than a message may have")
             self._handlers[act](query)
         except EngineError as error:

@@ -49,7 +49,7 @@ _SLOW: Final = 80
 """Maximum number of crosswalks and corners that are examined, evenly spread, because they are
 slow.
 """
-_MOST_SEED: Final = 2**31 - 1
+_MAX_SEED: Final = 2**31 - 1
 _WAYS: Final = 8
 _SCAN_WAYS: Final = 40
 """Numbers of drawn ways for long routes that are examined, on nets and on scans."""
@@ -166,14 +166,14 @@ class _ScanDraws(NamedTuple):
 
     def event(self, kind: EventKind, strip: Strip) -> Scenario:
         """Draw a reactive scenario on a strip, with a seed of its own."""
-        seed = int(self.rng.integers(_MOST_SEED))
+        seed = int(self.rng.integers(_MAX_SEED))
         return reactive_on(
             strip, kind, self.place, self.street_map, self.rng, seed, kind.name, robot=self.robot
         )
 
     def unit(self, structure: Structure, strip: Strip) -> Scenario:
         """Draw a unit scenario on a strip, with a seed of its own."""
-        seed = int(self.rng.integers(_MOST_SEED))
+        seed = int(self.rng.integers(_MAX_SEED))
         route, crossings = drawn_along(
             structure, strip, self.street_map, self.graph, self.rng, self.robot
         )

@@ -15,9 +15,9 @@ from scenarios.suites.drawing import wider_m
 
 _EDGE_M: Final = 0.03
 """Distance between a fence and the edge of the sidewalk, in metres."""
-_LEAST_M: Final = 0.52
+_MIN_M: Final = 0.52
 """Least width that a fence closes, in metres."""
-_MOST_M: Final = 2.2
+_MAX_M: Final = 2.2
 """Largest width that a fence closes, in metres."""
 _SPLITS: Final = 20
 
@@ -52,18 +52,18 @@ def drawn_gate(
     low_m, high_m = (bound + 0.5 * wider_m(robot) for bound in range_m)
     if sidewalk_half_m <= high_m:
         return Gate(0.0, sidewalk_half_m)
-    high_m = min(high_m, sidewalk_half_m - 0.5 * _LEAST_M)
+    high_m = min(high_m, sidewalk_half_m - 0.5 * _MIN_M)
     if high_m < low_m:
         raise SpecError("the sidewalk is a little too wide for a gate without fences")
     half_m = float(rng.uniform(low_m, high_m))
     closed_m = 2.0 * (sidewalk_half_m - half_m)
     for _ in range(_SPLITS):
         on_left_m = closed_m * float(rng.random())
-        if on_left_m < _LEAST_M:
+        if on_left_m < _MIN_M:
             on_left_m = 0.0
-        elif closed_m - on_left_m < _LEAST_M:
+        elif closed_m - on_left_m < _MIN_M:
             on_left_m = closed_m
-        if max(on_left_m, closed_m - on_left_m) <= _MOST_M:
+        if max(on_left_m, closed_m - on_left_m) <= _MAX_M:
             break
     else:
         raise SpecError("the sidewalk is too wide for a gate")

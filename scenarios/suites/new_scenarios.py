@@ -33,7 +33,7 @@ _STRUCTURES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 """Structures of the suites that can be drawn again."""
 _ROUTE_M: Final = (80.0, 200.0)
 """Shortest and longest drawn route, in metres."""
-_MOST_SEED: Final = 2**31 - 1
+_MAX_SEED: Final = 2**31 - 1
 
 
 class Fresh(msgspec.Struct, frozen=True, kw_only=True):
@@ -107,7 +107,7 @@ def fresh_cities(words: str) -> tuple[int, ...]:
     """
     found = re.fullmatch(r"([0-9]{1,10}):([0-9]{1,10})", words, re.ASCII)
     first, end = (int(part) for part in found.groups()) if found else (0, 0)
-    if not first < end <= _MOST_SEED or end - first > 10_000:
+    if not first < end <= _MAX_SEED or end - first > 10_000:
         raise UsageError(
             f"--cities {words}: give FIRST:END, such as 900:940 for the 40 cities from 900 to 939"
         )

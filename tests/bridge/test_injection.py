@@ -26,7 +26,7 @@ from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection, InjectionRequest, RelativePoint
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
 from scenarios.episodes import injected
-from scenarios.episodes.injected import MOST_INJECTED, InjectedPeople, RobotOnRoute
+from scenarios.episodes.injected import MAX_INJECTED, InjectedPeople, RobotOnRoute
 from tests.conftest import PATIENCE_S, Cosim
 from tests.support.documents import blocks
 from tests.support.plain import free_port
@@ -306,9 +306,9 @@ def test_a_flood_is_bounded() -> None:
     """Of 100,000 messages so many are taken as may be there at once; the rest is told why not."""
     one = injected_people()
     acks = [one.offer(anna(id=f"p{i}")) for i in range(100_000)]
-    assert sum(ack.status == "accepted" for ack in acks) == MOST_INJECTED
+    assert sum(ack.status == "accepted" for ack in acks) == MAX_INJECTED
     assert "are here already" in acks[-1].reason
-    assert len(one.react(query(0)).actors) == MOST_INJECTED
+    assert len(one.react(query(0)).actors) == MAX_INJECTED
 
 
 def test_an_injected_person_does_not_walk_through_the_robot() -> None:
@@ -580,10 +580,10 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(
         assert (ack["id"] in taken_in) is (ack["status"] == "accepted"), ack
         assert ack["status"] == "accepted" or "are here already" in ack["reason"]
     assert len(said["flood"]) <= 2000 and taken_in[0] == "bob"
-    assert len(taken_in) == len(set(taken_in)) >= MOST_INJECTED
+    assert len(taken_in) == len(set(taken_in)) >= MAX_INJECTED
     assert [one["injection"]["id"] for one in said["log"]["injections"]] == taken_in
     injected_people = [sum(one["kind"] == "injected" for one in crowd) for crowd in heard["crowd"]]
-    assert MOST_INJECTED // 2 < max(injected_people) <= MOST_INJECTED
+    assert MAX_INJECTED // 2 < max(injected_people) <= MAX_INJECTED
     assert (
         set(heard) == {"clock", "robot", "crowd", "signals", "events"}
         and heard["events"][-1][-1] == "ended: failure"

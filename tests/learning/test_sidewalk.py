@@ -31,7 +31,7 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed: see `cosi
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnx")
 
-from cosim.learning.bundle import manifest_of  # noqa: E402
+from cosim.learning.bundle import manifest_of, source_of, write_bundle  # noqa: E402
 from cosim.learning.memory_graph import MEMORY_INPUTS, build_memory_graph  # noqa: E402
 from cosim.learning.memory_network import (  # noqa: E402
     EVENTS,
@@ -42,7 +42,7 @@ from cosim.learning.memory_network import (  # noqa: E402
 from cosim.learning.network import HEIGHT_PX, WAYPOINTS, WIDTH_PX, plan  # noqa: E402
 from cosim.learning.settings import Training  # noqa: E402
 from cosim.learning.sidewalk import FREE_UNIT_M, HAND, SIDEWALK, near_loss  # noqa: E402
-from cosim.learning.training import train  # noqa: E402
+from cosim.learning.training import _batches, train  # noqa: E402
 from cosim.learning.windows import WindowExamples, mirror_windows, split_episodes  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -267,6 +267,39 @@ def test_settings_of_ablations_are_checked(data: Path, tmp_path: Path) -> None:
     assert train([tmp_path / "plain.npz"], tmp_path / "net", plain, False, ignore).whole
     with pytest.raises(RunError, match=r"of another training: share 0\.5, not 1\.0"):
         train([tmp_path / "plain.npz"], tmp_path / "net", replace(plain, share=1.0), True, ignore)
+
+
+def test_rows_with_rewards_are_weighted_by_values(data: Path, tmp_path: Path) -> None:
+    """Only training rows with rewards change their weight, the same in each call; the training
+    needs the bundle that drove, and such rows. The bundle's source has the figures."""
+    plain = WindowExamples([data], BRISK, CPU)
+    write_bundle(tmp_path, new_memory_parameters(7), plain, BRISK, "")
+    rows = street()
+    meta = rows.meta | {"policy": [""], "explorer": ["sidewalk"]}
+    reward = (rows.frames[:, 45, 80, :1] > 127).astype(np.float32)
+    replace(rows, meta=meta, reward=reward).save(tmp_path / "own.npz")
+    tuned = replace(BRISK, begin=tmp_path, values=1.0)
+    first, again = (SIDEWALK.examples([data, tmp_path / "own.npz"], tuned, CPU) for _ in "ab")
+    own = first.learned[first.learned >= len(rows)]
+    others = np.setdiff1d(np.arange(len(first.weight)), own)
+    assert (first.weight[others] == 1.0).all() and first.weight[own].std() > 0.05
+    assert abs(float(first.weight[own].mean()) - 1.0) < 1e-4
+    assert torch.equal(first.weight, again.weight)
+    source = source_of(first.meta, 0)
+    assert "on what orca drove and on what sidewalk drove with rewards; the value exp" in source
+    with pytest.raises(UsageError, match="--values needs --from"):
+        replace(tuned, begin=None)
+    with pytest.raises(RunError, match="0 training rows have rewards"):
+        SIDEWALK.examples([data], tuned, CPU)
+
+
+def test_batches_that_are_drawn_ahead_are_the_same(data: Path) -> None:
+    """A thread draws the batches of the steps in order."""
+    examples = WindowExamples([data], BRISK, CPU)
+    for ahead, alone in zip(
+        _batches(examples, BRISK, 2, 5, True), _batches(examples, BRISK, 2, 5, False), strict=True
+    ):
+        assert all(torch.equal(value, getattr(alone, name)) for name, value in vars(ahead).items())
 
 
 @pytest.mark.engine

@@ -29,7 +29,7 @@ from physics.street.surface import Chunk, Patch, TexturedDetails
 from physics.textures.ground import SURFACE_LAYERS, layer_of
 from tests.support.tiny_street import KEYS, tiny_map
 
-LEAST_DISTANCE = 15.0
+MIN_DISTANCE = 15.0
 """Between two mean colours in CIELAB: 2.3 can just be told apart side by side."""
 HOUSE = shapely.box(-60.0, 8.0, -4.0, 16.0)
 LOT = shapely.box(5.0, 9.0, 40.0, 30.0)
@@ -96,7 +96,7 @@ def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> No
     for one in walked():
         for other in others:
             assert not layers[one] & layers[other], (one, other)
-            assert np.linalg.norm(lab(colours[one]) - lab(colours[other])) >= LEAST_DISTANCE, (
+            assert np.linalg.norm(lab(colours[one]) - lab(colours[other])) >= MIN_DISTANCE, (
                 one,
                 other,
             )
@@ -212,7 +212,7 @@ def test_a_camera_shows_walkable_ground_apart_from_all_other(
                 if (here & near).sum() > 60:
                     means[name] = lab(frame.rgb[here & near] / 255.0).mean(axis=0)
             for name in means.keys() - {"sidewalk"}:
-                assert np.linalg.norm(means["sidewalk"] - means[name]) >= LEAST_DISTANCE, (
+                assert np.linalg.norm(means["sidewalk"] - means[name]) >= MIN_DISTANCE, (
                     name,
                     pose,
                 )

@@ -200,6 +200,8 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     assert said.returncode == 0, said.stderr
     assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", said.stdout)
     assert (tmp_path / "weather.png").read_bytes().startswith(b"\x89PNG")
+    said = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "p.png"), "--by", "policy")
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG"), said.stderr
     printed = io.StringIO()
     table = table_of(read_verified_run(rain).records.values())
     print_table(Console(file=printed, width=200), table, 20, rain)
@@ -557,6 +559,8 @@ def test_wrong_words_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> No
         said.returncode == 2
         and "table.pdf: its name must end in .csv, .png, .md, .tex" in said.stderr
     )
+    said = cosim("compare", one, other, "--by", "city")
+    assert said.returncode == 2 and "unknown axis of --by 'city'" in said.stderr
     said = cosim("compare", one, other, "-o", str(tmp_path / "gone/table.md"))
     assert (
         said.returncode == 3

@@ -78,7 +78,7 @@ def street(width_m: float) -> StreetMap:
     return StreetMap("street", (0, -2, 64, 62), strips, {"c": corner}, {}, {})
 
 
-LEAST_M = {
+MIN_M = {
     "obstructing": 1.9,
     "conversing": 3.4,
     "queueing": 3.2,
@@ -102,7 +102,7 @@ def test_a_kind_that_needs_a_wider_sidewalk_has_no_place_and_the_reason_is_told(
         name: "2 of 2 sidewalks"
         if width_m > least_m
         else f"none of 2 sidewalks: the sidewalk is narrower than {least_m} m"
-        for name, least_m in LEAST_M.items()
+        for name, least_m in MIN_M.items()
     }
     assert sum(count.found == 2 for count in capacity.events.values()) == fit
     straight = (

@@ -33,6 +33,7 @@ from cosim.spec.scenario import City, Scenario, Suite, write_suite
 from cosim.spec.sensors import ScanSpec
 from scenarios.episodes.demonstration import Demonstration
 from scenarios.episodes.demonstrator import Demonstrator
+from scenarios.episodes.reward import tick_rewards
 from scenarios.episodes.run_episode import run_episode
 from scenarios.places.nets import place
 from scenarios.suites.unit import build_unit
@@ -360,6 +361,27 @@ def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Des
         > shown.state[1:, 0][~shown.disturbed[:-1]].mean()
     )
     assert shown_here(way, PolicyCaller.of(Stands()), kept, learner).encoded() == shown.encoded()
+
+
+def test_a_learner_that_explores_drives_alone_and_its_commands_have_rewards(desk: Desk) -> None:
+    """Rows have the commands that were driven; rewards have its progress, the time and its end."""
+    kept = DemoOptions(
+        camera=CameraSpec(width=64, height=48), explore=0.3, learner="learner", unsolved=True
+    )
+    way = msgspec.structs.replace(desk.ways[0], time_limit_s=6.0)
+    demonstrator = Demonstrator(
+        PolicyCaller.of(Stands()), kept, "route_point", PolicyCaller.of(Learner())
+    )
+    outcome = run_episode(way, demonstrator, EpisodeOptions(goal="route_point", seed=0))
+    assert outcome.log is not None
+    shown = Demonstration.decoded(demonstrator.kept(way, outcome.record, outcome.log), way.id)
+    assert not shown.disturbed.any() and shown.driven.min() != shown.driven.max()
+    np.testing.assert_allclose(shown.command, outcome.log.command[::4], atol=1e-6)
+    plain = np.isclose(shown.command, [0.7, 0.1]).all(axis=1)
+    assert 0.2 < plain.mean() < 1.0
+    total = float(tick_rewards(outcome.record, outcome.log).sum())
+    assert shown.reward.shape == (len(shown), 1)
+    assert float(shown.reward.sum()) == pytest.approx(total, abs=1e-3)
 
 
 BESIDE = """

@@ -425,6 +425,20 @@ def test_bursts_have_their_share_of_the_time_and_are_drawn_from_the_seed() -> No
     assert all(bursts.driven(answer, COURIER) is answer for bursts in _each(DemoOptions()))
 
 
+def test_an_exploring_learner_stops_and_starts_at_times() -> None:
+    """Its commands are changed in their share of the time; half of the changes set its speed."""
+    collecting = DemoOptions(explore=0.3, learner="small", unsolved=True)
+    found = {}
+    for v_mps in (0.0, 1.0):
+        answer = Command(v_mps, 0.1)
+        drives = [[one.driven(answer, COURIER) for _ in range(60)] for one in _each(collecting)]
+        found[v_mps] = [one for drive in drives for one in drive]
+        changed = np.mean([one is not answer for one in found[v_mps]])
+        assert changed == pytest.approx(0.3, abs=0.03)
+    assert np.mean([one.v_mps == 1.0 for one in found[0.0]]) == pytest.approx(0.075, abs=0.02)
+    assert np.mean([one.v_mps == 0.0 for one in found[1.0]]) == pytest.approx(0.075, abs=0.02)
+
+
 def _each(collecting: DemoOptions) -> list[_Bursts]:
     return [_Bursts(seed, collecting) for seed in range(300)]
 
@@ -435,6 +449,8 @@ def _each(collecting: DemoOptions) -> list[_Bursts]:
         ({"rate_hz": 3.0}, "1, 2, 4, 5, 10, 20 pictures a second, not 3"),
         ({"noise": 1.5}, r"noise must be in \[0, 0\.9\]"),
         ({"noise": float("nan")}, r"noise must be in \[0, 0\.9\]"),
+        ({"explore": 1.5}, r"explore must be in \[0, 0\.9\]"),
+        ({"explore": 0.3, "learner": "small"}, "give --learner and --unsolved, and no --noise"),
         ({"waypoints": 0}, r"waypoints must be in \[1, 100\], not 0"),
         ({"waypoint_s": 0.12}, r"whole number of ticks of 0\.05 s, up to 10 s, not 0\.12 s"),
         (
@@ -446,6 +462,8 @@ def _each(collecting: DemoOptions) -> list[_Bursts]:
         "rate",
         "much noise",
         "no number",
+        "much exploration",
+        "solved ones alone",
         "no waypoints",
         "waypoints between ticks",
         "odd picture",

@@ -18,13 +18,16 @@ while [ $# -gt 0 ]; do
   case $1 in
     collect) command=$1 ;;
     compare) command=$1 ;;
-    -o | --out) out=$2 ;;
+    -o | --out) out=$2; outs+=("$2") ;;
   esac
   shift
 done
 case ${command:-} in
-  collect) exit "$CODE" ;;
-  compare) echo "a table" > "$out" ;;
+  collect) [ -n "$EMPTY" ] || { mkdir -p "$out/runs/00/episodes/a"; touch "$out/runs/00/episodes/a/demonstration.npz"; }
+    exit "$CODE" ;;
+  compare) for out in "${outs[@]}"; do
+      case $out in *.csv) echo "$TABLE" > "$out" ;; *) echo "a table" > "$out" ;; esac
+    done ;;
   *) case $out in *.npz) touch "${out%.npz}-000.npz" ;; *) mkdir -p "$out"; touch "$out/run.json" ;; esac ;;
 esac
 """
@@ -48,10 +51,13 @@ def called(
         | {"COSIM": str(folder / "cosim"), "PYTHON": str(folder / "python"), "CALLS": str(calls)}
         | {
             "CODE": str(code),
+            "TABLE": "",
+            "EMPTY": "",
             "JOBS": "1",
             "ROUNDS": "1",
             "ROBOTS": "",
             "SEEDS": "0",
+            "VALUES": "",
             "SUITES": "unit",
         }
         | settings,
@@ -71,6 +77,15 @@ def test_a_collection_that_crashed_is_not_done(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.glob("work/log/*.done")] == ["collect-0-unit.done"]
     minutes = {call.split()[2]: float(call.split("--minutes ")[1].split()[0]) for call in calls}
     assert minutes["unit"] < 0.1 and 3.0 < minutes["long-horizon"] <= 3.5
+
+
+def test_a_collection_without_episodes_is_not_done(tmp_path: Path) -> None:
+    """If its time was too short for one, the next call collects again, for as long."""
+    done, calls = called(tmp_path, EMPTY="1")
+    assert done.returncode == 1 and "no episode in COLLECT minutes" in done.stdout
+    assert not [*tmp_path.glob("work/log/*.done")] and not any("pack" in call for call in calls)
+    done, _ = called(tmp_path)
+    assert done.stdout.endswith("all done\n")
 
 
 @pytest.mark.parametrize(
@@ -93,6 +108,38 @@ def test_the_script_ends_with_a_table(
     trained = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
     assert trained[: len(names)] == names and len(trained) == len(set(trained))
     assert sum("compare" in call for call in calls) == table
+
+
+HEAD = "by,metric,value_before,value_after,verdict\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "kept"),
+    [
+        ("suite,success,0.5,0.6,better\nsuite,discerned,0.5,0.5,within noise", "values"),
+        ("suite,success,0.5,0.6,better\nsuite,discerned,0.5,0.4,within noise", "sidewalk-0"),
+        ("suite,success,0.5,0.5,within noise\nevent,success,0.5,0.6,better", "sidewalk-0"),
+    ],
+    ids=["one rises", "one falls", "none rises"],
+)
+def test_fine_tuning_is_kept_if_val_improves(tmp_path: Path, rows: str, kept: str) -> None:
+    """The learner explores, what it drove is weighted, and the better one drives with black
+    pictures. Questions train on one event, and score with random goals."""
+    settings = {"VALUES": "0.5", "QUESTIONS": "1", "SUITES": "reactive", "SPLIT": "test"}
+    done, calls = called(tmp_path, **settings, TABLE=HEAD + rows)
+    assert done.returncode == 0 and f"kept: {kept}\n" in done.stdout, done
+    net = tmp_path / "work/nets/sidewalk-0"
+    explored = [call for call in calls if f"--learner onnx:{net} --explore 0.3" in call]
+    assert len(explored) == 3 and not any("--noise" in call for call in explored)
+    (tuned,) = [call for call in calls if "--values 0.5" in call]
+    assert f"--from {net}" in tuned and "values-reactive-0-000.npz" in tuned
+    assert sum("--split val" in call for call in calls) == 2
+    (one,) = [call for call in calls if "--event gesturing" in call]
+    assert f"--learner onnx:{net}" in one and "--decoys" in one
+    (run,) = [call for call in calls if "--goal random_point" in call]
+    assert "--split test" in run and f"--policy onnx:{net} " in run
+    names = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
+    assert names == ["sidewalk-0", "sidewalk-values", "sidewalk-event"]
 
 
 def test_a_collection_must_fit_in_a_piece(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ _VERSION: Final = "own"
 _UNNAMED: Final = "scenario 'own': "
 """Prefix of messages about a scenario without a name."""
 _SLOWEST_MPS = 0.2
-_LEAST_S = 60.0
+_MIN_S = 60.0
 """Speed for the default time limit: one minute plus the time for the route at this speed."""
 
 
@@ -79,7 +79,7 @@ def build_scenario(variant: Variant, suite: str) -> BuiltScenario:
     if street is None:
         return BuiltScenario(variant, None, faults)
     limits = own.limits
-    time_s = limits.time_s or round(_LEAST_S + street.route_line.length_m / _SLOWEST_MPS, 1)
+    time_s = limits.time_s or round(_MIN_S + street.route_line.length_m / _SLOWEST_MPS, 1)
     try:
         scenario = msgspec.structs.replace(
             street,

@@ -29,7 +29,7 @@ from cosim.spec.validation import (
 from cosim.spec.weather import CLEAR, weather_fault
 
 STRAIGHT_M: Final = (10.0, 100.0)
-_MOST_SEEDS: Final = 1000
+_MAX_SEEDS: Final = 1000
 _TURNED_DEG: Final = Within(-360, 360)
 _SIZES: Final = ("small", "middle", "large")
 
@@ -274,7 +274,7 @@ class OwnScenario(Ranged, frozen=True, kw_only=True):
     name: Annotated[str, PathName("a scenario")]
     description: Annotated[str, Text(1000)] = ""
     seed: Annotated[int, SEED] = 0
-    seeds: Annotated[int, Within(1, _MOST_SEEDS)] = 1
+    seeds: Annotated[int, Within(1, _MAX_SEEDS)] = 1
     robot: str = COURIER.name
     goal_protocol: GoalProtocol | None = None
     place: OwnPlace

@@ -29,8 +29,8 @@ from scenarios.suites.user_scenarios.format import OwnScenario
 from sumo_nets.city.city import STYLES
 from sumo_nets.maps.map_store import known_maps
 
-_MOST_BYTES: Final = 1_000_000
-_MOST_SCENARIOS: Final = 5000
+_MAX_BYTES: Final = 1_000_000
+_MAX_SCENARIOS: Final = 5000
 _ONE_VALUE: Final = ("name", "description", "seeds")
 """Fields that apply to the whole file."""
 _SUITES: Final = Path(__file__).parents[1]
@@ -91,9 +91,9 @@ def read_own(path: Path) -> OwnFile:
         faults = _faults_of_each(tree, axes)
     seeds = tree.get("seeds", 1)
     count = math.prod(len(axis.values) for axis in axes) * (seeds if isinstance(seeds, int) else 1)
-    if count > _MOST_SCENARIOS:
+    if count > _MAX_SCENARIOS:
         faults.append(
-            f"makes {count} scenarios, and at most {_MOST_SCENARIOS} can be had: give fewer "
+            f"makes {count} scenarios, and at most {_MAX_SCENARIOS} can be had: give fewer "
             f"values or seeds"
         )
     if faults:
@@ -118,7 +118,7 @@ def _toml(path: Path) -> dict[str, Any]:
         if path.exists() and not path.is_file():
             raise SpecError(f"{path}: is no file: give the path of a .toml file")
         with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
+            data = file.read(_MAX_BYTES + 1)
     except OSError as error:
         remedy = (
             f": `cosim scenario new {path}` writes one"
@@ -126,8 +126,8 @@ def _toml(path: Path) -> dict[str, Any]:
             else ""
         )
         raise SpecError(f"{path}: cannot be read: {error.strerror}{remedy}") from error
-    if len(data) > _MOST_BYTES:
-        raise SpecError(f"{path}: holds more than {_MOST_BYTES} bytes: no scenario is so long")
+    if len(data) > _MAX_BYTES:
+        raise SpecError(f"{path}: holds more than {_MAX_BYTES} bytes: no scenario is so long")
     try:
         return tomllib.loads(data.removeprefix(b"\xef\xbb\xbf").decode())
     except UnicodeDecodeError as error:

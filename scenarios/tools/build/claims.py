@@ -43,15 +43,15 @@ _APART_M: Final = 5.0
 """Least distance between the starts of two scenarios of one structure in one place, in metres. They
 may be nearer if the scenarios lead elsewhere.
 """
-_MOST_BYTES: Final = 3_000_000
+_MAX_BYTES: Final = 3_000_000
 """Largest size of a suite's file and its proofs, in bytes."""
 _EDGE_M: Final = 0.6
 """Largest deviation of a drawn length from the wanted range, in metres."""
 _LENGTHS_APART_M: Final = 1.5
 """Largest difference between the lengths of one kind and of all, in metres: means and ranges."""
 _THIRDS: Final = ("first third", "middle third", "last third")
-_LEAST_THIRD: Final = 0.2
-_LEAST_SIDE: Final = 0.4
+_MIN_THIRD: Final = 0.2
+_MIN_SIDE: Final = 0.4
 _SHARE_EDGE: Final = 0.1
 """Largest deviation of a position from the range of shares, by which crosswalks are measured."""
 _LIMIT_EDGE_S: Final = 1e-6
@@ -265,7 +265,7 @@ def _positions(read: Read) -> Iterator[str]:
             if not -_SHARE_EDGE <= share <= 1.0 + _SHARE_EDGE:
                 yield f"{scenario.id}: its event does not fit where it is on the route"
             found.append(_THIRDS[min(max(int(3.0 * share), 0), 2)])
-        yield from _shares(f"{kind}: positions in the", found, _THIRDS, _LEAST_THIRD)
+        yield from _shares(f"{kind}: positions in the", found, _THIRDS, _MIN_THIRD)
 
 
 def _sides(read: Read) -> Iterator[str]:
@@ -277,7 +277,7 @@ def _sides(read: Read) -> Iterator[str]:
         ):
             if any(sides):
                 names = ["left" if side > 0 else "right" for side in sides]
-                yield from _shares(f"{kind}: {what}", names, ("left", "right"), _LEAST_SIDE)
+                yield from _shares(f"{kind}: {what}", names, ("left", "right"), _MIN_SIDE)
         if EVENT_KINDS[kind].has_free_side:
             yield from (
                 f"{one.id}: its event has no free side"
@@ -520,10 +520,10 @@ def _size(read: Read) -> Iterator[str]:
     """Check that the files of suite and proofs are small."""
     if read.path is not None:
         files = [path for path in (read.path, proofs_path(read.path)) if path.exists()]
-        if (size := sum(path.stat().st_size for path in files)) > _MOST_BYTES:
+        if (size := sum(path.stat().st_size for path in files)) > _MAX_BYTES:
             yield (
                 f"{read.path.name}: {size / 1e6:.1f} MB with its proofs, more than "
-                f"{_MOST_BYTES / 1e6:g}"
+                f"{_MAX_BYTES / 1e6:g}"
             )
 
 

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 _ASKED: Final = "collect.json"
 _WRITING: Final = "writing"
 _PARTS: Final = ("videos", "data", "meta")
-_MOST_ROUNDS: Final = 8
+_MAX_ROUNDS: Final = 8
 _BLOCK: Final = 1000
 """Most episodes of a round of the format raw; drawing a round cannot be interrupted."""
 _STAGE: Final = "writing the data set"
@@ -212,7 +212,7 @@ def collect(
         taken = 0
         number = 0
         blocks = -(-spec.episodes // _BLOCK) if form == "raw" else 1
-        while len(found) < spec.episodes and number < _MOST_ROUNDS * blocks and not rounds.over():
+        while len(found) < spec.episodes and number < _MAX_ROUNDS * blocks and not rounds.over():
             lacking = spec.episodes - len(found)
             count = lacking + (lacking // 2 + 1 if number else 0)
             count = min(count, _BLOCK) if form == "raw" else count
@@ -485,6 +485,8 @@ def _write_about(out: Path, about: dict[str, Any]) -> None:
 def _about(spec: CollectSpec, demonstrator: Demonstrator, robot: str) -> dict[str, Any]:
     """Return how the data set was collected."""
     camera = spec.collecting.camera
+    learner = "" if demonstrator.learner is None else demonstrator.learner.manifest.name
+    explores = spec.collecting.explore > 0.0
     return {
         "rate_hz": spec.collecting.rate_hz,
         "waypoint_s": spec.collecting.waypoint_s,
@@ -496,10 +498,12 @@ def _about(spec: CollectSpec, demonstrator: Demonstrator, robot: str) -> dict[st
         "people": demonstrator.manifest.people,
         "robot": robot,
         "weather": spec.weather,
-        "policy": demonstrator.manifest.name,
+        "policy": "" if explores else demonstrator.manifest.name,
         "policy_source": spec.policy_source,
         "noise": spec.collecting.noise,
-        "learner": "" if demonstrator.learner is None else demonstrator.learner.manifest.name,
+        "learner": "" if explores else learner,
+        "explorer": learner if explores else "",
+        "explore": spec.collecting.explore,
         "learner_source": spec.learner_source,
         "suite": spec.suite,
         "seed": spec.seed,

@@ -53,6 +53,7 @@ def packed_meta(
         "policy": [about["policy"] for about in abouts],
         "noise": [about["noise"] for about in abouts],
         "learner": [about.get("learner", "") for about in abouts],
+        "explorer": [about.get("explorer", "") for about in abouts],
         "scenarios": [one["scenario"] for one in episodes],
         "structures": [one["structure"] for one in episodes],
         "weathers": [one["weather"] for one in episodes],

@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.packed_demos import LABELS
+from cosim.core.packed_demos import LABELS, REWARD
 from scenarios.episodes.clip import CODEC, PIXELS, join_clips
 from scenarios.tools.dataset.collected import Collected
 
@@ -40,18 +40,20 @@ _TASK: Final = "Follow the sidewalk to the goal."
 _EPISODES_PATH: Final = f"meta/episodes/{_FILE}.parquet"
 _FIRST_FILE: Final = {"chunk_index": 0, "file_index": 0}
 _CHUNK: Final = 1000
-_MOST_ROWS_MB: Final = 100
-_MOST_FILM_MB: Final = 200
+_MAX_ROWS_MB: Final = 100
+_MAX_FILM_MB: Final = 200
 _QUANTILES: Final = (0.01, 0.1, 0.5, 0.9, 0.99)
 _SPEEDS: Final = ("v_mps", "w_radps")
 
 
 def feature_of(extra: str) -> str:
-    """Return the name of the feature of a sensor or a label.
+    """Return the name of the feature of a sensor, a label or the reward.
 
-    >>> feature_of("imu"), feature_of("free")
-    ('observation.imu', 'label.free')
+    >>> feature_of("imu"), feature_of("free"), feature_of("reward")
+    ('observation.imu', 'label.free', 'next.reward')
     """
+    if extra == REWARD:
+        return f"next.{REWARD}"
     return f"{'label' if extra in LABELS else 'observation'}.{extra}"
 
 
@@ -102,8 +104,8 @@ def write_lerobot(
         "total_frames": sum(lengths),
         "total_tasks": len(tasks),
         "chunks_size": _CHUNK,
-        "data_files_size_in_mb": _MOST_ROWS_MB,
-        "video_files_size_in_mb": _MOST_FILM_MB,
+        "data_files_size_in_mb": _MAX_ROWS_MB,
+        "video_files_size_in_mb": _MAX_FILM_MB,
         "fps": filmed.fps,
         "splits": {"train": f"0:{len(episodes)}"},
         "data_path": _DATA_PATH,
@@ -264,7 +266,7 @@ def _films(sizes: Sequence[int]) -> list[tuple[int, int]]:
     first = 0
     size = 0
     for index, more in enumerate(sizes):
-        if index > first and size + more > _MOST_FILM_MB * 2**20:
+        if index > first and size + more > _MAX_FILM_MB * 2**20:
             found.append((first, index))
             first = index
             size = 0

@@ -29,9 +29,9 @@ SeenParts = dict[str, Any]
 """Observation of a learner: arrays, and a text if the goal is an instruction."""
 
 _FARTHEST_M: Final = 10_000.0
-_MOST_GYRO_RADPS: Final = 35.0
-_MOST_ACCEL_MPS2: Final = 160.0
-_MOST_PERSON_MPS: Final = 10.0
+_MAX_GYRO_RADPS: Final = 35.0
+_MAX_ACCEL_MPS2: Final = 160.0
+_MAX_PERSON_MPS: Final = 10.0
 
 
 def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
@@ -67,9 +67,9 @@ def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
     if (scan := manifest.scan) is not None:
         parts["scan"] = spaces.Box(0.0, scan.range_m, (scan.rings, scan.rays), np.float32)
     if manifest.imu != "none":
-        parts["imu"] = _box([*[_MOST_GYRO_RADPS] * 3, *[_MOST_ACCEL_MPS2] * 3])
+        parts["imu"] = _box([*[_MAX_GYRO_RADPS] * 3, *[_MAX_ACCEL_MPS2] * 3])
     if manifest.people != "none":
-        most = [1.0, *[2.0 * TRACKING_RANGE_M] * 2, *[_MOST_PERSON_MPS] * 2]
+        most = [1.0, *[2.0 * TRACKING_RANGE_M] * 2, *[_MAX_PERSON_MPS] * 2]
         parts["people"] = _box(np.tile(most, (PEOPLE_ROWS, 1)))
     return spaces.Dict(parts)
 

@@ -42,7 +42,7 @@ _OPACITY_WEIGHT: Final = 0.01
 _SCALE_WEIGHT: Final = 0.01
 _NEEDLE: Final = 3.0
 """Largest ratio of the longest axis of a splat to its middle one."""
-_LEAST_OPACITY: Final = 0.01
+_MIN_OPACITY: Final = 0.01
 """Opacity below which trained splats are dropped."""
 _SKY: Final = (32, 96)
 """Rows and columns of the picture of the sky."""
@@ -213,7 +213,7 @@ class Trainer:
     def rows(self) -> NDArray[np.void]:
         """Return the splats as rows of a 3DGS .ply file, in the frame of the model."""
         params = {name: one.detach().cpu().numpy() for name, one in self._params.items()}
-        seen = 1.0 / (1.0 + np.exp(-params["opacities"])) >= _LEAST_OPACITY
+        seen = 1.0 / (1.0 + np.exp(-params["opacities"])) >= _MIN_OPACITY
         for one in params.values():
             seen &= np.isfinite(one.reshape(len(one), -1)).all(axis=1)
         rows = np.zeros(int(seen.sum()), dtype=SPLAT_ROW)

@@ -47,15 +47,15 @@ from scenarios.suites.exploits import exploit_of
 from scenarios.tools.viewing.scenes import ShownAgain, show_again, ticks_to_show
 from sumo_nets.maps.map_store import credit_of
 
-_MOST_BYTES: Final = 29_000_000
+_MAX_BYTES: Final = 29_000_000
 """Largest size of the file, in bytes. The least informative failures beyond it are left out."""
 _REST_BYTES: Final = 8_000_000
 """Bytes reserved for everything but failures and maps: Plotly, tables, small pictures and spots."""
-_MOST_MAPS: Final = 24
+_MAX_MAPS: Final = 24
 _MAP_PX: Final = 1000
 _MAP_QUALITY: Final = 70
 _MARGIN_M: Final = 25.0
-_MOST_SPOTS: Final = 300
+_MAX_SPOTS: Final = 300
 """Largest number of spots on the map of a place."""
 _TELL_EVERY_S: Final = 0.2
 _T = TypeVar("_T")
@@ -119,7 +119,7 @@ def make_report(
     progress("writing the page")
     fixed = len(msgspec.json.encode(pictures)) + _REST_BYTES
     sizes = np.array([len(msgspec.json.encode(entry)) for entry in entries], dtype=int)
-    count = int((fixed + np.cumsum(sizes) <= _MOST_BYTES).sum())
+    count = int((fixed + np.cumsum(sizes) <= _MAX_BYTES).sum())
     maps = Maps(pictures, _spots(runs, picks[:count]), dict(episode_counts(runs)))
     data = render_page(runs, plots, entries[:count], maps, _note(entries[:count]), blind_rows(runs))
     try:
@@ -127,7 +127,7 @@ def make_report(
     except OSError as error:
         raise unwritable(output, error) from error
     if count < len(picks):
-        limit = f"the file would be larger than {_MOST_BYTES / 1e6:g} MB"
+        limit = f"the file would be larger than {_MAX_BYTES / 1e6:g} MB"
     return ReportFacts(len(data), count, len(candidates), limit)
 
 
@@ -289,7 +289,7 @@ def _begun_pictures(
             _bounds(there[name]),
             [s.route for s in there[name]],
         )
-        for name in failed[:_MOST_MAPS]
+        for name in failed[:_MAX_MAPS]
     ]
 
 
@@ -356,6 +356,6 @@ def _spots(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> dict[
                 )
                 spots.setdefault(place_in_words(scenario), []).append(spot)
     return {
-        name: sorted(there, key=lambda spot: spot.entry < 0)[:_MOST_SPOTS]
+        name: sorted(there, key=lambda spot: spot.entry < 0)[:_MAX_SPOTS]
         for name, there in spots.items()
     }
