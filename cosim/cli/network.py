@@ -119,6 +119,9 @@ def _print_certificate(place: Path) -> None:
 
 
 direct_app = typer.Typer()
+WAKE_S = 0.5
+"""Longest sleep of a waiting command. A signal that arrives just before a sleep is handled after
+it."""
 
 
 @direct_app.command(
@@ -146,7 +149,7 @@ def direct(
         )
         try:
             while True:
-                time.sleep(3600.0)
+                time.sleep(WAKE_S)
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
 
