@@ -17,9 +17,10 @@ from typing import Final
 import moderngl
 
 from cosim.core.state import LABELS
+from physics.cameras.gl.mipmaps import mipmapped
 from physics.cameras.gl.shading import MAPS_UNIT
 from physics.people.body import COATS
-from physics.people.cloth_maps import COLUMNS, ROWS, SIDE_M, TALL_M, cloth_maps
+from physics.people.cloth_maps import ROWS, SIDE_M, TALL_M, cloth_maps
 
 TEXELS_PER_M: Final = ROWS / TALL_M
 _SHINE: Final = {"skin": 0.25, "lips": 0.3, "hair": 0.9, "shoes": 0.5, "metal": 1.0, "fur": 0.3}
@@ -62,9 +63,7 @@ void main() {{
 
 def map_texture(context: moderngl.Context) -> moderngl.TextureArray:
     """Upload the maps, with coarser ones for people at a distance."""
-    maps = cloth_maps()
-    texture = context.texture_array((COLUMNS, ROWS, len(maps)), 4, maps.tobytes())
-    texture.build_mipmaps()
+    texture = mipmapped(context, cloth_maps())
     texture.filter = moderngl.LINEAR_MIPMAP_NEAREST, moderngl.LINEAR
     texture.repeat_x = texture.repeat_y = False
     return texture

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from physics.cameras.gl.context import is_card
 from physics.cameras.gl.corners import CornerRows
+from physics.cameras.gl.mipmaps import mipmapped
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, programs
 from physics.textures.decals import decal_layers
 from physics.textures.facades import facade_layers
@@ -97,9 +98,7 @@ def surfaces(context: moderngl.Context) -> Surfaces:
 
 
 def _array(context: moderngl.Context, texels: NDArray[np.uint8]) -> moderngl.TextureArray:
-    count, size, _, channels = texels.shape
-    array = context.texture_array((size, size, count), channels, texels.tobytes())
-    array.build_mipmaps()
+    array = mipmapped(context, texels)
     # Steps between mipmap levels are invisible; a software renderer then reads half as much.
     array.filter = (
         moderngl.LINEAR_MIPMAP_LINEAR if is_card(context) else moderngl.LINEAR_MIPMAP_NEAREST,
