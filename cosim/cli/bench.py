@@ -12,7 +12,7 @@ from cosim.cli import tables
 from cosim.cli.console import out, say
 from cosim.cli.exploit import bench_cheats, bench_exploit
 from cosim.cli.legs import bench_legs
-from cosim.cli.options import MEASURE, Appears
+from cosim.cli.options import MEASURE
 from cosim.cli.progress import doing
 from cosim.core.errors import UsageError, unknown
 from cosim.spec.run_config import Appearance, help_of
@@ -329,6 +329,11 @@ def bench_realism(
 
 bench_app = typer.Typer()
 NO_FIGURE = ("none: see below", "")
+_SEVERAL = "Options of several measurements"
+_SPEED, _CROWD, _CROSSINGS, _EXPLOIT, _REALISM, _LEGS = (
+    f"Options of {name}"
+    for name in ("environment and camera", "crowd", "crossings", "exploit", "realism", "legs")
+)
 
 
 @bench_app.command(
@@ -357,22 +362,33 @@ def bench(
             metavar="NAME",
             help="For `environment` and `camera`: this measurement alone; for `exploit --cheats`: "
             "this cheat alone; repeatable.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="For `environment` and `camera`: a checkout, measured in turns, too, with the "
+            help="For `environment` and `camera`: another checkout, measured in turns, with "
             "ratios. For `realism`: realism.json of another run, shown next to this one.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = None,
     rounds: Annotated[
-        int, typer.Option(min=1, help="Number of measurements of each figure; medians are shown.")
+        int,
+        typer.Option(
+            min=1,
+            help="Number of measurements of each figure; medians are shown.",
+            rich_help_panel=_SPEED,
+        ),
     ] = 3,
     cities: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of cities; default: 3 for `crowd`, 20 for `crossings`."),
+        typer.Option(
+            min=1,
+            help="Number of cities; default: 3 for `crowd`, 20 for `crossings`.",
+            rich_help_panel=_SEVERAL,
+        ),
     ] = None,
     minutes: Annotated[
         float,
@@ -380,49 +396,71 @@ def bench(
             min=0.1,
             help="For `crowd`: simulated minutes in each; for `legs`: of random commands in all, "
             "a third on each of three grounds.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = 10.0,
-    robot: Annotated[str, typer.Option(help="For `legs`: the robot.")] = "dog",
-    gait: Annotated[
-        str,
-        typer.Option(
-            metavar="onnx:FILE.onnx", help="For `legs`: in place of the robot's own gait."
-        ),
-    ] = "",
-    residents: Annotated[int, typer.Option(min=0, help="For `crowd`: number of residents.")] = 0,
-    crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: their number.")] = 200,
-    policy: Annotated[str, typer.Option(help="For `crossings`: the policy.")] = "orca",
+    residents: Annotated[
+        int, typer.Option(min=0, help="Number of residents.", rich_help_panel=_CROWD)
+    ] = 0,
+    crossings: Annotated[
+        int, typer.Option(min=1, help="Number of crossings.", rich_help_panel=_CROSSINGS)
+    ] = 200,
+    policy: Annotated[str, typer.Option(help="Policy.", rich_help_panel=_CROSSINGS)] = "orca",
     jobs: Annotated[
-        int, typer.Option(min=1, help="For `crossings`, `people` and `exploit`: processes.")
+        int,
+        typer.Option(
+            min=1,
+            help="For `crossings`, `people` and `exploit`: processes.",
+            rich_help_panel=_SEVERAL,
+        ),
     ] = 1,
-    groups: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('groups')}")] = 0.0,
-    elderly: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('elderly')}")] = 0.0,
-    children: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('children')}")] = 0.0,
-    suite: Annotated[str, typer.Option(help="For `exploit`: a suite, or its .json.")] = "reactive",
+    groups: Annotated[
+        float, typer.Option(help=f"{help_of('groups')}", rich_help_panel=_CROWD)
+    ] = 0.0,
+    elderly: Annotated[
+        float, typer.Option(help=f"{help_of('elderly')}", rich_help_panel=_CROWD)
+    ] = 0.0,
+    children: Annotated[
+        float, typer.Option(help=f"{help_of('children')}", rich_help_panel=_CROWD)
+    ] = 0.0,
+    suite: Annotated[
+        str, typer.Option(help="Suite, or its .json.", rich_help_panel=_EXPLOIT)
+    ] = "reactive",
     kinds: Annotated[
         str,
         typer.Option(
             metavar="KIND,...",
-            help="For `exploit`: kinds of scenarios, `all` for a schedule for all of them; "
+            help="Kinds of scenarios, `all` for a schedule for all of them; "
             "default: each, and `all`.",
+            rich_help_panel=_EXPLOIT,
         ),
     ] = "",
     evaluations: Annotated[
-        int, typer.Option(min=20, help="For `exploit`: episodes of the search for each kind.")
+        int,
+        typer.Option(
+            min=20,
+            help="Episodes of the search for each kind.",
+            rich_help_panel=_EXPLOIT,
+        ),
     ] = 4000,
     objective: Annotated[
         str,
         typer.Option(
             metavar="sr,d",
-            help="For `exploit`: maximize success, pairs of event and decoy, or each in turn.",
+            help="Maximize success, pairs of event and decoy, or each in turn.",
+            rich_help_panel=_EXPLOIT,
         ),
     ] = "sr",
-    seed: Annotated[int, typer.Option(min=0, help="For `exploit`: seed of the search.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, help="Seed of the search.", rich_help_panel=_EXPLOIT),
+    ] = 0,
     goal: Annotated[
         str,
         typer.Option(
             metavar="GOAL,...",
-            help="For `exploit`: goal protocols; default: final_point, and for cheats their own.",
+            help="Goal protocols; default: final_point, and for cheats their own.",
+            rich_help_panel=_EXPLOIT,
         ),
     ] = "",
     folder: Annotated[
@@ -432,21 +470,31 @@ def bench(
             metavar="FOLDER",
             help="For `exploit`: where evaluations are stored, and continued; default: "
             "runs/exploit-SUITE. For `realism`: where pictures with boxes are written.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = None,
     write: Annotated[
         bool,
-        typer.Option("--write", help="For `exploit`: store the result next to the suite."),
+        typer.Option(
+            "--write",
+            help="Store the result next to the suite.",
+            rich_help_panel=_EXPLOIT,
+        ),
     ] = False,
     cheats: Annotated[
         bool,
-        typer.Option("--cheats", help="For `exploit`: drive the table of cheating schedules."),
+        typer.Option(
+            "--cheats",
+            help="Drive the table of cheating schedules.",
+            rich_help_panel=_EXPLOIT,
+        ),
     ] = False,
     weights: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="For `realism`: files of YOLOX-nano, FastestDet and ESPNetv2.",
+            help="Files of YOLOX-nano, FastestDet and ESPNetv2.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     places: Annotated[
@@ -454,29 +502,48 @@ def bench(
         typer.Option(
             "--place",
             metavar="NAME",
-            help="For `realism`: a map; default: the cities of `long-horizon`; repeatable.",
+            help="Map; default: the cities of `long-horizon`; repeatable.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     split: Annotated[
         list[str] | None,
         typer.Option(
             metavar="SPLIT",
-            help="For `realism`: routes of val, on which looks are tuned, or of test, which are "
+            help="Routes of val, on which looks are tuned, or of test, which are "
             "held out; default: val; repeatable.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     weather: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="For `realism`: weather of the routes, one of those of `cosim list`; default: "
-            "clear; repeatable.",
+            help="Weather of the routes, one of those of `cosim list`; default: clear; repeatable.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     frames: Annotated[
-        int, typer.Option(min=1, help="For `realism`: frames of each place, split and weather.")
+        int,
+        typer.Option(
+            min=1,
+            help="Frames of each place, split and weather.",
+            rich_help_panel=_REALISM,
+        ),
     ] = 80,
-    appearance: Appears = "splats",
+    appearance: Annotated[
+        Appearance,
+        typer.Option(metavar="APPEARANCE", help=help_of("appearance"), rich_help_panel=_REALISM),
+    ] = "splats",
+    robot: Annotated[str, typer.Option(help="Robot with legs.", rich_help_panel=_LEGS)] = "dog",
+    gait: Annotated[
+        str,
+        typer.Option(
+            metavar="onnx:FILE.onnx",
+            help="Gait in place of the robot's own.",
+            rich_help_panel=_LEGS,
+        ),
+    ] = "",
 ) -> None:
     """Measure the speed of an environment process or of cameras, behaviour in traffic, how far a
     suite can be solved blind, what networks see in pictures, or how a robot with legs walks."""
