@@ -20,7 +20,8 @@ from cosim.spec.run_config import Appearance, help_of
 if TYPE_CHECKING:
     from cosim.core.geometry import Floats
     from scenarios.tools.bench.figures import Figure
-    from scenarios.tools.bench.people import Comparison, MeanSd
+    from scenarios.tools.bench.people import Comparison
+    from scenarios.tools.bench.people_data import MeanSd
 
 
 _SHARE = [*tables.figures("count"), *tables.labels("of"), *tables.figures("share", "target")]
@@ -153,7 +154,7 @@ def _shares(
 _NOTES = (
     "Density and speed by pedpy, frame by frame, in a window of 2 x 3.2 m in the middle of a "
     "straight sidewalk that leads round a block; off: difference of the means in standard "
-    "deviations of the data. Free speed: of people who walk for 3 s with nobody within 3 m. "
+    "deviations of the data. Free speed: of people who walk for 3 s without others within 3 m. "
     "Nearest: the simulated street with the nearest median, because the density in the films is "
     "not known. Gaps: a marked crossing without signals, where vehicles yield; people and "
     "vehicles of each direction arrive every 10 s on average. Their rates in DUT, which has no "
@@ -179,7 +180,8 @@ def bench_people(jobs: int) -> None:
 
 
 def _show_by_density(found: Comparison) -> None:
-    from scenarios.tools.bench.people import DENSITY_EDGES, SPEED_BY_DENSITY_MPS, normal_distance
+    from scenarios.tools.bench.people_data import DENSITY_EDGES, SPEED_BY_DENSITY_MPS
+    from scenarios.tools.bench.people_tracks import normal_distance
 
     rows = []
     for k, data in enumerate(SPEED_BY_DENSITY_MPS):
@@ -196,7 +198,8 @@ def _show_by_density(found: Comparison) -> None:
 
 
 def _show_free(found: Comparison) -> None:
-    from scenarios.tools.bench.people import FREE_SPEED_MPS, mean_sd, normal_distance
+    from scenarios.tools.bench.people_data import FREE_SPEED_MPS
+    from scenarios.tools.bench.people_tracks import mean_sd, normal_distance
 
     ours = mean_sd(found.free_mps)
     rows = [
@@ -208,18 +211,14 @@ def _show_free(found: Comparison) -> None:
 
 
 def _show_nearest(found: Comparison) -> None:
-    from scenarios.tools.bench.people import (
-        GROUPS,
-        NEAREST_M,
-        NEAREST_PERCENT,
-        alike,
-        percentile_distance,
-    )
+    from scenarios.tools.bench.people import GROUPS, ring_with_median
+    from scenarios.tools.bench.people_data import NEAREST_M, NEAREST_PERCENT
+    from scenarios.tools.bench.people_tracks import percentile_distance
 
     rows = []
     for share in GROUPS:
         for name, data in NEAREST_M.items():
-            flow, apart_m = alike(
+            flow, apart_m = ring_with_median(
                 [one for one in found.nearest if one.flow.groups == share], data[-1]
             )
             far_m = percentile_distance(apart_m, NEAREST_PERCENT, data)
@@ -232,7 +231,8 @@ def _show_nearest(found: Comparison) -> None:
 
 
 def _show_following(found: Comparison) -> None:
-    from scenarios.tools.bench.people import FOLLOWED, FOLLOWING_BIN_M, largest_share, mean_sd
+    from scenarios.tools.bench.people import FOLLOWED, FOLLOWING_BIN_M, largest_share
+    from scenarios.tools.bench.people_tracks import mean_sd
 
     out.print(
         f"People that follow each other within 2 m, at {FOLLOWED.density:g} persons/m2 in one "
@@ -243,13 +243,13 @@ def _show_following(found: Comparison) -> None:
 
 
 def _show_gaps(found: Comparison) -> None:
-    from scenarios.tools.bench.people import (
+    from scenarios.tools.bench.people_data import (
         PERSON_FIRST_PERCENT,
         PERSON_FIRST_S,
         VEHICLE_FIRST_PERCENT,
         VEHICLE_FIRST_S,
-        percentile_distance,
     )
+    from scenarios.tools.bench.people_tracks import percentile_distance
 
     rows = []
     for name, percent, data, ours in (
