@@ -95,7 +95,7 @@ _SAME: Final = 0.5
 _OTHER: Final = 0.3
 """Overlap with all people, and share of pixels of people, below which a box is false."""
 _SEEN: Final = 0.7
-"""Share of a person's height that must be seen; people of whom less is seen do not count."""
+"""Share of a person's height that must be visible, for the person to count."""
 _ADULT_M: Final = 1.7
 _APART_M: Final = 0.9
 """Largest distance on the ground between a person and pixels of it, in metres."""
@@ -131,7 +131,7 @@ class SeenPeople(NamedTuple):
 class Detections:
     """Counts of one detector's boxes.
 
-    people: found and all people by class of size.
+    people: numbers of found and of all people, by class of size.
     expected: how many real people of the same heights would be found.
     boxes: number of boxes.
     false: boxes without a person, by what they show (`Things.under`).
@@ -360,7 +360,7 @@ class Things:
 def count_boxes(
     counts: Realism, detector: str, boxes: Floats, picture: Picture
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Count detected boxes (M, 4). Returns who is found (N,), and which boxes are false (M,)."""
+    """Count detected boxes (M, 4). Returns found people (N,) and false boxes (M,), as booleans."""
     seen, labels = picture.seen, picture.frame.labels
     assert labels is not None
     found, overlap = _matched(seen.boxes, boxes)
@@ -541,7 +541,7 @@ def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> 
 def _matched(people: Floats, boxes: Floats) -> tuple[NDArray[np.bool_], Floats]:
     """Match people (N, 4) with boxes (M, 4), the largest overlap first.
 
-    Returns who is found (N,), and all overlaps (N, M).
+    Returns which people are found (N,), and all overlaps (N, M).
     """
     overlap = _overlaps(people, boxes)
     found = np.zeros(len(people), dtype=bool)

@@ -1,5 +1,4 @@
-"""Measures the cost of a policy in another process: isolated, over Zenoh for one and for
-many episodes, and as a ROS 2 node."""
+"""Measures the cost of a policy in another process: isolated, over Zenoh, and as a ROS 2 node."""
 
 from __future__ import annotations
 
@@ -39,38 +38,40 @@ from scenarios.runs.ros2_policy import ros2_driver
 from scenarios.tools.bench.figures import MORE, Figure
 
 _SPEC: Final = CameraSpec(width=512, height=288)
-_ASKED: Final = 500
+_QUERIES: Final = 500
 _TOGETHER: Final = 8
-_HERE: Final = "the same policy asked in this process"
+_HERE: Final = "the same policy queried in this process"
 _REMOTE: Final = "the remote policy"
-_NAME: Final = f"{__name__}:Blind"
+_NAME: Final = f"{__name__}:FixedPolicy"
 
 
-class Blind:
-    """Answers at once, whatever it sees."""
+class FixedPolicy:
+    """Policy that always returns the same command."""
 
-    manifest = Manifest("blind", rate_hz=4.0, camera=_SPEC)
+    manifest = Manifest("fixed", rate_hz=4.0, camera=_SPEC)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Do nothing: it has no state."""
+        """Do nothing: the policy has no state."""
 
     def act(self, observation: Observation) -> Command:
         return Command(1.0, 0.0)
 
 
-class BlindTogether(Blind):
-    """The same policy, which answers many episodes at once."""
+class FixedBatchPolicy(FixedPolicy):
+    """The same policy for many episodes at once."""
 
     def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
         return [Command(1.0, 0.0) for _ in observations]
 
 
-def asking_elsewhere() -> list[Figure]:
+def policy_processes() -> list[Figure]:
     """Time round trips of a 512x288 picture, and answers of one server to eight clients."""
-    here = PolicyCaller(Blind())
-    isolated = isolated_driver(_NAME, expected=Blind.manifest, host=PolicyHost(isolated="auto"))
+    here = PolicyCaller(FixedPolicy())
+    isolated = isolated_driver(
+        _NAME, expected=FixedPolicy.manifest, host=PolicyHost(isolated="auto")
+    )
     with _served() as host, _ros2_node() as ros2:
-        remote = remote_driver("zenoh:blind", host)
+        remote = remote_driver("zenoh:fixed", host)
         here_ms, isolated_ms, remote_ms, ros2_ms = _in_turns(here, isolated, remote, ros2)
         remote.close()
         ros2.close()
@@ -93,7 +94,7 @@ def _in_turns(*drivers: PolicyCaller) -> list[float]:
     took: list[list[float]] = [[] for _ in drivers]
     for driver in drivers:
         driver.reset("k1", 1)
-    for tick in range(_ASKED):
+    for tick in range(_QUERIES):
         for driver, times in zip(drivers, took, strict=True):
             began = time.perf_counter()
             driver.act(_seen(tick))
@@ -103,25 +104,25 @@ def _in_turns(*drivers: PolicyCaller) -> list[float]:
 
 def _together(host: PolicyHost) -> float:
     """Return answers per second of one server with several clients, by the slowest client."""
-    code = f"from {__name__} import ask_alone; ask_alone({host.servers[0].connect!r})"
-    asking = [
+    code = f"from {__name__} import query_alone; query_alone({host.servers[0].connect!r})"
+    clients = [
         subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
         for _ in range(_TOGETHER)
     ]
-    said = [process.communicate()[0] for process in asking]
-    return _TOGETHER * min(map(float, said))
+    rates = [process.communicate()[0] for process in clients]
+    return _TOGETHER * min(map(float, rates))
 
 
-def ask_alone(endpoint: str) -> None:
+def query_alone(endpoint: str) -> None:
     """Query a served policy for one episode, and print its answers per second."""
     servers = (Connection(role="coordinator", connect=endpoint),)
-    driver = remote_driver("zenoh:blind", PolicyHost(servers=servers, run=str(os.getpid())))
+    driver = remote_driver("zenoh:fixed", PolicyHost(servers=servers, run=str(os.getpid())))
     driver.reset("k1", 1)
     driver.act(_seen(0))
     began = time.perf_counter()
-    for tick in range(_ASKED):
+    for tick in range(_QUERIES):
         driver.act(_seen(tick))
-    print(_ASKED / (time.perf_counter() - began))
+    print(_QUERIES / (time.perf_counter() - began))
     driver.ended()
     driver.close()
 
@@ -131,7 +132,7 @@ def _served() -> Iterator[PolicyHost]:
     """Serve the policy in another process, behind a socket."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint = f"unixsock-stream/{Path(folder)}/hub"
-        code = f"from {__name__} import serve_blind; serve_blind({endpoint!r})"
+        code = f"from {__name__} import serve_fixed; serve_fixed({endpoint!r})"
         process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
         try:
             yield PolicyHost(
@@ -162,7 +163,7 @@ def _ros2_node() -> Iterator[PolicyCaller]:
 def answer_pictures(endpoint: str) -> None:
     """Answer each picture at once with /cmd_vel, until killed."""
     with open_session(Connection(role="coordinator", connect=endpoint)) as session:
-        node = Ros2Node(session, Network(), "blind")
+        node = Ros2Node(session, Network(), "fixed")
         node.advertise(CMD_VEL, TWIST_STAMPED)
         picture = "/camera/image_raw"
 
@@ -176,9 +177,9 @@ def answer_pictures(endpoint: str) -> None:
             time.sleep(3600.0)
 
 
-def serve_blind(endpoint: str) -> None:
-    """Serve it until killed."""
-    serve(BlindTogether(), listen=endpoint, decoder=ObservationDecoder)
+def serve_fixed(endpoint: str) -> None:
+    """Serve the policy until killed."""
+    serve(FixedBatchPolicy(), listen=endpoint, decoder=ObservationDecoder)
 
 
 def _seen(tick: int) -> Observation:
