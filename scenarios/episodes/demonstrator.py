@@ -267,7 +267,7 @@ class _Rows:
             waypoints=waypoints,
             driven=driven,
             disturbed=disturbed,
-            told=np.array(self._instructions),
+            instruction=np.array(self._instructions),
             glimpses=np.stack(self._glimpses),
             colours=self._colours,
             clip=np.frombuffer(self._clip.finished(), np.uint8),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 
@@ -18,7 +18,7 @@ from cosim.results.record import Record
 from cosim.results.run_setup import RunSetup
 from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.scenario import Scenario
-from scenarios.episodes.counterfactual import CounterfactualTracker
+from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.wiring import StagedScenario
 from scenarios.ipc.command_log import CommandLog
@@ -69,7 +69,6 @@ def run_episode(
     """
     driver = PolicyCaller.of(policy)
     tracker = CounterfactualTracker()
-    comparison_error = ""
     all_watches = [*watches, tracker.watch] if options.counterfactual else watches
     if setup is None:
         setup = RunSetup.of(options, policy_source=driver.source_hash, policy_runs=driver.runs)
@@ -101,18 +100,26 @@ def run_episode(
         return Outcome(record, None, traceback.format_exc(), again)
     finally:
         driver.ended()
-    if options.counterfactual:
-        try:
-            measures = (
-                record.measures | tracker.compared(episode.scenario, entrances, comparing).measures
-            )
-            record = msgspec.structs.replace(record, measures=measures)
-        except Exception as error:  # noqa: BLE001  the episode itself is valid
-            comparison_error = traceback.format_exc()
-            record = msgspec.structs.replace(
-                record, reason=f"the street without the robot: {error_message(error)}"
-            )
-    return Outcome(record, log, comparison_error)
+    if not options.counterfactual:
+        return Outcome(record, log)
+    return _compared(
+        Outcome(record, log), lambda: tracker.compared(episode.scenario, entrances, comparing)
+    )
+
+
+def _compared(outcome: Outcome, compare: Callable[[], DelayComparison]) -> Outcome:
+    """Add the comparison with the street without the robot to an outcome.
+
+    An error of the comparison becomes the record's reason: the episode itself is valid.
+    """
+    record = outcome.record
+    try:
+        measures = record.measures | compare().measures
+        return replace(outcome, record=msgspec.structs.replace(record, measures=measures))
+    except Exception as error:  # noqa: BLE001  the episode itself is valid
+        reason = f"the street without the robot: {error_message(error)}"
+        record = msgspec.structs.replace(record, reason=reason)
+        return replace(outcome, record=record, traceback=traceback.format_exc())
 
 
 def drive(
