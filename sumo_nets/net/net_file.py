@@ -207,7 +207,8 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
             polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], end_corners
         )
     strips = _strips(raw, walk, _Bands(lines, widths, polygons), ports, signalised)
-    roads = _roads(driven, _Bands(*(part[len(walk) :] for part in (lines, widths, polygons))))
+    first = len(walk)
+    roads = _roads(driven, _Bands(lines[first:], widths[first:], polygons[first:]))
     apart = {edge.attributes["id"] for edge in raw.edges if all(map(_only_walked, edge.lanes))}
     terrain, elevation = terrain_of_net(
         raw.edges, apart, {name: index for name, (_, _, index) in walk.items()}, ports

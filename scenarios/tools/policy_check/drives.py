@@ -38,7 +38,7 @@ from physics.people.appearance import look_of
 from physics.people.body import COATS
 from physics.people.wardrobe import Season, season_of
 from physics.sensors.caster import RayCaster
-from physics.street.surface import Surface
+from physics.street.surface import PlaceSurface
 from scenarios.episodes.wiring import (
     CORRIDOR_M,
     draw_empty_street,
@@ -159,7 +159,7 @@ def _observer(
     scenario: Scenario,
     manifest: Manifest,
     camera: CameraName,
-    surface: Surface,
+    surface: PlaceSurface,
 ) -> tuple[Observer, ViewCamera | None]:
     """Return the observer of a scenario without engines, and the policy's first camera.
 
