@@ -162,10 +162,10 @@ def sandbox_lacks(kind: Isolation) -> str:
     return ""
 
 
-def kind_of(runs: PolicyProcess) -> Isolation | None:
+def isolation_of(runs: PolicyProcess) -> Isolation | None:
     """Return the kind of sandbox of a recorded place; None for other places.
 
-    >>> kind_of("isolated: landlock")
+    >>> isolation_of("isolated: landlock")
     'landlock'
     """
     return next((kind for kind, words in _RUNS.items() if words == runs), None)

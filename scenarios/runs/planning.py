@@ -22,7 +22,7 @@ from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite
-from cosim.spec.selection import pairs_of
+from cosim.spec.selection import scenario_pairs
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from physics.dynamics.drives import gait_hash
@@ -63,7 +63,7 @@ class PlannedRun(NamedTuple):
         """Return the scenarios that are run here."""
         if self.shard is None:
             return self.selected
-        return [one for pair in self.shard.select(pairs_of(self.selected)) for one in pair]
+        return [one for pair in self.shard.select(scenario_pairs(self.selected)) for one in pair]
 
     @property
     def spec(self) -> RunSpec:
@@ -96,7 +96,7 @@ def planned_run(
         if policy is None
         else f"{type(policy).__module__}:{type(policy).__qualname__}"
     )
-    part = Shard.parse(config.shard, len(pairs_of(selected))) if config.shard else None
+    part = Shard.parse(config.shard, len(scenario_pairs(selected))) if config.shard else None
     if part is not None and options.seed is None and resumed is None:
         raise UsageError(
             "--shard needs --seed: shards are of one run, which has one seed: give the same to each"

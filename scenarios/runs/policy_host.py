@@ -21,7 +21,7 @@ from cosim.spec.run_config import RunConfig
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_link import RendererLink, link_to
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
-from scenarios.runs.isolated_policy import isolated_driver, kind_of
+from scenarios.runs.isolated_policy import isolated_driver, isolation_of
 
 
 def policy_driver(
@@ -77,7 +77,7 @@ def host_of(config: RunConfig, servers: tuple[Connection, ...] = ()) -> PolicyHo
 def settled_host(host: PolicyHost, driver: PolicyCaller) -> PolicyHost:
     """Return a host with the kind of sandbox that a policy has, which every process of its run then
     uses."""
-    kind = kind_of(driver.runs)
+    kind = isolation_of(driver.runs)
     return host if kind is None else msgspec.structs.replace(host, isolated=kind)
 
 

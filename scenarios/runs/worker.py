@@ -36,13 +36,13 @@ from scenarios.ipc.command_log import CommandLog, commands_of
 from scenarios.ipc.deadlines import PendingCallMemory
 from scenarios.ipc.messages import (
     Done,
+    EpisodeProgress,
     FrameDrawn,
     Hello,
     Job,
     LostRenderer,
     Message,
     MessageHandler,
-    Progress,
     Ready,
     Repeated,
     Unable,
@@ -328,13 +328,13 @@ class _Watcher:
         self._every_s = job.options.frames_every_s
         self._send = send
         self._next_frame_s = 0.0
-        self._progress = Progress(job.scenario.id, 0.0, 0.0, 0)
+        self._progress = EpisodeProgress(job.scenario.id, 0.0, 0.0, 0)
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         time_s = Clock().time_s(step.tick)
         name = self._progress.scenario
         failures = self._progress.failures + len(verdict.failures)
-        self._progress = Progress(name, time_s, step.route_s_after_m, failures)
+        self._progress = EpisodeProgress(name, time_s, step.route_s_after_m, failures)
         if step.frame is not None and self._every_s and time_s >= self._next_frame_s:
             import cv2
 

@@ -566,9 +566,9 @@ class _RateMeter:
 
     def handle(self, message: object) -> None:
         """Count a message. Raises _RateMeasured at the end of the time to measure."""
-        from scenarios.ipc.messages import Progress
+        from scenarios.ipc.messages import EpisodeProgress
 
-        if not isinstance(message, Progress):
+        if not isinstance(message, EpisodeProgress):
             return
         self._at_s[message.scenario] = message.time_s
         so_far = time.perf_counter(), sum(self._at_s.values())
