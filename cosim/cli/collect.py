@@ -235,7 +235,7 @@ def collect_command(
     if demo.format != "raw":
         check_parquet()
     from cosim.spec.options import EpisodeOptions
-    from scenarios.runs.policy_host import host_of, inspected_driver
+    from scenarios.runs.policy_host import host_of, inspected_caller
     from scenarios.tools.dataset.collect import collect
 
     folder = config.out
@@ -245,7 +245,7 @@ def collect_command(
         raise UsageError(f"policy '{config.policy}' drives one episode at a time here: one job")
     collecting = demo.collecting
     host = host_of(config)
-    expert = inspected_driver(config.policy, host, jobs)
+    expert = inspected_caller(config.policy, host, jobs)
     options = EpisodeOptions.from_config(replace(config, camera=camera_here(config.camera)))
     source = _source(config, demo)
     began_s = time.monotonic()

@@ -67,14 +67,14 @@ def run_episode(
     Raises RendererLost if the shared renderer has ended, MachineError if the machine lacks
     something.
     """
-    driver = PolicyCaller.of(policy)
+    caller = PolicyCaller.of(policy)
     tracker = CounterfactualTracker()
     all_watches = [*watches, tracker.watch] if options.counterfactual else watches
     if setup is None:
-        setup = RunSetup.of(options, policy_source=driver.source_hash, policy_runs=driver.runs)
+        setup = RunSetup.of(options, policy_source=caller.source_hash, policy_runs=caller.runs)
     episode = Episode(
         scenario,
-        driver.manifest,
+        caller.manifest,
         options,
         watches=all_watches,
         waiting=waiting,
@@ -85,11 +85,11 @@ def run_episode(
     )
     try:
         with episode:
-            drive(episode, driver, ends_early)
+            drive(episode, caller, ends_early)
             if not episode.over:
                 return Outcome(episode.driven(), None, ended_early=True)
             record, log = episode.result()
-            record = msgspec.structs.replace(record, clock=record.clock | driver.clock)
+            record = msgspec.structs.replace(record, clock=record.clock | caller.clock)
             entrances = episode.entrances
     except (RendererLost, MachineError):
         raise
@@ -99,7 +99,7 @@ def run_episode(
         record = msgspec.structs.replace(record, status=status, reason=error_message(error))
         return Outcome(record, None, traceback.format_exc(), again)
     finally:
-        driver.ended()
+        caller.ended()
     if not options.counterfactual:
         return Outcome(record, log)
     return _compared(

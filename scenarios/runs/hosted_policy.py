@@ -141,8 +141,8 @@ class HostedPolicy:
         return reply
 
 
-class HostedDriver(PolicyCaller):
-    """Driver of a policy in another process, with the same checks of its answers.
+class HostedCaller(PolicyCaller):
+    """Caller of a policy in another process, with the same checks of its answers.
 
     A lost server or renderer, or a machine that lacks something, is not the policy's fault.
     """

@@ -41,7 +41,7 @@ from cosim.spec.options import PolicyHost, PolicyProcess
 from scenarios.ipc.deadlines import ServerTimes
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.shared_memory import observation_bytes
-from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy, PolicyServerBusy
+from scenarios.runs.hosted_policy import HostedCaller, HostedPolicy, PolicyServerBusy
 
 DOMAIN: Final = "default"
 """Domain in the keys of policy servers."""
@@ -186,8 +186,8 @@ class PolicyServers:
             time.sleep(self.times.pause_s)
 
 
-class RemoteDriver(HostedDriver):
-    """Driver of a policy behind Zenoh."""
+class RemoteCaller(HostedCaller):
+    """Caller of a policy behind Zenoh."""
 
     def __init__(
         self,
@@ -213,12 +213,12 @@ class RemoteDriver(HostedDriver):
             time.sleep(self._servers.times.pause_s)
 
 
-def remote_driver(
+def remote_caller(
     name: str,
     host: PolicyHost,
     timer: Timer | None = None,
     times: ServerTimes = ServerTimes(),  # noqa: B008  a frozen value
-) -> RemoteDriver:
+) -> RemoteCaller:
     """Connect to the servers of policy `zenoh:NAME`. Raises UsageError if it cannot be queried over
     a network, MachineError if no server replies."""
     called = name.partition(":")[2]
@@ -240,13 +240,13 @@ def remote_driver(
             or hashlib.blake2b(f"{manifest.name}\0{manifest.version}".encode()).hexdigest()[:16]
         )
         runs: PolicyProcess = "remote, jpeg" if info.jpeg else "remote"
-        driver = RemoteDriver(
+        caller = RemoteCaller(
             HostedPolicy(manifest, servers, host.run), servers, runs, source, timer
         )
-        driver.at_once = (
+        caller.at_once = (
             0 if any(not one.at_once for one in infos) else sum(one.at_once for one in infos)
         )
-        return driver
+        return caller
     except BaseException:
         servers.close()
         raise

@@ -48,7 +48,7 @@ from scenarios.ipc.render_protocol import Draw, Rendered, Request, encode_exchan
 from scenarios.ipc.shared_memory import SharedMemory
 from scenarios.places.nets import place
 from scenarios.runs import run as suite_run
-from scenarios.runs.policy_host import shared_driver
+from scenarios.runs.policy_host import shared_caller
 from scenarios.runs.shared_renderer import RendererEnd, SharedRenderer, check_shared
 from scenarios.tools.bench.cameras import busy_street
 from scenarios.tools.verify.doctor import small_scenario
@@ -253,7 +253,7 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
         assert [
             msgspec.structs.replace(reply, words=without_lines(reply.words)) for reply in replies
         ] == [refused] * 2
-        driver = shared_driver(Knowing.manifest, "", renderer.at, "r")
+        driver = shared_caller(Knowing.manifest, "", renderer.at, "r")
         with pytest.raises(
             PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt.* \(reset\)"
         ):

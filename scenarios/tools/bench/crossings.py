@@ -123,7 +123,7 @@ def _drawn(city: City, count: int) -> list[Scenario]:
 
 
 @cache
-def driver_of(policy: str) -> PolicyCaller:
+def caller_of(policy: str) -> PolicyCaller:
     """Load the policy once for all crossings of this process."""
     return load_policy(policy)
 
@@ -141,9 +141,9 @@ def cross(scenario: Scenario, policy: str) -> CrossingResult:
         counter.update(step.street_after)
         counter.count_vehicles(lines.passed(step.street_after.vehicles.ids))
 
-    outcome = run_episode(scenario, driver_of(policy), watches=[watch])
+    outcome = run_episode(scenario, caller_of(policy), watches=[watch])
     if outcome.traceback:
-        driver_of.cache_clear()
+        caller_of.cache_clear()
     return crossing_row(scenario, outcome, counter)
 
 

@@ -527,13 +527,13 @@ def driving_together() -> list[Figure]:
     ]
     suite = Suite(name="together", version="1", scenarios=tuple(picked))
     name = f"{__name__}:{StraightTogether.__name__}"
-    driver = load_policy(name)
+    caller = load_policy(name)
     options = EpisodeOptions(camera="gl")
-    hello = Hello(name, driver.manifest, driver.source_hash)
+    hello = Hello(name, caller.manifest, caller.source_hash)
     watch = _RateMeter()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
-        spec = run_spec(suite, picked, name, driver, options, True)
+        spec = run_spec(suite, picked, name, caller, options, True)
         held = stack.enter_context(RunFolder.create(folder, spec, suite))
         logs = held.path / "logs"
         renderer = stack.enter_context(SharedRenderer(logs, hello, asks=True))

@@ -88,7 +88,7 @@ CLASSES: Final = {
 }
 """Classes of Cityscapes, and labels that mean the same. Networks trained from cars call sidewalks
 under the robot road, so both are one class."""
-_DRIVER: Final = "orca"
+_POLICY: Final = "orca"
 _PERSONS: Final = 50
 _SAME: Final = 0.5
 """Overlap (IoU) from which a box shows a person."""
@@ -504,7 +504,7 @@ def _scenarios(place: str, split: Split) -> Iterator[Scenario]:
 
 
 def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> Iterator[Picture]:
-    driver = load_policy(_DRIVER)
+    caller = load_policy(_POLICY)
     surface = surface_of_place(scenario.place)
     robot_model = robot_called(scenario.robot)
     scenario = options.apply_to(scenario)
@@ -520,10 +520,10 @@ def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> 
     )
     progress(f"starting {scenario.id}")
     with (
-        Episode(scenario, driver.manifest, options) as episode,
+        Episode(scenario, caller.manifest, options) as episode,
         episode.eyes(CAMERA) as camera,
     ):
-        driver.reset(episode.id, episode.seed)
+        caller.reset(episode.id, episode.seed)
         observation = episode.reset()
         next_s = FIRST_S
         while not episode.over:
@@ -535,7 +535,7 @@ def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> 
                 heads_m = heads_with_companions(street.people, surface, scenario)
                 seen = seen_people(frame, street.people, taken, heads_m)
                 yield Picture(frame, seen, Things(surface, scenario, taken), conditions)
-            observation = episode.advance(driver.act(observation))
+            observation = episode.advance(caller.act(observation))
 
 
 def _matched(people: Floats, boxes: Floats) -> tuple[NDArray[np.bool_], Floats]:

@@ -32,9 +32,9 @@ from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
 from cosim.spec.ros2 import CMD_VEL, PUBLISHED_TOPICS, ROS2_SCHEME, Ros2Settings
 from scenarios.ipc.observation_codec import ObservationDecoder
-from scenarios.runs.isolated_policy import isolated_driver
-from scenarios.runs.remote_policy import remote_driver
-from scenarios.runs.ros2_policy import ros2_driver
+from scenarios.runs.isolated_policy import isolated_caller
+from scenarios.runs.remote_policy import remote_caller
+from scenarios.runs.ros2_policy import ros2_caller
 from scenarios.tools.bench.figures import MORE, Figure
 
 _SPEC: Final = CameraSpec(width=512, height=288)
@@ -67,11 +67,11 @@ class FixedBatchPolicy(FixedPolicy):
 def policy_processes() -> list[Figure]:
     """Time round trips of a 512x288 picture, and answers of one server to eight clients."""
     here = PolicyCaller(FixedPolicy())
-    isolated = isolated_driver(
+    isolated = isolated_caller(
         _NAME, expected=FixedPolicy.manifest, host=PolicyHost(isolated="auto")
     )
     with _served() as host, _ros2_node() as ros2:
-        remote = remote_driver("zenoh:fixed", host)
+        remote = remote_caller("zenoh:fixed", host)
         here_ms, isolated_ms, remote_ms, ros2_ms = _in_turns(here, isolated, remote, ros2)
         remote.close()
         ros2.close()
@@ -89,15 +89,15 @@ def policy_processes() -> list[Figure]:
     ]
 
 
-def _in_turns(*drivers: PolicyCaller) -> list[float]:
-    """Return the median milliseconds of an answer of each driver."""
-    took: list[list[float]] = [[] for _ in drivers]
-    for driver in drivers:
-        driver.reset("k1", 1)
+def _in_turns(*callers: PolicyCaller) -> list[float]:
+    """Return the median milliseconds of an answer of each caller."""
+    took: list[list[float]] = [[] for _ in callers]
+    for caller in callers:
+        caller.reset("k1", 1)
     for tick in range(_QUERIES):
-        for driver, times in zip(drivers, took, strict=True):
+        for caller, times in zip(callers, took, strict=True):
             began = time.perf_counter()
-            driver.act(_seen(tick))
+            caller.act(_seen(tick))
             times.append(1000.0 * (time.perf_counter() - began))
     return [statistics.median(times) for times in took]
 
@@ -116,15 +116,15 @@ def _together(host: PolicyHost) -> float:
 def query_alone(endpoint: str) -> None:
     """Query a served policy for one episode, and print its answers per second."""
     servers = (Connection(role="coordinator", connect=endpoint),)
-    driver = remote_driver("zenoh:fixed", PolicyHost(servers=servers, run=str(os.getpid())))
-    driver.reset("k1", 1)
-    driver.act(_seen(0))
+    caller = remote_caller("zenoh:fixed", PolicyHost(servers=servers, run=str(os.getpid())))
+    caller.reset("k1", 1)
+    caller.act(_seen(0))
     began = time.perf_counter()
     for tick in range(_QUERIES):
-        driver.act(_seen(tick))
+        caller.act(_seen(tick))
     print(_QUERIES / (time.perf_counter() - began))
-    driver.ended()
-    driver.close()
+    caller.ended()
+    caller.close()
 
 
 @contextmanager
@@ -145,7 +145,7 @@ def _served() -> Iterator[PolicyHost]:
 
 @contextmanager
 def _ros2_node() -> Iterator[PolicyCaller]:
-    """Yield the driver of a ROS 2 node in another process, which connects to a hub as in a run."""
+    """Yield the caller of a ROS 2 node in another process, which connects to a hub as in a run."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint = f"unixsock-stream/{Path(folder)}/hub"
         at = Connection(role="coordinator", listen=endpoint, guests=("ros2",))
@@ -154,7 +154,7 @@ def _ros2_node() -> Iterator[PolicyCaller]:
             process = subprocess.Popen([sys.executable, "-c", code])
             try:
                 settings = Ros2Settings(connection=hub.inside)
-                yield ros2_driver(ROS2_SCHEME, PolicyHost(ros2=settings))
+                yield ros2_caller(ROS2_SCHEME, PolicyHost(ros2=settings))
             finally:
                 process.kill()
                 process.wait()

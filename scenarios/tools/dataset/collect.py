@@ -162,7 +162,7 @@ def collect(
     The same arguments give the same bytes, for any `jobs` and any number of calls with `resume`.
 
     source: scenarios, in order.
-    expert: driver of the robot.
+    expert: policy that drives the robot.
     policy: name of the expert.
     options: seed, robot, weather, goal, own_camera and camera are used.
     episodes: number of episodes in the data set; by default all that are solved.
@@ -225,8 +225,8 @@ def _hello(
 ) -> Hello:
     """Return the message that names expert and learner to environment processes."""
     learner = None
-    if (driver := demonstrator.learner) is not None:
-        learner = Hello(learner_name, driver.manifest, driver.source_hash)
+    if (caller := demonstrator.learner) is not None:
+        learner = Hello(learner_name, caller.manifest, caller.source_hash)
     return Hello(policy, expert.manifest, expert.source_hash, host=host, learner=learner)
 
 

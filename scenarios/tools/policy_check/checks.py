@@ -91,14 +91,14 @@ class CheckedPolicy(NamedTuple):
 
 
 def checked_policy(
-    driver: PolicyCaller,
+    caller: PolicyCaller,
     manifest: Manifest,
     drives: Mapping[SceneName, Drive],
     progress: Progress = ignore,
     only: Collection[str] = (),
 ) -> CheckedPolicy:
     """Run all checks of a policy, or these. manifest: with the goals of the run."""
-    query = PolicyQuery(driver, manifest, drives, progress)
+    query = PolicyQuery(caller, manifest, drives, progress)
     outcomes: dict[str, CheckOutcome] = {}
     for name, check in POLICY_CHECKS.items():
         if only and name not in only:
