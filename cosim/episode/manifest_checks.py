@@ -17,6 +17,20 @@ from cosim.spec.robot import Mount, Robot
 from cosim.spec.sensors import ScanSpec, imu_called, people_called
 
 
+def check_unprivileged(name: str, manifest: Manifest, place: str, remedy: str = "") -> None:
+    """Check that a policy needs no privileged state where it does not get any.
+
+    place: "a remote one" or "an isolated one", in words
+    remedy: command or option that helps
+    Raises UsageError.
+    """
+    if manifest.privileged:
+        raise UsageError(
+            f"policy '{name}' needs privileged state, and {place} gets only observations"
+            + (f": {remedy}" if remedy else "")
+        )
+
+
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
     """Return a manifest with the goal protocol of the run, if there is one.
 

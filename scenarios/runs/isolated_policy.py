@@ -34,7 +34,7 @@ from bridge.policy_server import (
 )
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.framing import MessageSocket
-from cosim.episode.manifest_checks import with_goal
+from cosim.episode.manifest_checks import check_unprivileged, with_goal
 from cosim.episode.policy_caller import LOAD_TIMEOUT_S, NoTimer, Timer
 from cosim.policies.load import checked_manifest, load_policy
 from cosim.spec.manifest import Manifest
@@ -191,11 +191,7 @@ def _start_isolated(
         if isinstance(info, Refusal):
             raise _NoSandbox(info.words) if info.why == "sandbox" else UsageError(info.words)
         manifest = with_goal(checked_manifest(name, info.manifest), None)
-        if manifest.privileged:
-            raise UsageError(
-                f"policy '{manifest.name}' needs privileged state, and an "
-                "isolated one sees only observations: leave --isolated out"
-            )
+        check_unprivileged(manifest.name, manifest, "an isolated one", "leave --isolated out")
         stack.pop_all()
     policy = HostedPolicy(manifest, process, host.run)
     return HostedCaller(policy, _RUNS[kind], info.source[:64], timer)

@@ -33,7 +33,7 @@ from bridge.policy_server import (
 )
 from bridge.session import Session, open_session
 from cosim.core.errors import EngineError, MachineError, PolicyServerLost, UsageError
-from cosim.episode.manifest_checks import with_goal
+from cosim.episode.manifest_checks import check_unprivileged, with_goal
 from cosim.episode.policy_caller import Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.manifest import Manifest
@@ -254,10 +254,7 @@ def remote_caller(
 
 def _check(name: str, manifest: Manifest) -> None:
     """Check that a policy can be queried over a network. Raises UsageError."""
-    if manifest.privileged:
-        raise UsageError(
-            f"policy '{name}' needs privileged state, and a remote one sees only observations"
-        )
+    check_unprivileged(name, manifest, "a remote one")
     if (size := observation_bytes(manifest)) > LARGEST_MESSAGE_BYTES:
         raise UsageError(
             f"policy '{name}' asks for {size / 2**20:.0f} MiB of pictures a step, and a message "

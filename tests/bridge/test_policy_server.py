@@ -352,14 +352,14 @@ def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection)
     an answer."""
     wrong: dict[str, Callable[[ActRequest], bytes]] = {
         "sent what is no answer": lambda one: b"\xc1 no message",
-        "answered step 7 of 'k1' when it was asked step 0": lambda one: answer_to(one, step=7),
-        "answered step 0 of 'k1' when it was asked step 0, in another attempt": lambda one: (
-            answer_to(one, attempt="0")
+        "answered step 7 of 'k1' instead of step 0": lambda one: answer_to(one, step=7),
+        "answered step 0 of 'k1' instead of step 0, in another attempt": lambda one: answer_to(
+            one, attempt="0"
         ),
         "sent what is no answer: Invalid value 'info'": lambda one: encode_message(
             PolicyInfo("s", "wrong", {})
         ),
-        "answered step -1 of 'k1' when it was asked step 0": begin,
+        "answered step -1 of 'k1' instead of step 0": begin,
     }
     for words, answer in wrong.items():
         with liar(hub, answer), driver_at(hub, "wrong") as driver:

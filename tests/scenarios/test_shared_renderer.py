@@ -41,7 +41,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CityMap, Light, Scenario, Suite, write_suite
 from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello, Progress
+from scenarios.ipc.messages import EpisodeProgress, Hello
 from scenarios.ipc.observation_codec import encode_constants, encode_observation
 from scenarios.ipc.render_link import RendererLink
 from scenarios.ipc.render_protocol import Draw, Rendered, Request, encode_exchange
@@ -354,7 +354,7 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
     killed: list[int] = []
 
     def kill(message: object) -> None:
-        if isinstance(message, Progress) and not killed:
+        if isinstance(message, EpisodeProgress) and not killed:
             killed.append(renderer_pid())
             os.kill(killed[0], signal.SIGKILL)
 

@@ -80,7 +80,7 @@ def survey(city: City) -> Survey:
     tightest = min(widths, key=lambda strip: widths[strip][0])
     faults = list(found.faults)
     if (side_m := widths[tightest][0]) < MIN_CLEAR_M:
-        faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide beside what stands on it")
+        faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide next to its objects")
     if blocked := props_on_driveways(sidewalks, props):
         faults.append(f"{len(blocked)} props stand on driveways: {', '.join(blocked[:3])}")
     memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

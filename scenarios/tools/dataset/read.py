@@ -156,7 +156,7 @@ def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = 
         if not same:
             raise RunError(
                 f"{folder}: the rows of episode {index}, {one.scenario.id}, are not those "
-                f"that were kept"
+                f"that were stored"
             )
         seen = np.stack([glimpse(next(pictures)) for _ in range(len(shown))]).astype(float)
         off = np.abs(seen - shown.glimpses).mean(axis=(1, 2, 3))

@@ -51,7 +51,7 @@ from scenarios.suites.catalog import load_suite
 SceneName = Literal["straight", "left", "right", "person"]
 SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
     {
-        "straight": "along a straight sidewalk, nobody there",
+        "straight": "along a straight sidewalk without people",
         "left": "askew on it, to the right: the way leads to the left",
         "right": "askew on it, to the left: the way leads to the right",
         "person": "along it, and three people stand 3 m ahead",
