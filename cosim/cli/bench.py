@@ -56,7 +56,7 @@ def bench_crowd(
     from scenarios.tools.bench.crowd import APART_M, measure_crowds, summed
 
     spec = CrowdSpec(residents=residents, groups=groups, elderly=elderly, children=children)
-    with doing("watching the crowd") as progress:
+    with doing("simulating the crowd") as progress:
         found = measure_crowds(cities, minutes, spec, progress)
     counts = summed(one.counts for one in found)
     total_min = sum(one.minutes for one in found)
@@ -88,8 +88,8 @@ def bench_crowd(
         middle, most = (gaps_m[int(share * len(gaps_m))] for share in (0.5, 0.95))
         apart = sum(gap > APART_M for gap in gaps_m) / len(gaps_m)
         out.print(
-            f"Groups, the loneliest member's distance to its nearest fellow: median {middle:.2f} "
-            f"m, 95 % within {most:.2f} m, beyond {APART_M:g} m {100 * apart:.2f} % of the time."
+            f"Groups, largest distance of a member to its nearest other: median {middle:.2f} m, "
+            f"95 % within {most:.2f} m, beyond {APART_M:g} m {100 * apart:.2f} % of the time."
         )
 
 
@@ -134,8 +134,8 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
     first = tables.names(f"crowd and vehicles, {crossings_entered(rows)} crossings entered")
     tables.show(out, [*first, *_SHARE], lights)
     for row in rows:
-        for who in row.at_red:
-            say(f"{row.scenario}: {who}")
+        for entry in row.at_red:
+            say(f"{row.scenario}: {entry}")
 
 
 def _shares(

@@ -31,7 +31,7 @@ def bench_people(jobs: int) -> None:
     """Measure the walking of the crowd, and print it next to measurements of people."""
     from scenarios.tools.bench.people import watch_people
 
-    with doing("watching people") as progress:
+    with doing("simulating people") as progress:
         found = watch_people(jobs, progress)
     _show_by_density(found)
     _show_free(found)

@@ -87,7 +87,7 @@ class CityCounts(msgspec.Struct, frozen=True, kw_only=True):
     crossings: signalised crossings that a pedestrian entered.
     crowd_ms: mean CPU milliseconds of a step of the crowd.
     group_gaps_m: for each group, every half second, the largest distance of a member to its
-        nearest fellow.
+        nearest other.
     """
 
     place: str
@@ -219,7 +219,7 @@ def measure_crowds(
     """Count the crowd's behaviour in several cities, one process each, one after another."""
     found = []
     for seed in range(cities):
-        progress(f"watching the crowd: city {seed + 1} of {cities}")
+        progress(f"simulating the crowd: city {seed + 1} of {cities}")
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             arguments: tuple[Any, ...] = (City(seed=100 + seed, size_m=CITY_M), minutes, crowd)
             found.append(pool.apply(measure_crowd, arguments))

@@ -94,7 +94,7 @@ def watch_people(jobs: int, progress: Progress) -> Comparison:
         following = pool.apply_async(follow, (FOLLOWED, _WALK_S, 0))
         found = []
         for k, one in enumerate(tasks := [*walking, *near, *free]):
-            progress(f"watching people: street {k + 1} of {len(tasks)}")
+            progress(f"simulating people: street {k + 1} of {len(tasks)}")
             found.append(one.get())
         person_first_s, vehicle_first_s, people, vehicles = crossing.get()
         behind_m = following.get()
