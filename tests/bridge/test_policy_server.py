@@ -458,7 +458,7 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
     knows = Counting.manifest | {"privileged": True}
     with (
         served(hub, Counting(), manifest=knows),
-        pytest.raises(UsageError, match="a remote one sees only observations"),
+        pytest.raises(UsageError, match="a remote one gets only observations"),
     ):
         inspected_caller("zenoh:counting", at)
     wrong = Counting.manifest | {"camera": {"width": 64, "hight": 64}}
@@ -541,7 +541,7 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
 def test_a_policy_that_knows_everything_is_not_served(cosim: Cosim) -> None:
     """Nor is there an endpoint for a policy of this machine: in a line."""
     said = cosim("serve", "route")
-    assert said.returncode == 2 and "a remote one sees only observations" in said.stderr
+    assert said.returncode == 2 and "a remote one gets only observations" in said.stderr
     said = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
     assert (
         said.returncode == 2

@@ -323,7 +323,7 @@ os.abort()
         (("--isolated=weak", "--policy-memory", "2"), "--policy-memory goes with --isolated"),
         (("--isolated", "--policy-data", "nowhere"), "--policy-data nowhere: there is no such"),
         (("--isolated=strong",), "'strong' is not one of"),
-        (("--isolated",), "an isolated one sees only observations"),
+        (("--isolated",), "an isolated one gets only observations"),
     ],
     ids=["alone", "weak", "missing", "kind", "privileged"],
 )
