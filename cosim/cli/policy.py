@@ -75,7 +75,7 @@ def check_policy(
     from cosim.spec.goal import goal_called
     from scenarios.runs.policy_host import host_of, inspected_caller, policy_caller
     from scenarios.tools.policy_check.checks import POLICY_CHECKS, checked_policy
-    from scenarios.tools.policy_check.drives import drives_for
+    from scenarios.tools.policy_check.drives import shown_drives
     from scenarios.tools.policy_check.sheet import check_sheet
 
     if picture is not None:
@@ -92,7 +92,7 @@ def check_policy(
     try:
         manifest = with_goal(caller.manifest, asked_goal)
         with doing(f"checking {name}") as progress:
-            drives = drives_for(manifest, frames, camera_here(camera), own_camera, progress)
+            drives = shown_drives(manifest, frames, camera_here(camera), own_camera, progress)
             found = checked_policy(caller, manifest, drives, progress, only or ())
             if picture is not None:
                 progress("drawing")

@@ -32,6 +32,7 @@ from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.spec.options import RendererAddress
+from cosim.spec.scenario import Scenario
 from scenarios.ipc.command_log import CommandLog, commands_of
 from scenarios.ipc.deadlines import PendingCallMemory
 from scenarios.ipc.messages import (
@@ -56,7 +57,9 @@ from scenarios.ipc.render_link import link_to
 from scenarios.runs.policy_host import policy_caller, shared_caller
 
 if TYPE_CHECKING:
+    from scenarios.episodes.demonstrator import Demonstrator
     from scenarios.episodes.episode import Watch
+    from scenarios.episodes.run_episode import Outcome
 
 REPORT_EVERY_TICKS = 20
 """Ticks between two progress messages."""
@@ -309,16 +312,17 @@ def run_job(
         return LostRenderer(name, lost.number, lost.asked), False
     if outcome.traceback:
         print(f"--- {name}\n{outcome.traceback}", file=sys.stderr, flush=True)
+    return _done(job.scenario, outcome, expert), bool(outcome.traceback)
+
+
+def _done(scenario: Scenario, outcome: Outcome, expert: Demonstrator | None) -> Done:
+    """Return the message with the result of an episode."""
+    record = outcome.record
     log = b"" if outcome.log is None else outcome.log.encoded()
     demonstration = (
-        b""
-        if expert is None
-        else expert.encoded_demonstration(job.scenario, outcome.record, outcome.log)
+        b"" if expert is None else expert.encoded_demonstration(scenario, record, outcome.log)
     )
-    done = Done(
-        name, outcome.record.status, outcome.record.encoded(), log, outcome.again, demonstration
-    )
-    return done, bool(outcome.traceback)
+    return Done(scenario.id, record.status, record.encoded(), log, outcome.again, demonstration)
 
 
 class _Watcher:

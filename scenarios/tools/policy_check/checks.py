@@ -22,7 +22,7 @@ from scenarios.tools.policy_check.answer_checks import (
     speed_unit,
     time_step,
 )
-from scenarios.tools.policy_check.drives import Drive, SceneName
+from scenarios.tools.policy_check.drives import SceneName, ShownDrive
 from scenarios.tools.policy_check.goal_checks import (
     goal_ignored,
     goal_mirrored,
@@ -93,7 +93,7 @@ class CheckedPolicy(NamedTuple):
 def checked_policy(
     caller: PolicyCaller,
     manifest: Manifest,
-    drives: Mapping[SceneName, Drive],
+    drives: Mapping[SceneName, ShownDrive],
     progress: Progress = ignore,
     only: Collection[str] = (),
 ) -> CheckedPolicy:

@@ -81,22 +81,20 @@ rest.
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """Observations for a policy, one for each of its answers, oldest first, with the goals of its
-    run.
-    """
+class ShownDrive:
+    """Drive that is shown to a policy: an observation for each of its answers, oldest first."""
 
     scene: SceneName
     seen: tuple[Observation, ...]
 
 
-def drives_for(
+def shown_drives(
     manifest: Manifest,
     count: int,
     camera: CameraName,
     own_camera: bool = False,
     progress: Progress = ignore,
-) -> dict[SceneName, Drive]:
+) -> dict[SceneName, ShownDrive]:
     """Return the drives of all scenes with `count` observations each.
 
     Raises UsageError for a camera that the robot lacks.
@@ -107,7 +105,7 @@ def drives_for(
     drives = {}
     for done, scene in enumerate(SCENES):
         progress("drawing streets", done / len(SCENES))
-        drives[scene] = _drive(scene, shown, manifest, count, camera)
+        drives[scene] = _shown_drive(scene, shown, manifest, count, camera)
     return drives
 
 
@@ -121,9 +119,9 @@ def _pose(route: Polyline, scene: SceneName, back_m: float) -> Pose:
     return Pose(x_m, y_m, heading)
 
 
-def _drive(
+def _shown_drive(
     scene: SceneName, scenario: Scenario, manifest: Manifest, count: int, camera: CameraName
-) -> Drive:
+) -> ShownDrive:
     """Compute the observations of a drive along a scene, without simulating it."""
     robot = robot_called(scenario.robot)
     route = scenario.route_line
@@ -151,7 +149,7 @@ def _drive(
             if manifest.odometry == "gps" and one.odometry is not None:
                 one = replace(one, odometry=msgspec.structs.replace(one.odometry, heading_rad=None))
             seen.append(one)
-    return Drive(scene, tuple(seen))
+    return ShownDrive(scene, tuple(seen))
 
 
 def _observer(

@@ -17,7 +17,7 @@ from cosim.core.state import Command, WaypointCommand
 from cosim.episode.interfaces import Observation, Policy
 from cosim.episode.policy_caller import PolicyCaller
 from cosim.spec.manifest import Manifest, WaypointRule
-from scenarios.tools.policy_check.drives import Drive, SceneName
+from scenarios.tools.policy_check.drives import SceneName, ShownDrive
 from scenarios.tools.policy_check.edits import Edit, with_goal
 
 _SEED: Final = 1
@@ -82,7 +82,7 @@ class PolicyQuery:
         self,
         caller: PolicyCaller,
         manifest: Manifest,
-        drives: Mapping[SceneName, Drive],
+        drives: Mapping[SceneName, ShownDrive],
         progress: Progress = ignore,
     ) -> None:
         """manifest: with the goals of the run."""
