@@ -134,7 +134,7 @@ def read_rmw_token(token: str) -> Endpoint | None:
     _, domain, session, node, entity, kind, _, namespace, name, *rest = chunks
     if not (domain.isdecimal() and node.isdecimal() and entity.isdecimal()):
         return None
-    topic, kind_of, hash, qos = rest or ("", "", "", "")
+    topic, type_name, hash, qos = rest or ("", "", "", "")
     return Endpoint(
         kind,  # type: ignore[arg-type]
         int(domain),
@@ -143,7 +143,7 @@ def read_rmw_token(token: str) -> Endpoint | None:
         (int(node), int(entity)),
         "/" if namespace == "%" else namespace.replace("%", "/"),
         topic.replace("%", "/"),
-        ros_type(kind_of),
+        ros_type(type_name),
         hash,
         qos,
     )

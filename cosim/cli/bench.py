@@ -12,15 +12,14 @@ from cosim.cli import tables
 from cosim.cli.console import out, say
 from cosim.cli.exploit import bench_cheats, bench_exploit
 from cosim.cli.legs import bench_legs
-from cosim.cli.options import MEASURE, Appears
+from cosim.cli.options import MEASURE
+from cosim.cli.people import bench_people
 from cosim.cli.progress import doing
 from cosim.core.errors import UsageError, unknown
 from cosim.spec.run_config import Appearance, help_of
 
 if TYPE_CHECKING:
-    from cosim.core.geometry import Floats
     from scenarios.tools.bench.figures import Figure
-    from scenarios.tools.bench.people import Comparison, MeanSd
 
 
 _SHARE = [*tables.figures("count"), *tables.labels("of"), *tables.figures("share", "target")]
@@ -54,11 +53,11 @@ def bench_crowd(
 ) -> None:
     """Simulate the crowd of several cities, and print overlaps and violations of signals."""
     from cosim.spec.scenario import CrowdSpec
-    from scenarios.tools.bench.crowd import APART_M, summed, watch_all
+    from scenarios.tools.bench.crowd import APART_M, measure_crowds, summed
 
     spec = CrowdSpec(residents=residents, groups=groups, elderly=elderly, children=children)
-    with doing("watching the crowd") as progress:
-        found = watch_all(cities, minutes, spec, progress)
+    with doing("simulating the crowd") as progress:
+        found = measure_crowds(cities, minutes, spec, progress)
     counts = summed(one.counts for one in found)
     total_min = sum(one.minutes for one in found)
     places = (
@@ -89,8 +88,8 @@ def bench_crowd(
         middle, most = (gaps_m[int(share * len(gaps_m))] for share in (0.5, 0.95))
         apart = sum(gap > APART_M for gap in gaps_m) / len(gaps_m)
         out.print(
-            f"Groups, the loneliest member's distance to its nearest fellow: median {middle:.2f} "
-            f"m, 95 % within {most:.2f} m, beyond {APART_M:g} m {100 * apart:.2f} % of the time."
+            f"Groups, largest distance of a member to its nearest other: median {middle:.2f} m, "
+            f"95 % within {most:.2f} m, beyond {APART_M:g} m {100 * apart:.2f} % of the time."
         )
 
 
@@ -135,8 +134,8 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
     first = tables.names(f"crowd and vehicles, {crossings_entered(rows)} crossings entered")
     tables.show(out, [*first, *_SHARE], lights)
     for row in rows:
-        for who in row.at_red:
-            say(f"{row.scenario}: {who}")
+        for entry in row.at_red:
+            say(f"{row.scenario}: {entry}")
 
 
 def _shares(
@@ -148,138 +147,6 @@ def _shares(
         share = f"{100.0 * count / of:.4f} %" if of else ""
         rows.append((name, f"{count:.2f}", f"{of:.0f} {whole}", share, target))
     return rows
-
-
-_NOTES = (
-    "Density and speed by pedpy, frame by frame, in a window of 2 x 3.2 m in the middle of a "
-    "straight sidewalk that leads round a block; off: difference of the means in standard "
-    "deviations of the data. Free speed: of people who walk for 3 s with nobody within 3 m. "
-    "Nearest: the simulated street with the nearest median, because the density in the films is "
-    "not known. Gaps: a marked crossing without signals, where vehicles yield; people and "
-    "vehicles of each direction arrive every 10 s on average. Their rates in DUT, which has no "
-    "markings, are not known: the low percentiles say most.",
-    "Distances: for means and deviations the 2-Wasserstein distance between normal "
-    "distributions, for percentiles the 1-Wasserstein distance, their mean difference.",
-)
-
-
-def bench_people(jobs: int) -> None:
-    """Measure the walking of the crowd, and print it next to measurements of people."""
-    from scenarios.tools.bench.people import watch_people
-
-    with doing("watching people") as progress:
-        found = watch_people(jobs, progress)
-    _show_by_density(found)
-    _show_free(found)
-    _show_nearest(found)
-    _show_following(found)
-    _show_gaps(found)
-    for note in _NOTES:
-        out.print(note, highlight=False)
-
-
-def _show_by_density(found: Comparison) -> None:
-    from scenarios.tools.bench.people import DENSITY_EDGES, SPEED_BY_DENSITY_MPS, normal_distance
-
-    rows = []
-    for k, data in enumerate(SPEED_BY_DENSITY_MPS):
-        cells = []
-        for ours, _ in (way[k] for way in found.by_density):
-            off = (ours.mean - data.mean) / data.sd
-            cells += [_spread(ours), f"{normal_distance(ours, data):.2f}", f"{off:+.1f}"]
-        rows.append((f"{DENSITY_EDGES[k]:g} to {DENSITY_EDGES[k + 1]:g}", _spread(data), *cells))
-    person_s = [" ".join(f"{seconds:.0f}" for _, seconds in way) for way in found.by_density]
-    heads = ("HERMES", "one way", "dist.", "off, sd", "both ways", "dist.", "off, sd")
-    note = f"person-seconds: one way {person_s[0]}; both ways {person_s[1]}"
-    columns = [*tables.names("persons/m2"), *tables.figures(*heads)]
-    tables.show(out, columns, rows, title="Speed by density, m/s", note=note)
-
-
-def _show_free(found: Comparison) -> None:
-    from scenarios.tools.bench.people import FREE_SPEED_MPS, mean_sd, normal_distance
-
-    ours = mean_sd(found.free_mps)
-    rows = [
-        (name, _spread(data), _spread(ours), f"{normal_distance(ours, data):.2f}")
-        for name, data in FREE_SPEED_MPS.items()
-    ]
-    columns = [*tables.names(""), *tables.figures("data", "ours", "dist.")]
-    tables.show(out, columns, rows, title="Free speed, m/s")
-
-
-def _show_nearest(found: Comparison) -> None:
-    from scenarios.tools.bench.people import (
-        GROUPS,
-        NEAREST_M,
-        NEAREST_PERCENT,
-        alike,
-        percentile_distance,
-    )
-
-    rows = []
-    for share in GROUPS:
-        for name, data in NEAREST_M.items():
-            flow, apart_m = alike(
-                [one for one in found.nearest if one.flow.groups == share], data[-1]
-            )
-            far_m = percentile_distance(apart_m, NEAREST_PERCENT, data)
-            ours = _percentiles(apart_m, NEAREST_PERCENT)
-            numbers = (f"{far_m:.2f}", f"{100 * share:.0f} %", f"{flow.density:g}")
-            rows.append((name, _list(data), ours, *numbers))
-    heads = (_percent(NEAREST_PERCENT), "ours", "dist.", "in groups", "persons/m2")
-    columns = [*tables.names(""), *tables.figures(*heads)]
-    tables.show(out, columns, rows, title="Nearest neighbour, m")
-
-
-def _show_following(found: Comparison) -> None:
-    from scenarios.tools.bench.people import FOLLOWED, FOLLOWING_BIN_M, largest_share, mean_sd
-
-    out.print(
-        f"People that follow each other within 2 m, at {FOLLOWED.density:g} persons/m2 in one "
-        f"direction: {_spread(mean_sd(found.following_m))} m apart; at most "
-        f"{largest_share(found.following_m):.1%} within {100 * FOLLOWING_BIN_M:g} cm.",
-        highlight=False,
-    )
-
-
-def _show_gaps(found: Comparison) -> None:
-    from scenarios.tools.bench.people import (
-        PERSON_FIRST_PERCENT,
-        PERSON_FIRST_S,
-        VEHICLE_FIRST_PERCENT,
-        VEHICLE_FIRST_S,
-        percentile_distance,
-    )
-
-    rows = []
-    for name, percent, data, ours in (
-        ("person first", PERSON_FIRST_PERCENT, PERSON_FIRST_S, found.person_first_s),
-        ("vehicle first", VEHICLE_FIRST_PERCENT, VEHICLE_FIRST_S, found.vehicle_first_s),
-    ):
-        far_s = percentile_distance(ours, percent, data)
-        cells = (_list(data), _percentiles(ours, percent), f"{far_s:.2f}", str(len(ours)))
-        rows.append((f"{name}: {_percent(percent)}", *cells))
-    title = "Gaps at a crossing without signals (post-encroachment times), s"
-    columns = [*tables.names(""), *tables.figures("DUT", "ours", "dist.", "gaps")]
-    tables.show(out, columns, rows, title=title)
-
-
-def _spread(one: MeanSd) -> str:
-    return f"{one.mean:.2f} ± {one.sd:.2f}"
-
-
-def _percent(percent: Sequence[float]) -> str:
-    return "/".join(f"{one:g}" for one in percent) + " %"
-
-
-def _list(values: Sequence[float]) -> str:
-    return " ".join(f"{value:.2f}" for value in values)
-
-
-def _percentiles(values: Floats, percent: Sequence[float]) -> str:
-    import numpy as np
-
-    return _list(np.percentile(values, percent).tolist())
 
 
 def bench_realism(
@@ -329,6 +196,11 @@ def bench_realism(
 
 bench_app = typer.Typer()
 NO_FIGURE = ("none: see below", "")
+_SEVERAL = "Options of several measurements"
+_SPEED, _CROWD, _CROSSINGS, _EXPLOIT, _REALISM, _LEGS = (
+    f"Options of {name}"
+    for name in ("environment and camera", "crowd", "crossings", "exploit", "realism", "legs")
+)
 
 
 @bench_app.command(
@@ -357,22 +229,33 @@ def bench(
             metavar="NAME",
             help="For `environment` and `camera`: this measurement alone; for `exploit --cheats`: "
             "this cheat alone; repeatable.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="For `environment` and `camera`: a checkout, measured in turns, too, with the "
+            help="For `environment` and `camera`: another checkout, measured in turns, with "
             "ratios. For `realism`: realism.json of another run, shown next to this one.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = None,
     rounds: Annotated[
-        int, typer.Option(min=1, help="Number of measurements of each figure; medians are shown.")
+        int,
+        typer.Option(
+            min=1,
+            help="Number of measurements of each figure; medians are shown.",
+            rich_help_panel=_SPEED,
+        ),
     ] = 3,
     cities: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of cities; default: 3 for `crowd`, 20 for `crossings`."),
+        typer.Option(
+            min=1,
+            help="Number of cities; default: 3 for `crowd`, 20 for `crossings`.",
+            rich_help_panel=_SEVERAL,
+        ),
     ] = None,
     minutes: Annotated[
         float,
@@ -380,49 +263,71 @@ def bench(
             min=0.1,
             help="For `crowd`: simulated minutes in each; for `legs`: of random commands in all, "
             "a third on each of three grounds.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = 10.0,
-    robot: Annotated[str, typer.Option(help="For `legs`: the robot.")] = "dog",
-    gait: Annotated[
-        str,
-        typer.Option(
-            metavar="onnx:FILE.onnx", help="For `legs`: in place of the robot's own gait."
-        ),
-    ] = "",
-    residents: Annotated[int, typer.Option(min=0, help="For `crowd`: number of residents.")] = 0,
-    crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: their number.")] = 200,
-    policy: Annotated[str, typer.Option(help="For `crossings`: the policy.")] = "orca",
+    residents: Annotated[
+        int, typer.Option(min=0, help="Number of residents.", rich_help_panel=_CROWD)
+    ] = 0,
+    crossings: Annotated[
+        int, typer.Option(min=1, help="Number of crossings.", rich_help_panel=_CROSSINGS)
+    ] = 200,
+    policy: Annotated[str, typer.Option(help="Policy.", rich_help_panel=_CROSSINGS)] = "orca",
     jobs: Annotated[
-        int, typer.Option(min=1, help="For `crossings`, `people` and `exploit`: processes.")
+        int,
+        typer.Option(
+            min=1,
+            help="For `crossings`, `people` and `exploit`: processes.",
+            rich_help_panel=_SEVERAL,
+        ),
     ] = 1,
-    groups: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('groups')}")] = 0.0,
-    elderly: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('elderly')}")] = 0.0,
-    children: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('children')}")] = 0.0,
-    suite: Annotated[str, typer.Option(help="For `exploit`: a suite, or its .json.")] = "reactive",
+    groups: Annotated[
+        float, typer.Option(help=f"{help_of('groups')}", rich_help_panel=_CROWD)
+    ] = 0.0,
+    elderly: Annotated[
+        float, typer.Option(help=f"{help_of('elderly')}", rich_help_panel=_CROWD)
+    ] = 0.0,
+    children: Annotated[
+        float, typer.Option(help=f"{help_of('children')}", rich_help_panel=_CROWD)
+    ] = 0.0,
+    suite: Annotated[
+        str, typer.Option(help="Suite, or its .json.", rich_help_panel=_EXPLOIT)
+    ] = "reactive",
     kinds: Annotated[
         str,
         typer.Option(
             metavar="KIND,...",
-            help="For `exploit`: kinds of scenarios, `all` for a schedule for all of them; "
+            help="Kinds of scenarios, `all` for a schedule for all of them; "
             "default: each, and `all`.",
+            rich_help_panel=_EXPLOIT,
         ),
     ] = "",
     evaluations: Annotated[
-        int, typer.Option(min=20, help="For `exploit`: episodes of the search for each kind.")
+        int,
+        typer.Option(
+            min=20,
+            help="Episodes of the search for each kind.",
+            rich_help_panel=_EXPLOIT,
+        ),
     ] = 4000,
     objective: Annotated[
         str,
         typer.Option(
             metavar="sr,d",
-            help="For `exploit`: maximize success, pairs of event and decoy, or each in turn.",
+            help="Maximize success, pairs of event and decoy, or each in turn.",
+            rich_help_panel=_EXPLOIT,
         ),
     ] = "sr",
-    seed: Annotated[int, typer.Option(min=0, help="For `exploit`: seed of the search.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, help="Seed of the search.", rich_help_panel=_EXPLOIT),
+    ] = 0,
     goal: Annotated[
         str,
         typer.Option(
             metavar="GOAL,...",
-            help="For `exploit`: goal protocols; default: final_point, and for cheats their own.",
+            help="Goal protocols; default: final_point, and for cheats their own.",
+            rich_help_panel=_EXPLOIT,
         ),
     ] = "",
     folder: Annotated[
@@ -432,21 +337,31 @@ def bench(
             metavar="FOLDER",
             help="For `exploit`: where evaluations are stored, and continued; default: "
             "runs/exploit-SUITE. For `realism`: where pictures with boxes are written.",
+            rich_help_panel=_SEVERAL,
         ),
     ] = None,
     write: Annotated[
         bool,
-        typer.Option("--write", help="For `exploit`: store the result next to the suite."),
+        typer.Option(
+            "--write",
+            help="Store the result next to the suite.",
+            rich_help_panel=_EXPLOIT,
+        ),
     ] = False,
     cheats: Annotated[
         bool,
-        typer.Option("--cheats", help="For `exploit`: drive the table of cheating schedules."),
+        typer.Option(
+            "--cheats",
+            help="Drive the table of cheating schedules.",
+            rich_help_panel=_EXPLOIT,
+        ),
     ] = False,
     weights: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="For `realism`: files of YOLOX-nano, FastestDet and ESPNetv2.",
+            help="Files of YOLOX-nano, FastestDet and ESPNetv2.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     places: Annotated[
@@ -454,29 +369,48 @@ def bench(
         typer.Option(
             "--place",
             metavar="NAME",
-            help="For `realism`: a map; default: the cities of `long-horizon`; repeatable.",
+            help="Map; default: the cities of `long-horizon`; repeatable.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     split: Annotated[
         list[str] | None,
         typer.Option(
             metavar="SPLIT",
-            help="For `realism`: routes of val, on which looks are tuned, or of test, which are "
+            help="Routes of val, on which looks are tuned, or of test, which are "
             "held out; default: val; repeatable.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     weather: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="For `realism`: weather of the routes, one of those of `cosim list`; default: "
-            "clear; repeatable.",
+            help="Weather of the routes, one of those of `cosim list`; default: clear; repeatable.",
+            rich_help_panel=_REALISM,
         ),
     ] = None,
     frames: Annotated[
-        int, typer.Option(min=1, help="For `realism`: frames of each place, split and weather.")
+        int,
+        typer.Option(
+            min=1,
+            help="Frames of each place, split and weather.",
+            rich_help_panel=_REALISM,
+        ),
     ] = 80,
-    appearance: Appears = "splats",
+    appearance: Annotated[
+        Appearance,
+        typer.Option(metavar="APPEARANCE", help=help_of("appearance"), rich_help_panel=_REALISM),
+    ] = "splats",
+    robot: Annotated[str, typer.Option(help="Robot with legs.", rich_help_panel=_LEGS)] = "dog",
+    gait: Annotated[
+        str,
+        typer.Option(
+            metavar="onnx:FILE.onnx",
+            help="Gait in place of the robot's own.",
+            rich_help_panel=_LEGS,
+        ),
+    ] = "",
 ) -> None:
     """Measure the speed of an environment process or of cameras, behaviour in traffic, how far a
     suite can be solved blind, what networks see in pictures, or how a robot with legs walks."""

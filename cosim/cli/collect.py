@@ -25,8 +25,8 @@ from cosim.spec.run_config import DataFormat, Option, RunConfig
 if TYPE_CHECKING:
     from cosim.spec.demo_options import DemoOptions
     from cosim.spec.scenario import Scenario, Suite
-    from scenarios.suites.new_scenarios import Fresh
-    from scenarios.tools.dataset.collect import Gathered
+    from scenarios.suites.new_scenarios import NewScenarios
+    from scenarios.tools.dataset.collect import CollectResult
 
 
 collect_app = typer.Typer()
@@ -235,7 +235,7 @@ def collect_command(
     if demo.format != "raw":
         check_parquet()
     from cosim.spec.options import EpisodeOptions
-    from scenarios.runs.policy_host import host_of, inspected_driver
+    from scenarios.runs.policy_host import host_of, inspected_caller
     from scenarios.tools.dataset.collect import collect
 
     folder = config.out
@@ -245,7 +245,7 @@ def collect_command(
         raise UsageError(f"policy '{config.policy}' drives one episode at a time here: one job")
     collecting = demo.collecting
     host = host_of(config)
-    expert = inspected_driver(config.policy, host, jobs)
+    expert = inspected_caller(config.policy, host, jobs)
     options = EpisodeOptions.from_config(replace(config, camera=camera_here(config.camera)))
     source = _source(config, demo)
     began_s = time.monotonic()
@@ -269,10 +269,10 @@ def collect_command(
         _print_stopped("Stopped", folder)
         raise typer.Exit(INTERRUPTED) from None
     if not found.whole:
-        _print_stopped(f"The time is up after {found.kept} episodes", folder)
+        _print_stopped(f"The time is up after {found.stored} episodes", folder)
         raise typer.Exit(TIME_IS_UP)
     _print_end(found, folder, time.monotonic() - began_s)
-    if config.episodes is not None and found.kept < config.episodes:
+    if config.episodes is not None and found.stored < config.episodes:
         err.print(f"There are no more: {config.episodes} were requested.", highlight=False)
 
 
@@ -285,10 +285,10 @@ def _print_stopped(why: str, folder: Path) -> None:
     )
 
 
-def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
+def _print_end(found: CollectResult, folder: Path, took_s: float) -> None:
     """Print the numbers of collected and dropped episodes, and the result of reading them back."""
     pictures = f"{found.rows} pictures, " if found.rows else ""
-    kept = f"{found.kept} episodes, {pictures}{_size_mb(folder):.1f} MB"
+    kept = f"{found.stored} episodes, {pictures}{_size_mb(folder):.1f} MB"
     words = f"Data set: {folder} ({kept}), of {found.run} driven in {took_s:.0f} s"
     say(words)
     if found.dropped:
@@ -316,7 +316,7 @@ def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
     out.print(words, soft_wrap=True, highlight=False)
 
 
-def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
+def _source(config: RunConfig, demo: DemoConfig) -> Suite | NewScenarios:
     """Return the suite or the source of new scenarios to drive. Raises UsageError."""
     import msgspec
 
@@ -324,7 +324,7 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
     from cosim.spec.scenario import split_called
     from cosim.spec.selection import select_scenarios
     from scenarios.suites.catalog import load_suite
-    from scenarios.suites.new_scenarios import fresh, fresh_cities
+    from scenarios.suites.new_scenarios import new_cities, new_scenarios
 
     options = {
         "--cities": demo.cities,
@@ -345,8 +345,8 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
             raise UsageError(
                 f"--decoys goes with reactive: new scenarios of {config.suite} have no decoys"
             )
-        cities = fresh_cities(demo.cities)
-        return fresh(config.suite, cities, config.event, demo.city_size, demo.decoys)
+        cities = new_cities(demo.cities)
+        return new_scenarios(config.suite, cities, config.event, demo.city_size, demo.decoys)
     if demo.decoys:
         raise UsageError("--decoys goes with --cities: a suite has its own, see --no-decoys")
     if config.map is not None:

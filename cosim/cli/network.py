@@ -59,7 +59,7 @@ def init(
 
     make_authority(folder, host or ["localhost", "127.0.0.1"], days)
     _print_certificate(folder / "coordinator")
-    words = f"Keep {folder / 'ca.key'} to yourself: whoever has it can make every role."
+    words = f"Keep {folder / 'ca.key'} to yourself: it can make every role."
     say(words)
 
 
@@ -380,16 +380,13 @@ def serve_command(
     from bridge.policy_server import serve
     from bridge.session import open_session
     from cosim.episode.interfaces import Policy
+    from cosim.episode.manifest_checks import check_unprivileged
     from cosim.episode.policy_caller import NoTimer
     from cosim.policies.load import load_policy
     from scenarios.ipc.observation_codec import ObservationDecoder
 
     first = load_policy(policy)
-    if first.manifest.privileged:
-        raise UsageError(
-            f"policy '{policy}' is told what the simulator knows (privileged), and a remote "
-            f"one sees only observations"
-        )
+    check_unprivileged(policy, first.manifest, "a remote one")
     spare = [first.policy]
 
     def another() -> Policy:

@@ -167,7 +167,7 @@ def check_rerun(path: Path | None, episodes: int) -> None:
     if episodes != 1:
         how = "--scenario of `cosim run`, --episode of `cosim show`"
         raise UsageError(
-            f"--rerun is of one episode, and {episodes or 'none'} are asked for: name one ({how})"
+            f"--rerun is of one episode, and {episodes or 'none'} are chosen: name one ({how})"
         )
     if importlib.util.find_spec("rerun") is None:
         raise MachineError(

@@ -73,9 +73,9 @@ def check_policy(
     from cosim.episode.manifest_checks import with_goal
     from cosim.report.mapsheet import write_png
     from cosim.spec.goal import goal_called
-    from scenarios.runs.policy_host import host_of, inspected_driver, policy_driver
+    from scenarios.runs.policy_host import host_of, inspected_caller, policy_caller
     from scenarios.tools.policy_check.checks import POLICY_CHECKS, checked_policy
-    from scenarios.tools.policy_check.drives import drives_for
+    from scenarios.tools.policy_check.drives import shown_drives
     from scenarios.tools.policy_check.sheet import check_sheet
 
     if picture is not None:
@@ -87,20 +87,20 @@ def check_policy(
     asked_goal = goal_called(goal) if goal else None
     servers = run_connections(None, None, policy_at or (), tls, insecure).servers
     host = host_of(config, servers)
-    expected = inspected_driver(name, host).manifest if host.isolated != "no" else None
-    driver = policy_driver(name, host, expected=expected)
+    expected = inspected_caller(name, host).manifest if host.isolated != "no" else None
+    caller = policy_caller(name, host, expected=expected)
     try:
-        manifest = with_goal(driver.manifest, asked_goal)
+        manifest = with_goal(caller.manifest, asked_goal)
         with doing(f"checking {name}") as progress:
-            drives = drives_for(manifest, frames, camera_here(camera), own_camera, progress)
-            found = checked_policy(driver, manifest, drives, progress, only or ())
+            drives = shown_drives(manifest, frames, camera_here(camera), own_camera, progress)
+            found = checked_policy(caller, manifest, drives, progress, only or ())
             if picture is not None:
                 progress("drawing")
                 write_png(check_sheet(found.query), picture)
     finally:
-        driver.close()
+        caller.close()
     if as_json:
-        _print_json(found, manifest, driver.source_hash)
+        _print_json(found, manifest, caller.source_hash)
     else:
         _print_outcomes(found, manifest)
         if picture is not None:

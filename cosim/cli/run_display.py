@@ -68,7 +68,7 @@ class Terminal(EpisodeBars):
 
     def planned(self, plan: PlannedRun) -> None:
         """Check that a requested recording is possible, and print if OpenGL is missing."""
-        sees = plan.driver.manifest.camera is not None
+        sees = plan.caller.manifest.camera is not None
         if sees and self._config.camera == "auto" and plan.options.camera == "bullet":
             err.print(NO_OPENGL)
         check_rerun(self._config.rerun, len(plan.scenarios))

@@ -105,10 +105,9 @@ class ProgressDisplay:
 
     def tell(self, message: object) -> None:
         """Update the display by a message of a worker."""
-        from scenarios.ipc.messages import Done, Waits
-        from scenarios.ipc.messages import Progress as Report
+        from scenarios.ipc.messages import Done, EpisodeProgress, Waits
 
-        if isinstance(message, Report) and message.compared is not None:
+        if isinstance(message, EpisodeProgress) and message.compared is not None:
             self.left.at(message.scenario, self._alone + (1.0 - self._alone) * message.compared)
             self._bar(
                 message.scenario,
@@ -116,7 +115,7 @@ class ProgressDisplay:
                 f"{100.0 * message.compared:.0f} %",
                 "without the robot",
             )
-        elif isinstance(message, Report):
+        elif isinstance(message, EpisodeProgress):
             one = self._scenarios[message.scenario]
             length_m = one.route_line.length_m
             share = max(message.route_s_m / length_m, message.time_s / one.time_limit_s)

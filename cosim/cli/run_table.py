@@ -14,9 +14,9 @@ from cosim.core.units import milliseconds
 from cosim.results.discerned import (
     DISCERNED,
     DISCERNED_IN_WORDS,
+    episode_pairs,
     has_decoys,
     is_decoy,
-    pairs_of,
     with_discerned,
     without_decoys,
 )
@@ -169,7 +169,7 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
         f"below {MIN_N} episodes only counts"
     )
     if has_decoys(table):
-        out.print(f"decoys count in D alone, over {pairs_of(table).in_words}", highlight=False)
+        out.print(f"decoys count in D alone, over {episode_pairs(table).in_words}", highlight=False)
     print_by_split(out, table)
 
 

@@ -227,7 +227,7 @@ def run_own(
     `cosim run FILE.toml` has all other options of runs.
     """
     from cosim.results.run_folder import check_unused
-    from scenarios.runs.policy_host import host_of, inspected_driver
+    from scenarios.runs.policy_host import host_of, inspected_caller
     from scenarios.suites.user_scenarios.check import checked_own
     from scenarios.suites.user_scenarios.read import read_own
 
@@ -238,7 +238,7 @@ def run_own(
             check_unused(part)
     with doing(f"checking {file}") as progress:
         suite = checked_own(own, progress)
-    manifest = inspected_driver(config.policy, host_of(config), config.jobs or 1).manifest
+    manifest = inspected_caller(config.policy, host_of(config), config.jobs or 1).manifest
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = config.out or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
     if manifest.camera is not None:

@@ -16,6 +16,23 @@ from cosim.spec.odometry import ODOMETRY
 from cosim.spec.robot import Mount, Robot
 from cosim.spec.sensors import ScanSpec, imu_called, people_called
 
+MAX_CAMERA_PX = 4096
+"""Largest side of a policy's camera, pixels."""
+
+
+def check_unprivileged(name: str, manifest: Manifest, place: str, remedy: str = "") -> None:
+    """Check that a policy needs no privileged state where it does not get any.
+
+    place: "a remote one" or "an isolated one", in words
+    remedy: command or option that helps
+    Raises UsageError.
+    """
+    if manifest.privileged:
+        raise UsageError(
+            f"policy '{name}' needs privileged state, and {place} gets only observations"
+            + (f": {remedy}" if remedy else "")
+        )
+
 
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
     """Return a manifest with the goal protocol of the run, if there is one.
@@ -52,6 +69,33 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
             f"pictures of its camera: give its manifest a camera, or choose one of {others}"
         )
     return settled
+
+
+def fault_of_values(manifest: Manifest) -> str:
+    """Return the first fault in the values of a manifest's rate and cameras; "" if valid."""
+    if not 0.0 < manifest.rate_hz < math.inf:
+        return f"rate_hz must be a positive number, not {manifest.rate_hz}"
+    cameras = [*([] if manifest.camera is None else [manifest.camera]), *manifest.cameras.values()]
+    return next(filter(None, map(_camera_fault, cameras)), "")
+
+
+def _camera_fault(camera: CameraSpec) -> str:
+    """Return the first fault in a camera's values; "" if valid."""
+    if not all(1 <= side <= MAX_CAMERA_PX for side in (camera.width, camera.height)):
+        size = f"{camera.width} x {camera.height}"
+        return f"camera must have sides of 1 to {MAX_CAMERA_PX} pixels, not {size}"
+    if not 0.0 < camera.fov_deg < 180.0:
+        return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"
+    mount = camera.mount
+    if not isinstance(mount, str) and not all(
+        map(math.isfinite, (*mount.at_m, mount.pitch_down_deg, mount.yaw_left_deg))
+    ):
+        angles = f"{mount.pitch_down_deg}, {mount.yaw_left_deg}"
+        return (
+            f"camera mount at_m, pitch_down_deg and yaw_left_deg must be finite, not "
+            f"{mount.at_m}, {angles}"
+        )
+    return ""
 
 
 def calibration_of(spec: CameraSpec, robot: Robot) -> Calibration:

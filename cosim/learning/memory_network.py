@@ -12,14 +12,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from cosim.core.packed_demos import FREE_RAYS
-from cosim.learning.network import TURN_BINS, WAYPOINTS, NetworkOutput, Parameters
+from cosim.learning.network import (
+    TURN_BINS,
+    WAYPOINTS,
+    NetworkOutput,
+    Parameters,
+    convolution,
+    linear_layer,
+)
 
 PICTURES: Final = 2
 """Number of pictures in the input, the newest last."""
@@ -128,11 +135,7 @@ def new_memory_parameters(seed: int) -> dict[str, Tensor]:
 
 def encoded(parameters: Parameters, pictures: Tensor) -> Tensor:
     """Return (N, _IMAGE) features of pictures (N, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1."""
-
-    def convolved(x: Tensor, name: str) -> Tensor:
-        weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
-        return functional.conv2d(x, weight, bias, STRIDES.get(name, 1), weight.shape[-1] // 2)
-
+    convolved = partial(convolution, parameters, STRIDES)
     x = (pictures - 0.5) * 4.0
     for stage in STAGES:
         if is_block(stage):
@@ -140,19 +143,15 @@ def encoded(parameters: Parameters, pictures: Tensor) -> Tensor:
         else:
             for name in stage:
                 x = convolved(x, name).relu()
-    return _linear(parameters, x.flatten(1), "seen").relu()
-
-
-def _linear(parameters: Parameters, x: Tensor, name: str) -> Tensor:
-    return functional.linear(x, parameters[f"{name}.weight"], parameters[f"{name}.bias"])
+    return linear_layer(parameters, x.flatten(1), "seen").relu()
 
 
 def remembered(parameters: Parameters, joined: Tensor, memory: Tensor, carries: bool) -> Tensor:
     """Return (B, T, MEMORY) the memory after each step. carries: False clears it at each step."""
-    arriving = _linear(parameters, joined, "arriving")
+    arriving = linear_layer(parameters, joined, "arriving")
     found = []
     for step in arriving.unbind(1):
-        recurrent = _linear(parameters, memory, "recurrent")
+        recurrent = linear_layer(parameters, memory, "recurrent")
         reset, update = (step[:, : 2 * MEMORY] + recurrent[:, : 2 * MEMORY]).sigmoid().chunk(2, 1)
         new = (step[:, 2 * MEMORY :] + reset * recurrent[:, 2 * MEMORY :]).tanh()
         after = update * memory + (1.0 - update) * new
@@ -178,12 +177,12 @@ def forward_steps(
     """
     batch, steps = goal.shape[:2]
     image = encoded(parameters, pictures.flatten(0, 1))
-    inputs = _linear(parameters, torch.cat([goal, speeds], 2).flatten(0, 1), "inputs").relu()
-    joined = _linear(parameters, torch.cat([image, inputs], 1), "joined").relu()
+    inputs = linear_layer(parameters, torch.cat([goal, speeds], 2).flatten(0, 1), "inputs").relu()
+    joined = linear_layer(parameters, torch.cat([image, inputs], 1), "joined").relu()
     after = remembered(parameters, joined.unflatten(0, (batch, steps)), memory, carries)
     both = torch.cat([joined, after.flatten(0, 1)], 1)
-    known = _linear(parameters, both, "known").relu()
-    raw = {name: _linear(parameters, known, name).float() for name in HEADS}
+    known = linear_layer(parameters, both, "known").relu()
+    raw = {name: linear_layer(parameters, known, name).float() for name in HEADS}
     return MemoryOutput(
         NetworkOutput(
             raw["speed"].squeeze(1),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Final, NamedTuple
 
 import torch
@@ -99,6 +100,20 @@ def turns_radps(device: str | torch.device = "cpu") -> Tensor:
     return torch.linspace(TURN_UNIT_RADPS, -TURN_UNIT_RADPS, TURN_BINS, device=device)
 
 
+def convolution(parameters: Parameters, strides: Mapping[str, int], x: Tensor, name: str) -> Tensor:
+    """Apply a layer's convolution to x (B, C, H, W), with zeros beyond the border.
+
+    strides: of layers by name, 1 for others
+    """
+    weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
+    return functional.conv2d(x, weight, bias, strides.get(name, 1), weight.shape[-1] // 2)
+
+
+def linear_layer(parameters: Parameters, x: Tensor, name: str) -> Tensor:
+    """Apply a linear layer to x (..., K)."""
+    return functional.linear(x, parameters[f"{name}.weight"], parameters[f"{name}.bias"])
+
+
 def forward(
     parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tensor
 ) -> NetworkOutput:
@@ -108,14 +123,8 @@ def forward(
     goal: (B, 2), x and y in GOAL_UNIT_M
     speeds: (B, 2), v minus its mean in SPEED_UNIT_MPS, w in TURN_UNIT_RADPS
     """
-
-    def convolved(x: Tensor, name: str) -> Tensor:
-        weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
-        return functional.conv2d(x, weight, bias, STRIDES.get(name, 1), weight.shape[-1] // 2)
-
-    def linear(x: Tensor, name: str) -> Tensor:
-        return functional.linear(x, parameters[f"{name}.weight"], parameters[f"{name}.bias"])
-
+    convolved = partial(convolution, parameters, STRIDES)
+    linear = partial(linear_layer, parameters)
     x = (pictures - 0.5) * 4.0
     for name in ("stem", "down1", "down2"):
         x = convolved(x, name).relu()

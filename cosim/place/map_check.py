@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -167,19 +167,6 @@ def check_map(
     narrow = [s for s in sidewalks if s.width_m < _NARROW_M]
     driven_over = corners_driven_over(street_map)
     islands = _islands(graph, lengths)
-    problems = [
-        *_problems("island", [s for s in strips if s.id not in graph.main_strips]),
-        *_problems("narrow", narrow),
-        *_problems("on_road", on_road),
-        *_problems("stacked", stacked),
-        *_corner_problems("driven_over", driven_over),
-        *_problems("steep", [s for s in strips if s.id in street_map.steep]),
-        *_problems("short_green", [s for s in crossings if s.short_green]),
-    ]
-    if facts is not None:
-        for kind in ("never_green", "always_green", "levels", "misfits"):
-            known = [street_map.strips[i] for i in getattr(facts, kind) if i in street_map.strips]
-            problems += _problems(kind.removesuffix("s"), known)
     x0, y0, x1, y1 = street_map.bounds
     return MapCheck(
         name=street_map.name,
@@ -215,9 +202,26 @@ def check_map(
             *_short_green_notes(crossings),
             *_net_notes(facts),
         ),
-        problems=tuple(problems),
+        problems=(
+            *_problems("island", [s for s in strips if s.id not in graph.main_strips]),
+            *_problems("narrow", narrow),
+            *_problems("on_road", on_road),
+            *_problems("stacked", stacked),
+            *_corner_problems("driven_over", driven_over),
+            *_problems("steep", [s for s in strips if s.id in street_map.steep]),
+            *_problems("short_green", [s for s in crossings if s.short_green]),
+            *_net_problems(street_map, facts),
+        ),
         features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
     )
+
+
+def _net_problems(street_map: StreetMap, facts: NetFacts | None) -> Iterator[Problem]:
+    """Yield the problems of the strips that the facts about a net name."""
+    if facts is not None:
+        for kind in ("never_green", "always_green", "levels", "misfits"):
+            known = [street_map.strips[i] for i in getattr(facts, kind) if i in street_map.strips]
+            yield from _problems(kind.removesuffix("s"), known)
 
 
 def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:

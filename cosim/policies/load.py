@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from bridge.policy_server import PolicyFault, policy_call
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError, unknown
 from cosim.episode.interfaces import Policy
-from cosim.episode.manifest_checks import with_goal
+from cosim.episode.manifest_checks import fault_of_values, with_goal
 from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer
 from cosim.policies import POLICIES
 from cosim.policies.onnx.manifest import MANIFEST_FILE, read_bundle_manifest
@@ -35,7 +34,6 @@ from cosim.policies.user_module import (
     policy_module,
     remedy_for_missing,
 )
-from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.ros2 import ROS2_SCHEME
 
@@ -63,8 +61,6 @@ def bundle_in_words(folder: Path) -> str:
 
 _BUNDLED = "cosim.policies."
 """Start of the names of modules of bundled policies."""
-_MAX_PX = 4096
-"""Largest side of a camera image in pixels."""
 LONGEST_NAME = 100
 """Largest number of characters in a policy's name or version."""
 FOLLOW = "follow"
@@ -294,28 +290,7 @@ def _wrong(manifest: Manifest) -> str:
                 f"{field} must be a text of 1 to {LONGEST_NAME} printable characters, without "
                 f"'/', not {text!r:.80}"
             )
-    cameras = [*([] if manifest.camera is None else [manifest.camera]), *manifest.cameras.values()]
-    return next(filter(None, map(_wrong_camera, cameras)), "")
-
-
-def _wrong_camera(camera: CameraSpec) -> str:
-    """Return the first fault in a camera's values; "" if valid."""
-    if not all(1 <= side <= _MAX_PX for side in (camera.width, camera.height)):
-        return (
-            f"camera must have sides of 1 to {_MAX_PX} pixels, not {camera.width} x {camera.height}"
-        )
-    if not 0.0 < camera.fov_deg < 180.0:
-        return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"
-    mount = camera.mount
-    if not isinstance(mount, str) and not all(
-        map(math.isfinite, (*mount.at_m, mount.pitch_down_deg, mount.yaw_left_deg))
-    ):
-        angles = f"{mount.pitch_down_deg}, {mount.yaw_left_deg}"
-        return (
-            f"camera mount at_m, pitch_down_deg and yaw_left_deg must be finite, not "
-            f"{mount.at_m}, {angles}"
-        )
-    return ""
+    return fault_of_values(manifest)
 
 
 @contextmanager

@@ -17,8 +17,8 @@ from cosim.core.errors import RunError, UsageError
 from cosim.core.geometry import Floats
 from cosim.results.discerned import (
     DISCERNED,
+    episode_pairs,
     has_decoys,
-    pairs_of,
     with_discerned,
     without_decoys,
 )
@@ -321,7 +321,7 @@ def _paired_columns(name: str, before: pd.DataFrame, after: pd.DataFrame) -> lis
     """
     tables = before, after
     if name == DISCERNED:
-        solved = [pairs_of(table.reset_index()).solved for table in tables]
+        solved = [episode_pairs(table.reset_index()).solved for table in tables]
         both = solved[0].index.intersection(solved[1].index)
         return [np.asarray(pairs[both], dtype=float) for pairs in solved]
     columns = POOLED.get(name, (name,))
@@ -425,7 +425,7 @@ def _notes(runs: Sequence[VerifiedRun], compared: Sequence[ComparedRun]) -> Iter
             (record.nonstandard for record in run.records.values() if record.nonstandard), ""
         ):
             yield f"{other.label} is nonstandard: {nonstandard}"
-        pairs = pairs_of(other.table)
+        pairs = episode_pairs(other.table)
         if pairs.invalid or pairs.single:
             yield f"{other.label}: D is over {pairs.in_words}"
         if words := run.spec.conditions_in_words:

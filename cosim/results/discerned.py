@@ -85,7 +85,7 @@ def with_discerned(heads: Mapping[str, str], decoys: bool) -> dict[str, str]:
     return found
 
 
-def pairs_of(table: pd.DataFrame) -> Pairs:
+def episode_pairs(table: pd.DataFrame) -> Pairs:
     """Return the pairs of a table with one row per episode."""
     if not has_decoys(table):
         return Pairs(pd.Series(dtype=float), 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Any, Generic, TypeVar
 
@@ -19,6 +19,7 @@ class FlatFile(Generic[_T]):
         follow
     without: fields, as `PART.FIELD`, that the file omits
     defaults: values of optional keys, if the field has another default or none
+    fault: function that returns the first fault in a decoded struct, or ""
 
     `keys` maps each key of the file to `PART.FIELD`, or to `FIELD` of the struct itself.
     """
@@ -30,8 +31,10 @@ class FlatFile(Generic[_T]):
         order: str,
         without: str = "",
         defaults: Mapping[str, Any] | None = None,
+        fault: Callable[[_T], str] = lambda _: "",
     ) -> None:
         self._whole = whole
+        self._fault = fault
         self._parts = parts
         fields: dict[str, tuple[Any, Any]] = {}
         for part, kind in {"": whole, **parts}.items():
@@ -76,6 +79,9 @@ class FlatFile(Generic[_T]):
         for name, path in self.keys.items():
             part, _, field = path.rpartition(".")
             found[part][field] = getattr(read, name)
-        return self._whole(
+        value = self._whole(
             **found[""], **{part: kind(**found[part]) for part, kind in self._parts.items()}
         )
+        if fault := self._fault(value):
+            raise msgspec.ValidationError(fault)
+        return value

@@ -282,7 +282,7 @@ class Log:
         return RobotState(pose, z_m=z_m, legs=LegState(roll, pitch, tuple(angles)))
 
     def same(self, tick: Tick) -> bool:
-        """Return whether a replayed tick equals the recorded one, bit for bit.
+        """Return whether a replayed tick has the recorded values; -0.0 equals 0.0, NaN equals NaN.
 
         With legs `travelled_m` is left out: it is a function of the poses of many ticks.
         """

@@ -21,7 +21,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import Motion
 from cosim.episode.command_delay import CommandDelay
 from cosim.episode.loop import Step
-from cosim.episode.manifest_checks import nonstandard
+from cosim.episode.manifest_checks import fault_of_values, nonstandard
 from cosim.results.flat_file import FlatFile
 from cosim.results.log import COLUMNS, Log, Tick
 from cosim.results.referee import Ended, Failure, Verdict
@@ -250,6 +250,7 @@ RECORD_FILE = FlatFile(
     """,
     without="manifest.goals",
     defaults={"camera": None},
+    fault=lambda record: fault_of_values(record.manifest),
 )
 """Layout of record.json: flat, for compatibility with files written before `Record` had parts."""
 

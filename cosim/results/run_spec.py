@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from cosim.core.errors import RunError, UsageError
+from cosim.episode.manifest_checks import fault_of_values
 from cosim.results.flat_file import FlatFile
 from cosim.results.run_setup import RunSetup, gait_in_words
 from cosim.spec.manifest import Manifest
@@ -181,6 +182,7 @@ RUN_FILE = FlatFile(
     """,
     without="manifest.privileged manifest.goals",
     defaults={"camera": None, "renderer": "unknown"},
+    fault=lambda spec: fault_of_values(spec.manifest),
 )
 """Layout of run.json: flat, for compatibility with files written before `RunSpec` had parts."""
 

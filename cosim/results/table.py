@@ -13,8 +13,8 @@ from cosim.core.errors import listed
 from cosim.core.geometry import Floats
 from cosim.results.discerned import (
     DISCERNED,
+    episode_pairs,
     has_decoys,
-    pairs_of,
     with_discerned,
     without_decoys,
 )
@@ -178,7 +178,7 @@ def estimate_of(table: pd.DataFrame, name: str) -> Estimate:
     Decoys count in `discerned` alone, which is over pairs (`cosim.results.discerned`).
     """
     if name == DISCERNED:
-        return estimate_of_share(pairs_of(table).values)
+        return estimate_of_share(episode_pairs(table).values)
     table = without_decoys(table)
     if name in UNKNOWN_WITH_CRASH and crashed_in(table):
         return NO_ESTIMATE

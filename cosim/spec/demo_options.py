@@ -216,7 +216,7 @@ def recording_manifest(
     if not kind.has_data_set_column:
         others = ", ".join(one.name for one in GOALS.values() if one.has_data_set_column)
         raise UsageError(
-            f"goal protocol '{goal}' ({kind.summary}) cannot be told in a data set: give "
+            f"goal protocol '{goal}' ({kind.summary}) cannot be stored in a data set: give "
             f"--goal, one of {others}"
         )
     if expert.camera is not None and collecting.rate_hz != expert.rate_hz:

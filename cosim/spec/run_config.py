@@ -403,7 +403,7 @@ class RunConfig:
     counterfactual: Annotated[
         bool,
         Option(
-            "Simulate every street again without the robot, to measure whom it delayed.",
+            "Simulate every street again without the robot, to measure the delays by it.",
             panel=_FOLDER,
         ),
     ] = False

@@ -474,7 +474,7 @@ def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Ite
     if scenario.ends_at == "stop" and not any(event.kind in stops for event in scenario.events):
         needed = " or ".join(f"'{name}'" for name in stops)
         yield (
-            f"{scenario.prefix}ends_at 'stop' needs an event {needed}: somebody to stop for - at "
+            f"{scenario.prefix}ends_at 'stop' needs an event {needed}: a person to stop for - at "
             f"`{place}`"
         )
 

@@ -59,11 +59,11 @@ def select_scenarios(
             raise UsageError(
                 f"suite '{suite.name}' has no scenarios of split '{split}' among those chosen"
             )
-    first = {s.id for pair in pairs_of(picked)[:episodes] for s in pair}
+    first = {s.id for pair in scenario_pairs(picked)[:episodes] for s in pair}
     return tuple(s for s in picked if s.id in first)
 
 
-def pairs_of(scenarios: Sequence[Scenario]) -> list[tuple[Scenario, ...]]:
+def scenario_pairs(scenarios: Sequence[Scenario]) -> list[tuple[Scenario, ...]]:
     """Return scenarios with their decoys behind them; a decoy alone if its scenario is missing."""
     groups: dict[str, list[Scenario]] = {s.id: [s] for s in scenarios if not s.decoy_of}
     for decoy in (s for s in scenarios if s.decoy_of):
@@ -105,7 +105,10 @@ def _options_for(suite: Suite, ids: Sequence[str]) -> list[str]:
         (False, True) if any(scenario.decoy_of for scenario in suite.scenarios) else (False,)
     )
     choices = product(
-        (None, *get_args(Split)), ((), *common, every), (None, len(pairs_of(picked))), no_decoys
+        (None, *get_args(Split)),
+        ((), *common, every),
+        (None, len(scenario_pairs(picked))),
+        no_decoys,
     )
     for split, kinds, episodes, without in sorted(choices, key=lambda one: sum(map(bool, one))):
         try:

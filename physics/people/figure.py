@@ -50,87 +50,9 @@ def torso_pieces(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> l
     loose: gap between cloth and body, metres
     """
     w, b = build.woman, build.belly_m
-    keys = (
-        # z, x, half depth ahead, behind, half width (man), half width (woman), weights
-        (
-            0.90,
-            -0.012,
-            0.110 + 0.6 * b,
-            0.122 + 0.006 * w,
-            0.160,
-            0.176,
-            {"pelvis": 0.9, "spine1": 0.1},
-        ),
-        (
-            0.98,
-            -0.012,
-            0.109 + 0.9 * b,
-            0.114 + 0.004 * w,
-            0.156,
-            0.162,
-            {"pelvis": 0.65, "spine1": 0.35},
-        ),
-        (
-            1.06,
-            -0.010,
-            0.108 + b,
-            0.100 - 0.006 * w,
-            0.147,
-            0.133,
-            {"pelvis": 0.25, "spine1": 0.65, "spine2": 0.1},
-        ),
-        (
-            1.14,
-            -0.008,
-            0.109 + 0.8 * b - 0.006 * w,
-            0.100,
-            0.150,
-            0.132,
-            {"spine1": 0.5, "spine2": 0.5},
-        ),
-        (
-            1.22,
-            -0.006,
-            0.117 + 0.3 * b + 0.014 * w,
-            0.108,
-            0.163,
-            0.146,
-            {"spine1": 0.1, "spine2": 0.6, "spine3": 0.3},
-        ),
-        (
-            1.275,
-            -0.006,
-            0.120 + 0.1 * b + 0.022 * w,
-            0.114,
-            0.172,
-            0.152,
-            {"spine2": 0.35, "spine3": 0.65},
-        ),
-        (1.34, -0.010, 0.113 + 0.006 * w, 0.114, 0.182, 0.160, {"spine2": 0.1, "spine3": 0.9}),
-        (
-            1.40,
-            -0.018,
-            0.094,
-            0.104,
-            0.178,
-            0.156,
-            {"spine3": 0.9, "left_collar": 0.05, "right_collar": 0.05},
-        ),
-        (
-            1.453,
-            -0.026,
-            0.068,
-            0.082,
-            0.168,
-            0.149,
-            {"spine3": 0.85, "left_collar": 0.075, "right_collar": 0.075},
-        ),
-        (1.474, -0.030, 0.059, 0.070, 0.124, 0.110, {"spine3": 0.85, "neck": 0.15}),
-        (1.491, -0.031, 0.056, 0.064, 0.080, 0.072, {"spine3": 0.7, "neck": 0.3}),
-        (1.500, -0.030, 0.056, 0.060, 0.064, 0.058, {"spine3": 0.5, "neck": 0.5}),
-    )
     rings = []
-    for z, x, front, behind, man, woman, joints in keys:
+    for profile, joints in zip(_torso_profile(w, b), _TORSO_WEIGHTS, strict=True):
+        z, x, front, behind, man, woman = profile
         if kind == "skirt" and z < 0.95:
             continue
         wide = man + (woman - man) * w + 0.6 * b * (0.9 < z < 1.2) + loose
@@ -157,6 +79,44 @@ def torso_pieces(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> l
         Piece("top", (_rim(rings[0], -0.004, 0.93), *rings), TORSO, (26, 13, 10, 9)),
         _seat(build),
     ]
+
+
+_TORSO_WEIGHTS: Final[tuple[Joints, ...]] = (
+    {"pelvis": 0.9, "spine1": 0.1},
+    {"pelvis": 0.65, "spine1": 0.35},
+    {"pelvis": 0.25, "spine1": 0.65, "spine2": 0.1},
+    {"spine1": 0.5, "spine2": 0.5},
+    {"spine1": 0.1, "spine2": 0.6, "spine3": 0.3},
+    {"spine2": 0.35, "spine3": 0.65},
+    {"spine2": 0.1, "spine3": 0.9},
+    {"spine3": 0.9, "left_collar": 0.05, "right_collar": 0.05},
+    {"spine3": 0.85, "left_collar": 0.075, "right_collar": 0.075},
+    {"spine3": 0.85, "neck": 0.15},
+    {"spine3": 0.7, "neck": 0.3},
+    {"spine3": 0.5, "neck": 0.5},
+)
+"""Joints that move each ring of the torso, with their weights."""
+
+
+def _torso_profile(w: float, b: float) -> tuple[tuple[float, ...], ...]:
+    """Return z, x, half depths ahead and behind, half widths of a man and a woman, of each ring.
+
+    w, b: woman and belly_m of `Build`
+    """
+    return (
+        (0.90, -0.012, 0.110 + 0.6 * b, 0.122 + 0.006 * w, 0.160, 0.176),
+        (0.98, -0.012, 0.109 + 0.9 * b, 0.114 + 0.004 * w, 0.156, 0.162),
+        (1.06, -0.010, 0.108 + b, 0.100 - 0.006 * w, 0.147, 0.133),
+        (1.14, -0.008, 0.109 + 0.8 * b - 0.006 * w, 0.100, 0.150, 0.132),
+        (1.22, -0.006, 0.117 + 0.3 * b + 0.014 * w, 0.108, 0.163, 0.146),
+        (1.275, -0.006, 0.120 + 0.1 * b + 0.022 * w, 0.114, 0.172, 0.152),
+        (1.34, -0.010, 0.113 + 0.006 * w, 0.114, 0.182, 0.160),
+        (1.40, -0.018, 0.094, 0.104, 0.178, 0.156),
+        (1.453, -0.026, 0.068, 0.082, 0.168, 0.149),
+        (1.474, -0.030, 0.059, 0.070, 0.124, 0.110),
+        (1.491, -0.031, 0.056, 0.064, 0.080, 0.072),
+        (1.500, -0.030, 0.056, 0.060, 0.064, 0.058),
+    )
 
 
 def _rim(hem: Ring, up_m: float, size: float) -> Ring:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from physics.people.families import man_rest_m
 from physics.people.figure import SMALL, Build, upright_loft
 from physics.people.lofted_mesh import Piece, Ring, ball, scaled_vector
 from physics.people.skeleton import INDEX
+
+_COARSE: Final = (8, 0, 0, 0)
+_SMOOTH: Final = (8, 5, 0, 0)
+"""Sides of the small balls of a face, by level of meshes and tubes."""
 
 
 def neck_and_head(build: Build) -> list[Piece]:
@@ -42,37 +48,29 @@ def neck_and_head(build: Build) -> list[Piece]:
         ball("lips", (0.084, 0.0, 1.577), (0.010, 0.023, 0.0065), {"head": 1.0}, (8, 5, 0, 0)),
     ]
     for left in (1.0, -1.0):
-        pieces += [
-            ball(
-                "white",
-                (0.0775, 0.0305 * left, 1.6475),
-                (0.0090, 0.0125, 0.0058),
-                {"head": 1.0},
-                (8, 0, 0, 0),
-            ),
-            ball(
-                "dark",
-                (0.0835, 0.0300 * left, 1.6475),
-                (0.0055, 0.0065, 0.0065),
-                {"head": 1.0},
-                (8, 5, 0, 0),
-            ),
-            ball(
-                "hair",
-                (0.0855, 0.0310 * left, 1.6670),
-                (0.006, 0.0185, 0.0038),
-                {"head": 1.0},
-                (8, 5, 0, 0),
-            ),
-            ball(
-                "skin",
-                (-0.010, 0.076 * left * slim, 1.632),
-                (0.017, 0.010, 0.030),
-                {"head": 1.0},
-                (8, 6, 0, 0),
-            ),
-        ]
+        pieces += _eye_and_ear(left, slim)
     return [about_head(piece, build.head) for piece in pieces]
+
+
+def _eye_and_ear(left: float, slim: float) -> list[Piece]:
+    """Return white, pupil, brow and ear of one side.
+
+    left: 1 or -1
+    slim: factor on the head's width
+    """
+    weights = {"head": 1.0}
+    return [
+        ball("white", (0.0775, 0.0305 * left, 1.6475), (0.0090, 0.0125, 0.0058), weights, _COARSE),
+        ball("dark", (0.0835, 0.0300 * left, 1.6475), (0.0055, 0.0065, 0.0065), weights, _SMOOTH),
+        ball("hair", (0.0855, 0.0310 * left, 1.6670), (0.006, 0.0185, 0.0038), weights, _SMOOTH),
+        ball(
+            "skin",
+            (-0.010, 0.076 * left * slim, 1.632),
+            (0.017, 0.010, 0.030),
+            weights,
+            (8, 6, 0, 0),
+        ),
+    ]
 
 
 def _nose() -> list[Ring]:

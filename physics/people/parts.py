@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -59,87 +60,73 @@ def part_meshes(family: Family) -> tuple[Mesh, ...]:
     _, at = bind_of(body, model_pose())
     f = body.height_m / 1.75
     joints = {name: at[k] for k, name in enumerate(JOINTS)}
+    meshes = {"spine2": [_chest(joints, f)], "head": _head(joints, f)}
+    for side in ("left", "right"):
+        meshes |= {f"{side}_{part}": [mesh] for part, mesh in _limbs(joints, side, f).items()}
+    taken = {name: iter(list_) for name, list_ in meshes.items()}
+    return tuple(next(taken[joint]).moved(-joints[joint]) for joint, _ in RIGID_PARTS)
+
+
+def _chest(joints: Mapping[str, Floats], f: float) -> Mesh:
+    """Return the trunk from hem to neck; f: factor on the size, in all functions here."""
     base = _off(joints["neck"], 0.0, -0.03 * f)
     hem, ribs = _off(joints["pelvis"], 0.0, -0.08 * f), _off(joints["spine3"], 0.0, -0.02 * f)
-    chest = join(
+    low, high = _off(base, 0.0, -0.03 * f), _off(base, 0.0, 0.03 * f)
+    return join(
         [
             _tube(hem, _off(ribs, 0.0, 0.01 * f), (0.11 * f, 0.155 * f), (0.114 * f, 0.159 * f), 8),
-            _tube(ribs, _off(base, 0.0, -0.03 * f), (0.115 * f, 0.16 * f), (0.08 * f, 0.17 * f), 8),
-            _tube(
-                _off(base, 0.0, -0.03 * f),
-                _off(base, 0.0, 0.03 * f),
-                (0.08 * f, 0.17 * f),
-                (0.06 * f, 0.06 * f),
-                8,
-            ),
+            _tube(ribs, low, (0.115 * f, 0.16 * f), (0.08 * f, 0.17 * f), 8),
+            _tube(low, high, (0.08 * f, 0.17 * f), (0.06 * f, 0.06 * f), 8),
         ]
     )
+
+
+def _head(joints: Mapping[str, Floats], f: float) -> list[Mesh]:
+    """Return the head with the neck, and the hair."""
     skull = _off(joints["head"], 0.0, 0.075 * f)
+    nape, chin = _off(joints["neck"], 0.01, -0.05 * f), _off(joints["head"], 0.01, 0.0)
+    jaw, top = _off(skull, 0.02, -0.12 * f), _off(skull, 0.0, 0.09 * f)
+    thick = (0.05 * f, 0.05 * f)
+    wide = (0.095 * f, 0.075 * f)
     head = join(
         [
-            _tube(
-                _off(joints["neck"], 0.01, -0.05 * f),
-                _off(joints["head"], 0.01, 0.0),
-                (0.05 * f, 0.05 * f),
-                (0.05 * f, 0.05 * f),
-                5,
-            ),
-            _tube(
-                _off(skull, 0.02, -0.12 * f), skull, (0.06 * f, 0.05 * f), (0.095 * f, 0.075 * f), 7
-            ),
-            _tube(
-                skull, _off(skull, 0.0, 0.09 * f), (0.095 * f, 0.075 * f), (0.05 * f, 0.045 * f), 7
-            ),
+            _tube(nape, chin, thick, thick, 5),
+            _tube(jaw, skull, (0.06 * f, 0.05 * f), wide, 7),
+            _tube(skull, top, wide, (0.05 * f, 0.045 * f), 7),
         ]
     )
     crown = _off(skull, -0.03 * f, 0.0)
+    low, middle = _off(crown, 0.0, -0.06 * f), _off(crown, 0.012 * f, 0.06 * f)
+    broad = (0.105 * f, 0.084 * f)
     hair = join(
         [
-            _tube(
-                _off(crown, 0.0, -0.06 * f),
-                _off(crown, 0.012 * f, 0.06 * f),
-                (0.08 * f, 0.080 * f),
-                (0.105 * f, 0.084 * f),
-                7,
-            ),
-            _tube(
-                _off(crown, 0.012 * f, 0.06 * f),
-                _off(crown, 0.0, 0.112 * f),
-                (0.105 * f, 0.084 * f),
-                (0.05 * f, 0.045 * f),
-                7,
-            ),
+            _tube(low, middle, (0.08 * f, 0.080 * f), broad, 7),
+            _tube(middle, _off(crown, 0.0, 0.112 * f), broad, (0.05 * f, 0.045 * f), 7),
         ]
     )
-    meshes: dict[str, list[Mesh]] = {"spine2": [chest], "head": [head, hair]}
-    for side in ("left", "right"):
-        shoulder, elbow, wrist, hand = (
-            joints[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist", "hand")
-        )
-        hip, knee, ankle = (joints[f"{side}_{part}"] for part in ("hip", "knee", "ankle"))
-        meshes[f"{side}_shoulder"] = [
-            _tube(elbow, shoulder, (0.045 * f, 0.045 * f), (0.058 * f, 0.055 * f), 5)
-        ]
-        palm = _tube(
-            hand + 0.9 * (hand - wrist), wrist, (0.050 * f, 0.014 * f), (0.052 * f, 0.02 * f), 4
-        )
-        meshes[f"{side}_wrist"] = [palm]
-        meshes[f"{side}_elbow"] = [
-            _tube(wrist, elbow, (0.028 * f, 0.028 * f), (0.042 * f, 0.042 * f), 5)
-        ]
-        meshes[f"{side}_hip"] = [
-            _tube(knee, _off(hip, 0.0, 0.03 * f), (0.06 * f, 0.06 * f), (0.095 * f, 0.085 * f), 6)
-        ]
-        shoe = box(
-            (0.275 * f, 0.09 * f, 0.075 * f),
-            (ankle[0] + 0.075 * f, ankle[1], 0.0375 * f),
-            skip=("bottom",),
-        )
-        meshes[f"{side}_knee"] = [
-            join([_tube(ankle, knee, (0.05 * f, 0.05 * f), (0.062 * f, 0.06 * f), 5), shoe])
-        ]
-    taken = {name: iter(list_) for name, list_ in meshes.items()}
-    return tuple(next(taken[joint]).moved(-joints[joint]) for joint, _ in RIGID_PARTS)
+    return [head, hair]
+
+
+def _limbs(joints: Mapping[str, Floats], side: str, f: float) -> dict[str, Mesh]:
+    """Return the parts of one arm and one leg, by the joint that carries each."""
+    shoulder, elbow, wrist, hand, hip, knee, ankle = (
+        joints[f"{side}_{part}"]
+        for part in ("shoulder", "elbow", "wrist", "hand", "hip", "knee", "ankle")
+    )
+    palm = hand + 0.9 * (hand - wrist)
+    shoe = box(
+        (0.275 * f, 0.09 * f, 0.075 * f),
+        (ankle[0] + 0.075 * f, ankle[1], 0.0375 * f),
+        skip=("bottom",),
+    )
+    thigh = _off(hip, 0.0, 0.03 * f)
+    return {
+        "shoulder": _tube(elbow, shoulder, (0.045 * f, 0.045 * f), (0.058 * f, 0.055 * f), 5),
+        "wrist": _tube(palm, wrist, (0.050 * f, 0.014 * f), (0.052 * f, 0.02 * f), 4),
+        "elbow": _tube(wrist, elbow, (0.028 * f, 0.028 * f), (0.042 * f, 0.042 * f), 5),
+        "hip": _tube(knee, thigh, (0.06 * f, 0.06 * f), (0.095 * f, 0.085 * f), 6),
+        "knee": join([_tube(ankle, knee, (0.05 * f, 0.05 * f), (0.062 * f, 0.06 * f), 5), shoe]),
+    }
 
 
 def placed_parts(people: People, z_m: Floats, time_s: float) -> _Placed:

@@ -41,9 +41,13 @@ def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]
 
     ahead, left: 1 or -1.
     """
+    return _leg_links(name, ahead, left), _leg_joints(name, ahead, left)
+
+
+def _leg_links(name: str, ahead: float, left: float) -> list[Link]:
     aside_m = left * THIGH_ASIDE_M
     half_m = 0.5 * SEGMENT_M
-    links = [
+    return [
         Link(
             f"{name}_hip_link",
             0.678,
@@ -88,8 +92,11 @@ def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]
             (Solid("sphere", (FOOT_M,), colour="rubber", touches=True),),
         ),
     ]
+
+
+def _leg_joints(name: str, ahead: float, left: float) -> list[Joint]:
     thigh_rad = (-1.5708, 3.4907) if ahead > 0 else (-0.5236, 4.5379)
-    joints = [
+    return [
         Joint(
             f"{name}_hip",
             "base",
@@ -105,7 +112,7 @@ def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]
             f"{name}_thigh",
             f"{name}_hip_link",
             f"{name}_thigh_link",
-            (0.0, aside_m, 0.0),
+            (0.0, left * THIGH_ASIDE_M, 0.0),
             axis=1,
             range_rad=thigh_rad,
             torque_nm=_TORQUES_NM[f"{name}_thigh"],
@@ -125,7 +132,6 @@ def _leg(name: str, ahead: float, left: float) -> tuple[list[Link], list[Joint]]
         ),
         Joint(f"{name}_ankle", f"{name}_calf_link", f"{name}_foot", (0.0, 0.0, -SEGMENT_M)),
     ]
-    return links, joints
 
 
 def _model() -> Model:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import io
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -41,7 +41,7 @@ class Demonstration:
 
     state, goal, command (n, 2), waypoints (n, K, 2), driven (n,), disturbed (n,): as in
         `cosim.core.packed_demos`.
-    told (n,): the instruction, "" for other goals.
+    instruction (n,): the instruction, "" for other goals.
     glimpses (n, 6, 8, 3) uint8: thumbnails of the drawn pictures, to check the decoded ones.
     colours (3, 256) int64: histograms of red, green and blue.
     clip: the bytes of an .mp4 with n pictures.
@@ -59,7 +59,7 @@ class Demonstration:
     waypoints: NDArray[np.float32]
     driven: NDArray[np.int32]
     disturbed: NDArray[np.bool_]
-    told: NDArray[np.str_]
+    instruction: NDArray[np.str_] = field(metadata={"key": "told"})
     glimpses: NDArray[np.uint8]
     colours: NDArray[np.int64]
     clip: NDArray[np.uint8]
@@ -91,7 +91,7 @@ class Demonstration:
         """Return the .npz; equal demonstrations have equal bytes."""
         file = io.BytesIO()
         np.savez(
-            file, allow_pickle=False, **{one.name: getattr(self, one.name) for one in fields(self)}
+            file, allow_pickle=False, **{_key(one): getattr(self, one.name) for one in fields(self)}
         )
         return file.getvalue()
 
@@ -99,13 +99,19 @@ class Demonstration:
     def decoded(cls, data: bytes, where: object) -> Demonstration:
         """Decode a demonstration. where: the file that an error names. Raises RunError."""
         try:
-            names = [one.name for one in fields(cls)]
-            held = read_open_npz(io.BytesIO(data), names)
-            return cls(**{name: held[name] for name in names})
+            keys = {one.name: _key(one) for one in fields(cls)}
+            held = read_open_npz(io.BytesIO(data), list(keys.values()))
+            return cls(**{name: held[key] for name, key in keys.items()})
         except ValueError as error:
             raise RunError(
                 f"{where}: no demonstration: {error}: collect it again, in another --out"
             ) from error
+
+
+def _key(one: Field[Any]) -> str:
+    """Return the key of a field in the .npz."""
+    key: str = one.metadata.get("key", one.name)
+    return key
 
 
 def glimpse(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -48,7 +48,7 @@ _EXPLORED_MPS: Final = (0.0, 1.0)
 
 
 class Demonstrator(PolicyCaller):
-    """Driver of an expert that records a demonstration.
+    """Policy that drives with an expert and records a demonstration.
 
     goal: goal protocol of the run; see `EpisodeOptions`.
     learner: drives at times (`load_learner`; Ross et al., DAgger, 2011). It is queried at every
@@ -267,7 +267,7 @@ class _Rows:
             waypoints=waypoints,
             driven=driven,
             disturbed=disturbed,
-            told=np.array(self._instructions),
+            instruction=np.array(self._instructions),
             glimpses=np.stack(self._glimpses),
             colours=self._colours,
             clip=np.frombuffer(self._clip.finished(), np.uint8),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 
@@ -18,7 +18,7 @@ from cosim.results.record import Record
 from cosim.results.run_setup import RunSetup
 from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.scenario import Scenario
-from scenarios.episodes.counterfactual import CounterfactualTracker
+from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.wiring import StagedScenario
 from scenarios.ipc.command_log import CommandLog
@@ -67,15 +67,14 @@ def run_episode(
     Raises RendererLost if the shared renderer has ended, MachineError if the machine lacks
     something.
     """
-    driver = PolicyCaller.of(policy)
+    caller = PolicyCaller.of(policy)
     tracker = CounterfactualTracker()
-    comparison_error = ""
     all_watches = [*watches, tracker.watch] if options.counterfactual else watches
     if setup is None:
-        setup = RunSetup.of(options, policy_source=driver.source_hash, policy_runs=driver.runs)
+        setup = RunSetup.of(options, policy_source=caller.source_hash, policy_runs=caller.runs)
     episode = Episode(
         scenario,
-        driver.manifest,
+        caller.manifest,
         options,
         watches=all_watches,
         waiting=waiting,
@@ -86,11 +85,11 @@ def run_episode(
     )
     try:
         with episode:
-            drive(episode, driver, ends_early)
+            drive(episode, caller, ends_early)
             if not episode.over:
                 return Outcome(episode.driven(), None, ended_early=True)
             record, log = episode.result()
-            record = msgspec.structs.replace(record, clock=record.clock | driver.clock)
+            record = msgspec.structs.replace(record, clock=record.clock | caller.clock)
             entrances = episode.entrances
     except (RendererLost, MachineError):
         raise
@@ -100,19 +99,27 @@ def run_episode(
         record = msgspec.structs.replace(record, status=status, reason=error_message(error))
         return Outcome(record, None, traceback.format_exc(), again)
     finally:
-        driver.ended()
-    if options.counterfactual:
-        try:
-            measures = (
-                record.measures | tracker.compared(episode.scenario, entrances, comparing).measures
-            )
-            record = msgspec.structs.replace(record, measures=measures)
-        except Exception as error:  # noqa: BLE001  the episode itself is valid
-            comparison_error = traceback.format_exc()
-            record = msgspec.structs.replace(
-                record, reason=f"the street without the robot: {error_message(error)}"
-            )
-    return Outcome(record, log, comparison_error)
+        caller.ended()
+    if not options.counterfactual:
+        return Outcome(record, log)
+    return _compared(
+        Outcome(record, log), lambda: tracker.compared(episode.scenario, entrances, comparing)
+    )
+
+
+def _compared(outcome: Outcome, compare: Callable[[], DelayComparison]) -> Outcome:
+    """Add the comparison with the street without the robot to an outcome.
+
+    An error of the comparison becomes the record's reason: the episode itself is valid.
+    """
+    record = outcome.record
+    try:
+        measures = record.measures | compare().measures
+        return replace(outcome, record=msgspec.structs.replace(record, measures=measures))
+    except Exception as error:  # noqa: BLE001  the episode itself is valid
+        reason = f"the street without the robot: {error_message(error)}"
+        record = msgspec.structs.replace(record, reason=reason)
+        return replace(outcome, record=record, traceback=traceback.format_exc())
 
 
 def drive(

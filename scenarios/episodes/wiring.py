@@ -110,22 +110,15 @@ def staged(
     if faults := list(event_faults(scenario, kinds)):
         raise SpecError(f"scenario '{scenario.id}': {join_faults(faults)}")
     _, street_map = place(scenario.place)
-    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
-    walkable = street_map.walkable_near(around)
+    walkable = street_map.walkable_near(_around(scenario))
     with ExitStack() as stack:
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
         gait = user_gait(options.gait, robot, SUBSTEP_S) if options.gait else None
         motors = None if gait is None else gait_drive(robot, gait)
+        grip = scenario.conditions.grip
         world = stack.enter_context(
-            BulletWorld(
-                street,
-                scenario.barriers,
-                robot,
-                scenario.obstacles,
-                motors,
-                scenario.conditions.grip,
-            )
+            BulletWorld(street, scenario.barriers, robot, scenario.obstacles, motors, grip)
         )
         crowd = crowd_of(scenario)
         stack.enter_context(crowd)
@@ -153,17 +146,7 @@ def staged(
         injected, directed = _with_people(
             director, scenario, options, street_map, street, clock, lambda: crowd.street.people
         )
-
-        @cache
-        def free() -> Polygon | MultiPolygon:
-            """Compute the free ground, only for policies that get it: placing all props is slow."""
-            props = street.standing(around)
-            return _free_ground(walkable, scenario, props, robot)
-
-        @cache
-        def waits_m() -> tuple[float, ...]:
-            return waits_before(street_map, scenario.route_line, scenario.crossings, robot)
-
+        privileged = _privileged_source(scenario, robot, street, street_map, walkable)
         yield StagedScenario(
             engines=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
@@ -173,19 +156,40 @@ def staged(
             scorer=Scorer(
                 scenario, kinds, street_map, WalkableArea(walkable), robot, world.occluded, clock
             ),
-            observer=Observer(
-                scenario,
-                manifest,
-                seed,
-                lambda now: privileged_state(scenario, free(), waits_m(), now),
-                cameras,
-                look,
-                rays,
-            ),
+            observer=Observer(scenario, manifest, seed, privileged, cameras, look, rays),
             eyes=eyes,
             injected=injected,
             entrances=crowd.entrances,
         )
+
+
+def _around(scenario: Scenario) -> Polygon:
+    """Return the ground within CORRIDOR_M of the route."""
+    around: Polygon = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
+    return around
+
+
+def _privileged_source(
+    scenario: Scenario,
+    robot: Robot,
+    street: PlaceSurface,
+    street_map: StreetMap,
+    walkable: Polygon | MultiPolygon,
+) -> Callable[[Moment], Privileged]:
+    """Return the function that gives privileged state.
+
+    What never changes is computed at the first call, because placing all props is slow.
+    """
+
+    @cache
+    def free() -> Polygon | MultiPolygon:
+        return _free_ground(walkable, scenario, street.standing(_around(scenario)), robot)
+
+    @cache
+    def waits_m() -> tuple[float, ...]:
+        return waits_before(street_map, scenario.route_line, scenario.crossings, robot)
+
+    return lambda now: privileged_state(scenario, free(), waits_m(), now)
 
 
 def _policy_camera(

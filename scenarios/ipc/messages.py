@@ -86,7 +86,7 @@ class Unable(msgspec.Struct, frozen=True, tag=True):
     blames_policy: bool
 
 
-class Progress(msgspec.Struct, frozen=True, tag=True):
+class EpisodeProgress(msgspec.Struct, frozen=True, tag="Progress"):
     """Reports the progress of an episode.
 
     compared: share of the street that is simulated without the robot, 0 to 1; None before the
@@ -140,7 +140,7 @@ class Done(msgspec.Struct, frozen=True, tag=True):
     demonstration: bytes = b""
 
 
-Message = Ready | Unable | Progress | Waits | FrameDrawn | LostRenderer | Done | Repeated
+Message = Ready | Unable | EpisodeProgress | Waits | FrameDrawn | LostRenderer | Done | Repeated
 MessageHandler = Callable[[Message], None]
 
 encode_message = msgspec.msgpack.Encoder().encode

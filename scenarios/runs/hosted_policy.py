@@ -136,13 +136,13 @@ class HostedPolicy:
         wanted = EpisodeReply if isinstance(request, ResetRequest) else ActReply
         step = reply.step if isinstance(reply, ActReply) else -1
         if not isinstance(reply, wanted) or reply.signature != self._sign or step != self._step:
-            said = f"answered step {step} of '{reply.episode}' when it was asked step {self._step}"
+            said = f"answered step {step} of '{reply.episode}' instead of step {self._step}"
             raise PolicyFault(said + ", in another attempt" * (step == self._step))
         return reply
 
 
-class HostedDriver(PolicyCaller):
-    """Driver of a policy in another process, with the same checks of its answers.
+class HostedCaller(PolicyCaller):
+    """Caller of a policy in another process, with the same checks of its answers.
 
     A lost server or renderer, or a machine that lacks something, is not the policy's fault.
     """

@@ -34,7 +34,7 @@ from bridge.policy_server import (
 )
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.framing import MessageSocket
-from cosim.episode.manifest_checks import with_goal
+from cosim.episode.manifest_checks import check_unprivileged, with_goal
 from cosim.episode.policy_caller import LOAD_TIMEOUT_S, NoTimer, Timer
 from cosim.policies.load import checked_manifest, load_policy
 from cosim.spec.manifest import Manifest
@@ -45,7 +45,7 @@ from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.process_state import ProcessState, end_at_once
 from scenarios.ipc.sandbox import KINDS, Sandbox
 from scenarios.ipc.shared_memory import SharedMemory, observation_bytes
-from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
+from scenarios.runs.hosted_policy import HostedCaller, HostedPolicy
 from scenarios.runs.policy_view import name_in_sandbox, sandbox_for
 
 _ENTRY_POINT: Final = "scenarios.runs.isolated_policy:serve_without_sandbox"
@@ -125,13 +125,13 @@ class _NoSandbox(Exception):
     """The kernel does not offer a kind of sandbox, and why."""
 
 
-def isolated_driver(
+def isolated_caller(
     name: str,
     timer: Timer | None = None,
     expected: Manifest | None = None,
     host: PolicyHost = PolicyHost(isolated="auto"),  # noqa: B008  a frozen value
     start_s: float = LOAD_TIMEOUT_S,
-) -> HostedDriver:
+) -> HostedCaller:
     """Load a policy in a process of its own.
 
     expected: its manifest in the run, by which shared memory is sized; None if it is not queried.
@@ -144,7 +144,7 @@ def isolated_driver(
     why = []
     for kind in kinds:
         try:
-            return _driver(name, timer, expected, host, cast(Isolation, kind), start_s)
+            return _start_isolated(name, timer, expected, host, cast(Isolation, kind), start_s)
         except _NoSandbox as lacking:
             why.append(f"{kind}: {lacking}")
     raise MachineError(
@@ -156,29 +156,29 @@ def isolated_driver(
 def sandbox_lacks(kind: Isolation) -> str:
     """Return the step of a sandbox's set-up that fails on this machine, and why; "" if none."""
     try:
-        _driver("straight", None, None, PolicyHost(), kind, LOAD_TIMEOUT_S).close()
+        _start_isolated("straight", None, None, PolicyHost(), kind, LOAD_TIMEOUT_S).close()
     except _NoSandbox as lacking:
         return str(lacking)
     return ""
 
 
-def kind_of(runs: PolicyProcess) -> Isolation | None:
+def isolation_of(runs: PolicyProcess) -> Isolation | None:
     """Return the kind of sandbox of a recorded place; None for other places.
 
-    >>> kind_of("isolated: landlock")
+    >>> isolation_of("isolated: landlock")
     'landlock'
     """
     return next((kind for kind, words in _RUNS.items() if words == runs), None)
 
 
-def _driver(
+def _start_isolated(
     name: str,
     timer: Timer | None,
     expected: Manifest | None,
     host: PolicyHost,
     kind: Isolation,
     start_s: float,
-) -> HostedDriver:
+) -> HostedCaller:
     """Load a policy with one kind of sandbox. Raises _NoSandbox, UsageError."""
     sandbox = None if kind == "weak" else sandbox_for(name, kind, host)
     with ExitStack() as stack, policy_call("loading", timer=timer, passes=(BaseException,)):
@@ -191,14 +191,10 @@ def _driver(
         if isinstance(info, Refusal):
             raise _NoSandbox(info.words) if info.why == "sandbox" else UsageError(info.words)
         manifest = with_goal(checked_manifest(name, info.manifest), None)
-        if manifest.privileged:
-            raise UsageError(
-                f"policy '{manifest.name}' needs privileged state, and an "
-                "isolated one sees only observations: leave --isolated out"
-            )
+        check_unprivileged(manifest.name, manifest, "an isolated one", "leave --isolated out")
         stack.pop_all()
     policy = HostedPolicy(manifest, process, host.run)
-    return HostedDriver(policy, _RUNS[kind], info.source[:64], timer)
+    return HostedCaller(policy, _RUNS[kind], info.source[:64], timer)
 
 
 def serve_without_sandbox(
@@ -227,12 +223,12 @@ def _serve(socket_descriptor: int, memory_descriptor: int, *, in_sandbox: bool) 
     os.close(memory_descriptor)
     name = wire.receive().decode()
     try:
-        driver = load_policy(name, NoTimer())
+        caller = load_policy(name, NoTimer())
     except UsageError as error:
         wire.send(encode_message(_with_remedy(Refusal("policy", str(error)), in_sandbox)))
         return
-    desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
-    info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
+    desk = PolicyDesk(caller.policy, decoder=ObservationDecoder, batch=False)
+    info = PolicyInfo("", name, msgspec.to_builtins(caller.manifest), caller.source_hash)
     wire.send(encode_message(info))
     initial_state = ProcessState.now()
     with suppress(EOFError):

@@ -23,7 +23,7 @@ from cosim.spec.connection import Connection
 from cosim.spec.scenario import CityMap
 from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.faults import AttemptFailure
-from scenarios.ipc.messages import Done, FrameDrawn, Hello, Message, Progress, Waits
+from scenarios.ipc.messages import Done, EpisodeProgress, FrameDrawn, Hello, Message, Waits
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
 from scenarios.runs.protocol import (
     MAX_DRIVEN_BYTES,
@@ -116,7 +116,7 @@ class JobClient:
         self._lease: Assignment | None = None
         self._reporting = False
         self._report_at_s = 0.0
-        self._said: list[Progress | Waits | FrameDrawn] = []
+        self._said: list[EpisodeProgress | Waits | FrameDrawn] = []
         self._said_sent = 0
         self._done: Done | None = None
         self._failure: AttemptFailure | None = None
@@ -266,11 +266,11 @@ class JobClient:
         if isinstance(message, Done):
             self._done = message
             self._report_at_s = 0.0
-        elif isinstance(message, Progress | Waits | FrameDrawn):
-            if isinstance(message, Progress):
+        elif isinstance(message, EpisodeProgress | Waits | FrameDrawn):
+            if isinstance(message, EpisodeProgress):
                 unsent = self._said[self._said_sent :]
                 self._said[self._said_sent :] = [
-                    one for one in unsent if not isinstance(one, Progress)
+                    one for one in unsent if not isinstance(one, EpisodeProgress)
                 ]
             self._said.append(message)
             if isinstance(message, FrameDrawn):

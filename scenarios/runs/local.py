@@ -53,8 +53,8 @@ class InProcess:
     An episode that hangs or dies ends the run, and no timeout of an answer is enforced.
     """
 
-    def __init__(self, driver: PolicyCaller) -> None:
-        self._driver = driver
+    def __init__(self, caller: PolicyCaller) -> None:
+        self._caller = caller
 
     def room(self, busy: int) -> int:
         return 1 - busy
@@ -63,7 +63,7 @@ class InProcess:
         return ()
 
     def start(self, hello: Hello) -> _ThisProcess:
-        return _ThisProcess(self._driver)
+        return _ThisProcess(self._caller)
 
     def wait(self, timeout_s: float) -> None:
         """Do nothing: the next poll runs the next job."""
@@ -75,8 +75,8 @@ class _ThisProcess:
     log = "this process's own output"
     ended = False
 
-    def __init__(self, driver: PolicyCaller) -> None:
-        self._driver = driver
+    def __init__(self, caller: PolicyCaller) -> None:
+        self._caller = caller
         self._job: Job | None = None
 
     def give(self, job: Job) -> None:
@@ -86,7 +86,7 @@ class _ThisProcess:
         job = self._job
         self._job = None
         if job is not None:
-            done, _ = run_job(job, self._driver, handle)
+            done, _ = run_job(job, self._caller, handle)
             handle(done)
 
     def cancel(self) -> None:

@@ -22,7 +22,7 @@ from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite
-from cosim.spec.selection import pairs_of
+from cosim.spec.selection import scenario_pairs
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from physics.dynamics.drives import gait_hash
@@ -30,7 +30,7 @@ from physics.robots import robot_hash
 from physics.robots.check import check_robot
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello
-from scenarios.runs.policy_host import inspected_driver, settled_host
+from scenarios.runs.policy_host import inspected_caller, settled_host
 from scenarios.runs.shared_renderer import check_shared
 from scenarios.runs.transport import LockedRun
 
@@ -42,7 +42,7 @@ class PlannedRun(NamedTuple):
     selected: the scenarios selected from the suite, with the robot of the run.
     shard: the part of them that is run here, None for all.
     policy: name of the policy.
-    driver: the policy as loaded in this process.
+    caller: the policy as loaded in this process.
     options: of each episode, with the seed of the run and the camera of this machine.
     host: where episodes query the policy.
     patience: timeouts of the policy.
@@ -53,7 +53,7 @@ class PlannedRun(NamedTuple):
     selected: Sequence[Scenario]
     shard: Shard | None
     policy: str
-    driver: PolicyCaller
+    caller: PolicyCaller
     options: EpisodeOptions
     host: PolicyHost
     patience: Patience
@@ -63,14 +63,14 @@ class PlannedRun(NamedTuple):
         """Return the scenarios that are run here."""
         if self.shard is None:
             return self.selected
-        return [one for pair in self.shard.select(pairs_of(self.selected)) for one in pair]
+        return [one for pair in self.shard.select(scenario_pairs(self.selected)) for one in pair]
 
     @property
     def spec(self) -> RunSpec:
         """Return the identity of the run. Raises UsageError."""
         shared = self.config.shared_renderer
         return run_spec(
-            self.suite, self.selected, self.policy, self.driver, self.options, shared, self.shard
+            self.suite, self.selected, self.policy, self.caller, self.options, shared, self.shard
         )
 
 
@@ -96,26 +96,26 @@ def planned_run(
         if policy is None
         else f"{type(policy).__module__}:{type(policy).__qualname__}"
     )
-    part = Shard.parse(config.shard, len(pairs_of(selected))) if config.shard else None
+    part = Shard.parse(config.shard, len(scenario_pairs(selected))) if config.shard else None
     if part is not None and options.seed is None and resumed is None:
         raise UsageError(
             "--shard needs --seed: shards are of one run, which has one seed: give the same to each"
         )
     patience = Patience(config.answer_timeout, config.start_timeout)
     jobs = 1 if config.on else config.jobs or 1
-    driver = (
-        inspected_driver(name, host, jobs, patience.start_s)
+    caller = (
+        inspected_caller(name, host, jobs, patience.start_s)
         if policy is None
         else PolicyCaller.of(policy)
     )
-    host = settled_host(host, driver)
-    camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
+    host = settled_host(host, caller)
+    camera = chosen_camera(options.camera) if caller.manifest.camera is not None else "bullet"
     seed = seed_of_run(options.seed, resumed)
     options = msgspec.structs.replace(options, seed=seed, camera=camera)
     check_real_time(options, jobs, config.shared_renderer)
     if config.shared_renderer:
-        check_shared(driver, camera)
-    return PlannedRun(config, suite, selected, part, name, driver, options, host, patience)
+        check_shared(caller, camera)
+    return PlannedRun(config, suite, selected, part, name, caller, options, host, patience)
 
 
 def check_folder(plan: PlannedRun, folder: Path) -> None:
@@ -132,8 +132,8 @@ def locked_run(plan: PlannedRun, folder: Path) -> Iterator[LockedRun]:
     run_folder = _run_folder(plan, folder)
     hello = Hello(
         plan.policy,
-        plan.driver.manifest,
-        plan.driver.source_hash,
+        plan.caller.manifest,
+        plan.caller.source_hash,
         host=msgspec.structs.replace(plan.host, hidden=(str(folder.absolute()),)),
         patience=plan.patience,
     )
@@ -154,7 +154,7 @@ def run_spec(
     suite: Suite,
     scenarios: Sequence[Scenario],
     policy: str,
-    driver: PolicyCaller,
+    caller: PolicyCaller,
     options: EpisodeOptions,
     shared: bool = False,
     shard: Shard | None = None,
@@ -170,7 +170,7 @@ def run_spec(
     if the policy does not support the goal, or if the gait does not fit the robot. Raises SpecError
     if a robot's row or URDF is invalid.
     """
-    manifest = with_goal(driver.manifest, options.goal)
+    manifest = with_goal(caller.manifest, options.goal)
     robots = [robot_called(name) for name in sorted({one.robot for one in scenarios})]
     if manifest.camera is not None:
         for robot in robots:
@@ -181,8 +181,8 @@ def run_spec(
     setup = RunSetup.of(
         options,
         suite_hash=suite.content_hash,
-        policy_source=driver.source_hash,
-        policy_runs=driver.runs,
+        policy_source=caller.source_hash,
+        policy_runs=caller.runs,
         gait_hash=gaits[0] if gaits else "",
     )
     if manifest.camera is not None:

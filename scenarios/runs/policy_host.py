@@ -1,4 +1,4 @@
-"""Drivers of a run's policy: in this process, in an isolated one, behind Zenoh, as a ROS 2 node, or
+"""Callers of a run's policy: in this process, in an isolated one, behind Zenoh, as a ROS 2 node, or
 in the shared renderer."""
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from cosim.spec.ros2 import ROS2_SCHEME
 from cosim.spec.run_config import RunConfig
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_link import RendererLink, link_to
-from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
-from scenarios.runs.isolated_policy import isolated_driver, kind_of
+from scenarios.runs.hosted_policy import HostedCaller, HostedPolicy
+from scenarios.runs.isolated_policy import isolated_caller, isolation_of
 
 
-def policy_driver(
+def policy_caller(
     name: str,
     host: PolicyHost,
     timer: Timer | None = None,
@@ -37,27 +37,27 @@ def policy_driver(
     start_s: timeout of loading in seconds, used without a timer.
     Raises UsageError.
 
-    >>> policy_driver("route", PolicyHost()).manifest.name
+    >>> policy_caller("route", PolicyHost()).manifest.name
     'route'
     """
     name = importable_name(name)
     if name.startswith(REMOTE_SCHEME):
         # Imported only where needed: it loads Zenoh and OpenCV.
-        from scenarios.runs.remote_policy import remote_driver
+        from scenarios.runs.remote_policy import remote_caller
 
         if host.isolated != "no":
             raise UsageError(f"policy '{name}' is elsewhere anyway: leave --isolated out")
-        return remote_driver(name, host, timer)
+        return remote_caller(name, host, timer)
     if name.startswith(ROS2_SCHEME):
-        from scenarios.runs.ros2_policy import ros2_driver
+        from scenarios.runs.ros2_policy import ros2_caller
 
         if host.isolated != "no":
             raise UsageError(f"policy '{name}' is elsewhere anyway: leave --isolated out")
-        return ros2_driver(name, host, timer)
+        return ros2_caller(name, host, timer)
     if host.servers:
         raise UsageError(f"--policy-at goes with --policy {REMOTE_SCHEME}NAME, not with '{name}'")
     if host.isolated != "no":
-        return isolated_driver(name, timer, expected, host, start_s)
+        return isolated_caller(name, timer, expected, host, start_s)
     return load_policy(name, timer, start_s)
 
 
@@ -74,28 +74,28 @@ def host_of(config: RunConfig, servers: tuple[Connection, ...] = ()) -> PolicyHo
     )
 
 
-def settled_host(host: PolicyHost, driver: PolicyCaller) -> PolicyHost:
+def settled_host(host: PolicyHost, caller: PolicyCaller) -> PolicyHost:
     """Return a host with the kind of sandbox that a policy has, which every process of its run then
     uses."""
-    kind = kind_of(driver.runs)
+    kind = isolation_of(caller.runs)
     return host if kind is None else msgspec.structs.replace(host, isolated=kind)
 
 
-def inspected_driver(
+def inspected_caller(
     name: str, host: PolicyHost, jobs: int = 1, start_s: float = LOAD_TIMEOUT_S
 ) -> PolicyCaller:
     """Load a policy to inspect it before a run; connections and processes of its own are closed.
 
     Raises UsageError if its servers answer for fewer episodes at a time than there are jobs.
     """
-    driver = policy_driver(name, host, start_s=start_s)
-    driver.close()
-    if 0 < driver.at_once < jobs:
+    caller = policy_caller(name, host, start_s=start_s)
+    caller.close()
+    if 0 < caller.at_once < jobs:
         raise UsageError(
-            f"policy '{name}' answers for {driver.at_once} episodes at a time, and there are "
+            f"policy '{name}' answers for {caller.at_once} episodes at a time, and there are "
             f"{jobs} jobs: serve its class in place of an object, more servers, or take fewer jobs"
         )
-    return driver
+    return caller
 
 
 class _RendererCarrier:
@@ -132,9 +132,9 @@ class _RendererCarrier:
         return self._link
 
 
-def shared_driver(
+def shared_caller(
     manifest: Manifest, source_hash: str, renderer: RendererAddress, run: str
-) -> HostedDriver:
-    """Return the driver of a policy in the shared renderer, where the run enforces its timeouts."""
+) -> HostedCaller:
+    """Return the caller of a policy in the shared renderer, where the run enforces its timeouts."""
     policy = HostedPolicy(manifest, _RendererCarrier(renderer.address), run)
-    return HostedDriver(policy, "in-process", source_hash)
+    return HostedCaller(policy, "in-process", source_hash)

@@ -21,7 +21,7 @@ from cosim.core.versions import versions
 from cosim.results.run_setup import METRIC_SCHEMA
 from cosim.results.run_spec import RUN_FILE, RunSpec
 from scenarios.ipc.faults import Fault
-from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Progress, Waits
+from scenarios.ipc.messages import Done, EpisodeProgress, FrameDrawn, Hello, Job, Waits
 
 PROTOCOL: Final = 3
 """Version of these messages, raised with every change."""
@@ -97,7 +97,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     slot: _Slot
     lease: _Count
     scenario: _Words
-    said: tuple[Progress | Waits | FrameDrawn, ...] = ()
+    said: tuple[EpisodeProgress | Waits | FrameDrawn, ...] = ()
     done: Done | None = None
     digest: str = ""
     fault: Fault | None = None

@@ -33,7 +33,7 @@ from bridge.policy_server import (
 )
 from bridge.session import Session, open_session
 from cosim.core.errors import EngineError, MachineError, PolicyServerLost, UsageError
-from cosim.episode.manifest_checks import with_goal
+from cosim.episode.manifest_checks import check_unprivileged, with_goal
 from cosim.episode.policy_caller import Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.manifest import Manifest
@@ -41,7 +41,7 @@ from cosim.spec.options import PolicyHost, PolicyProcess
 from scenarios.ipc.deadlines import ServerTimes
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.shared_memory import observation_bytes
-from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy, PolicyServerBusy
+from scenarios.runs.hosted_policy import HostedCaller, HostedPolicy, PolicyServerBusy
 
 DOMAIN: Final = "default"
 """Domain in the keys of policy servers."""
@@ -186,8 +186,8 @@ class PolicyServers:
             time.sleep(self.times.pause_s)
 
 
-class RemoteDriver(HostedDriver):
-    """Driver of a policy behind Zenoh."""
+class RemoteCaller(HostedCaller):
+    """Caller of a policy behind Zenoh."""
 
     def __init__(
         self,
@@ -213,12 +213,12 @@ class RemoteDriver(HostedDriver):
             time.sleep(self._servers.times.pause_s)
 
 
-def remote_driver(
+def remote_caller(
     name: str,
     host: PolicyHost,
     timer: Timer | None = None,
     times: ServerTimes = ServerTimes(),  # noqa: B008  a frozen value
-) -> RemoteDriver:
+) -> RemoteCaller:
     """Connect to the servers of policy `zenoh:NAME`. Raises UsageError if it cannot be queried over
     a network, MachineError if no server replies."""
     called = name.partition(":")[2]
@@ -240,13 +240,13 @@ def remote_driver(
             or hashlib.blake2b(f"{manifest.name}\0{manifest.version}".encode()).hexdigest()[:16]
         )
         runs: PolicyProcess = "remote, jpeg" if info.jpeg else "remote"
-        driver = RemoteDriver(
+        caller = RemoteCaller(
             HostedPolicy(manifest, servers, host.run), servers, runs, source, timer
         )
-        driver.at_once = (
+        caller.at_once = (
             0 if any(not one.at_once for one in infos) else sum(one.at_once for one in infos)
         )
-        return driver
+        return caller
     except BaseException:
         servers.close()
         raise
@@ -254,10 +254,7 @@ def remote_driver(
 
 def _check(name: str, manifest: Manifest) -> None:
     """Check that a policy can be queried over a network. Raises UsageError."""
-    if manifest.privileged:
-        raise UsageError(
-            f"policy '{name}' needs privileged state, and a remote one sees only observations"
-        )
+    check_unprivileged(name, manifest, "a remote one")
     if (size := observation_bytes(manifest)) > LARGEST_MESSAGE_BYTES:
         raise UsageError(
             f"policy '{name}' asks for {size / 2**20:.0f} MiB of pictures a step, and a message "

@@ -122,7 +122,7 @@ class Ros2Policy:
         self.took_ms = []
         self._report_repeated()
         self._await_controller(node)
-        self._present = self._drivers(node)
+        self._present = self._command_publishers(node)
         for topic, sent in self._stream.begun():
             self._publish(node, topic, sent)
         time.sleep(SETTLE_S)
@@ -230,7 +230,7 @@ class Ros2Policy:
     def _refuse_gone(self, node: Ros2Node) -> None:
         """Raise PolicyFault if no node has published /cmd_vel for a while."""
         now_s = time.monotonic()
-        if there := self._drivers(node):
+        if there := self._command_publishers(node):
             self._absent_s = None
             self._refuse_replaced(there)
         elif self._absent_s is None:
@@ -278,7 +278,7 @@ class Ros2Policy:
             self._refuse_another(node, [got])
             if self._controller is None and got.sender:
                 self._controller = _Controller(got.sender, got.by)
-                there = self._drivers(node)
+                there = self._command_publishers(node)
                 self._present = {gid: end for gid, end in there.items() if gid == got.sender}
         return found.command
 
@@ -370,7 +370,7 @@ class Ros2Policy:
         def ready() -> bool:
             now_s = time.monotonic()
             several = len(node.publishers_of(CMD_VEL)) > 1
-            if not self._drivers(node) or (several and not self._attached):
+            if not self._command_publishers(node) or (several and not self._attached):
                 return False
             if now_s - began_s > SETTLED_S:
                 return True
@@ -387,12 +387,12 @@ class Ros2Policy:
                 raise PolicyFault(f"is missing after {allowed_s:.0f} s: {why}")
             self._hint(node, waited_s, "a node")
             node.wait_for_tokens(_LOOK_S)
-        if len(there := list(self._drivers(node).values())) > 1:
+        if len(there := list(self._command_publishers(node).values())) > 1:
             words = f"there are {two_publishers(there[0], there[1])}"
             self._remark(Fault(CMD_VEL, "publishers", words))
             self.on_reason(words)
 
-    def _drivers(self, node: Ros2Node) -> dict[bytes, Endpoint]:
+    def _command_publishers(self, node: Ros2Node) -> dict[bytes, Endpoint]:
         """Return the publishers of /cmd_vel with a type that is read, by gid."""
         there = node.publishers_of(CMD_VEL)
         distro = self.settings.distro
@@ -432,8 +432,8 @@ def _report(words: str) -> None:
     log_event("ros2 message refused", WARNING, why=words)
 
 
-class Ros2Driver(PolicyCaller):
-    """Driver of a policy that is a ROS 2 node."""
+class Ros2Caller(PolicyCaller):
+    """Caller of a policy that is a ROS 2 node."""
 
     _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError, EngineError, MachineError)
 
@@ -459,8 +459,8 @@ class Ros2Driver(PolicyCaller):
         return observation  # the messages are copies
 
 
-def ros2_driver(name: str, host: PolicyHost, timer: Timer | None = None) -> Ros2Driver:
-    """Return the driver of policy `ros2:` or `ros2:NAME`, which joins the network in an episode.
+def ros2_caller(name: str, host: PolicyHost, timer: Timer | None = None) -> Ros2Caller:
+    """Return the caller of policy `ros2:` or `ros2:NAME`, which joins the network in an episode.
 
     Raises UsageError for invalid settings, MachineError without the extra [ros2].
     """
@@ -474,7 +474,7 @@ def ros2_driver(name: str, host: PolicyHost, timer: Timer | None = None) -> Ros2
     called = name.removeprefix(ROS2_SCHEME) or "ros2"
     policy = Ros2Policy(called, host.ros2)
     checked_manifest(name, _builtins(policy))
-    return Ros2Driver(policy, timer)
+    return Ros2Caller(policy, timer)
 
 
 def _builtins(policy: Ros2Policy) -> Any:

@@ -315,7 +315,7 @@ def _default_folder(plan: PlannedRun, stack: ExitStack, *, temporary: bool) -> P
         return Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     shard = "" if plan.shard is None else f"-{plan.shard.number}-of-{plan.shard.of}"
-    return Path("runs") / f"{plan.suite.name}-{plan.driver.manifest.name}-{stamp}{shard}"
+    return Path("runs") / f"{plan.suite.name}-{plan.caller.manifest.name}-{stamp}{shard}"
 
 
 def _checking_jobs(config: RunConfig, workers: WorkerConnection | None) -> int:
@@ -352,7 +352,7 @@ def _measured(plan: PlannedRun, reporter: Reporter) -> float:
         f"Latency {latency_ms:g} ms for every command of this run: in {first.id} an answer took "
         f"{milliseconds(answer_ms)} (median), and commands take effect at whole ticks of 50 ms."
     )
-    if latency_ms > (period_ms := 1000.0 / plan.driver.manifest.rate_hz):
+    if latency_ms > (period_ms := 1000.0 / plan.caller.manifest.rate_hz):
         reporter.say(
             f"That is longer than its period of {period_ms:g} ms, at which it is still queried. "
             "With --real-time it is not queried again before it has answered."
@@ -406,7 +406,7 @@ def _workers(plan: PlannedRun, objects: RunObjects | None, reporter: Reporter) -
 
         return ray_workers(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
     if objects is not None and objects.policy is not None:
-        return nullcontext(partial(_in_this_process, plan.driver))
+        return nullcontext(partial(_in_this_process, plan.caller))
     return nullcontext(partial(_local_processes, plan.config.jobs or 1))
 
 
@@ -417,9 +417,9 @@ def _local_processes(
 
 
 def _in_this_process(
-    driver: PolicyCaller, run: LockedRun, handle: MessageHandler
+    caller: PolicyCaller, run: LockedRun, handle: MessageHandler
 ) -> AbstractContextManager[tuple[InProcess, MessageHandler]]:
-    return nullcontext((InProcess(driver), handle))
+    return nullcontext((InProcess(caller), handle))
 
 
 @contextmanager
@@ -482,7 +482,7 @@ def _run_todo(
             renderer = SharedRenderer(
                 logs,
                 run.hello,
-                asks=plan.driver.batches,
+                asks=plan.caller.batches,
                 appearance=plan.options.appearance,
             )
             stack.enter_context(renderer)

@@ -158,10 +158,10 @@ class SharedRenderer:
         self._start()
 
 
-def check_shared(driver: PolicyCaller, camera: CameraName) -> None:
+def check_shared(caller: PolicyCaller, camera: CameraName) -> None:
     """Check that a run can have a shared renderer. camera: of the run. Raises UsageError."""
-    manifest = driver.manifest
-    if manifest.camera is None and not driver.batches:
+    manifest = caller.manifest
+    if manifest.camera is None and not caller.batches:
         raise UsageError(
             f"policy '{manifest.name}' has no camera and no method 'act_batch': leave "
             "--shared-renderer out, there is nothing to share"

@@ -18,7 +18,7 @@ from cosim.core.files import write_atomic
 from cosim.core.log_event import log_event
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.messages import Done, Message, MessageHandler, Progress, Waits
+from scenarios.ipc.messages import Done, EpisodeProgress, Message, MessageHandler, Waits
 from scenarios.runs.protocol import Report
 
 STATUS_FILE: Final = "status.json"
@@ -56,10 +56,10 @@ class RunningEpisode(msgspec.Struct, kw_only=True):
         """Note a message about the episode, whose route has this length."""
         self.moved_at_s = time.time()
         self.waits = message.reason if isinstance(message, Waits) else ""
-        if isinstance(message, Progress) and message.compared is not None:
+        if isinstance(message, EpisodeProgress) and message.compared is not None:
             self.share = 1.0
             self.waits = f"is compared, {message.compared:.0%}"
-        elif isinstance(message, Progress):
+        elif isinstance(message, EpisodeProgress):
             self.time_s = message.time_s
             self.share = min(max(message.route_s_m / length_m, 0.0), 1.0)
 

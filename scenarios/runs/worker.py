@@ -32,17 +32,18 @@ from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.spec.options import RendererAddress
+from cosim.spec.scenario import Scenario
 from scenarios.ipc.command_log import CommandLog, commands_of
 from scenarios.ipc.deadlines import PendingCallMemory
 from scenarios.ipc.messages import (
     Done,
+    EpisodeProgress,
     FrameDrawn,
     Hello,
     Job,
     LostRenderer,
     Message,
     MessageHandler,
-    Progress,
     Ready,
     Repeated,
     Unable,
@@ -53,10 +54,12 @@ from scenarios.ipc.messages import (
 )
 from scenarios.ipc.process_state import ProcessState, end_at_once
 from scenarios.ipc.render_link import link_to
-from scenarios.runs.policy_host import policy_driver, shared_driver
+from scenarios.runs.policy_host import policy_caller, shared_caller
 
 if TYPE_CHECKING:
+    from scenarios.episodes.demonstrator import Demonstrator
     from scenarios.episodes.episode import Watch
+    from scenarios.episodes.run_episode import Outcome
 
 REPORT_EVERY_TICKS = 20
 """Ticks between two progress messages."""
@@ -78,26 +81,26 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
         with _load_errors_sent(send):
             send(repeat_job(hello, commands, send))
     home = _working_folder()
-    drivers: WorkerDrivers | None = load_drivers(hello, timer, send)
+    callers: WorkerCallers | None = load_callers(hello, timer, send)
     initial_state = ProcessState.now()
     send(Ready())
     while True:
         try:
             job = decode_job(wire.receive())
         except EOFError:
-            if drivers is not None:
-                drivers.close()  # an open session would keep this process alive
+            if callers is not None:
+                callers.close()  # an open session would keep this process alive
             return
         with suppress(OSError):  # the policy may have deleted it
             os.chdir(home)
         try:
-            drivers = drivers or load_drivers(hello, timer, ignore_message, again=True)
+            callers = callers or load_callers(hello, timer, ignore_message, again=True)
         except (UsageError, MachineError):
             break  # a new process says whether the policy can be loaded there, and runs the job
-        done, failed = _run(job, drivers, send, hello, commands)
-        if failed or drivers.has_exited:
-            drivers.close()
-            drivers = None  # loaded again for the next job
+        done, failed = _run(job, callers, send, hello, commands)
+        if failed or callers.has_exited:
+            callers.close()
+            callers = None  # loaded again for the next job
         send(done)
         engine_failed = failed and isinstance(done, Done) and done.status == "invalid"
         if engine_failed or ProcessState.now() != initial_state:
@@ -106,12 +109,12 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
 
 
 def _run(
-    job: Job, drivers: WorkerDrivers, send: MessageHandler, hello: Hello, commands: CommandLog
+    job: Job, callers: WorkerCallers, send: MessageHandler, hello: Hello, commands: CommandLog
 ) -> tuple[Done | LostRenderer, bool]:
     """Run one episode as `run_job`. What the machine lacks, the policy may have taken away: this is
     an engine error, and a replay without the policy finds out."""
     try:
-        return run_job(job, drivers.policy, send, drivers.learner, hello.renderer, commands)
+        return run_job(job, callers.policy, send, callers.learner, hello.renderer, commands)
     except MachineError as lack:
         print(f"--- {job.scenario.id}\n{lack}", file=sys.stderr, flush=True)
         setup = job.setup or RunSetup.of(job.options)
@@ -181,8 +184,8 @@ def _tick_logger(commands: CommandLog) -> Watch:
 
 
 @dataclass(frozen=True)
-class WorkerDrivers:
-    """The drivers of a worker: of the run's policy, and of the learner of a collection."""
+class WorkerCallers:
+    """The callers of a worker: of the run's policy, and of the learner of a collection."""
 
     policy: PolicyCaller
     learner: PolicyCaller | None
@@ -197,20 +200,20 @@ class WorkerDrivers:
             self.learner.close()
 
 
-def load_drivers(
+def load_callers(
     hello: Hello, timer: PendingCallMemory, send: MessageHandler, *, again: bool = False
-) -> WorkerDrivers:
-    """Load the drivers of a worker, with the checks of `load_run_policy`."""
+) -> WorkerCallers:
+    """Load the callers of a worker, with the checks of `load_run_policy`."""
     if hello.renderer is not None and hello.renderer.asks:
-        driver: PolicyCaller = shared_driver(
+        caller: PolicyCaller = shared_caller(
             hello.manifest, hello.source_hash, hello.renderer, hello.host.run
         )
     else:
-        driver = load_run_policy(hello, timer, send, again=again)
+        caller = load_run_policy(hello, timer, send, again=again)
     if (learner := hello.learner) is None:
-        return WorkerDrivers(driver, None)
+        return WorkerCallers(caller, None)
     with _load_errors_sent(send):
-        return WorkerDrivers(driver, _checked(load_policy(learner.policy, timer), learner, again))
+        return WorkerCallers(caller, _checked(load_policy(learner.policy, timer), learner, again))
 
 
 def load_run_policy(
@@ -223,8 +226,8 @@ def load_run_policy(
         its class.
     """
     with _load_errors_sent(send):
-        driver = policy_driver(hello.policy, hello.host, timer, hello.manifest)
-        return _checked(driver, hello, again)
+        caller = policy_caller(hello.policy, hello.host, timer, hello.manifest)
+        return _checked(caller, hello, again)
 
 
 @contextmanager
@@ -237,27 +240,27 @@ def _load_errors_sent(send: MessageHandler) -> Iterator[None]:
         raise
 
 
-def _checked(driver: PolicyCaller, expected: Hello, again: bool) -> PolicyCaller:
-    """Return a driver if it equals that of the run. Raises UsageError."""
-    if driver.source_hash != expected.source_hash:
+def _checked(caller: PolicyCaller, expected: Hello, again: bool) -> PolicyCaller:
+    """Return a caller if it equals that of the run. Raises UsageError."""
+    if caller.source_hash != expected.source_hash:
         raise UsageError(
             f"policy '{expected.policy}' was edited during the run: begin another run. Or it is a "
             "network on another kind of processor than the run's, whose answers differ in the last "
             "bit"
         )
     if again:
-        driver.manifest = expected.manifest
-    if driver.manifest != expected.manifest:
+        caller.manifest = expected.manifest
+    if caller.manifest != expected.manifest:
         raise UsageError(
             f"policy '{expected.policy}' has another manifest in each process: "
-            f"{driver.manifest} in this one, {expected.manifest} in the first"
+            f"{caller.manifest} in this one, {expected.manifest} in the first"
         )
-    return driver
+    return caller
 
 
 def run_job(
     job: Job,
-    driver: PolicyCaller,
+    caller: PolicyCaller,
     send: MessageHandler,
     learner: PolicyCaller | None = None,
     renderer: RendererAddress | None = None,
@@ -282,8 +285,8 @@ def run_job(
     if (collecting := job.options.collecting) is not None:
         from scenarios.episodes.demonstrator import Demonstrator
 
-        expert = Demonstrator(driver, collecting, job.options.goal, learner)
-    driver.on_reason(lambda reason: send(Waits(name, reason)))
+        expert = Demonstrator(caller, collecting, job.options.goal, learner)
+    caller.on_reason(lambda reason: send(Waits(name, reason)))
     watcher = _Watcher(job, send)
     watches: list[Watch] = [watcher.watch]
     if commands is not None:
@@ -294,7 +297,7 @@ def run_job(
             link_to(renderer.address, lambda: send(Waits(name, "waits for the shared renderer")))
         outcome = run_episode(
             job.scenario,
-            expert or driver,
+            expert or caller,
             job.options,
             setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
             renderer=renderer,
@@ -309,16 +312,17 @@ def run_job(
         return LostRenderer(name, lost.number, lost.asked), False
     if outcome.traceback:
         print(f"--- {name}\n{outcome.traceback}", file=sys.stderr, flush=True)
+    return _done(job.scenario, outcome, expert), bool(outcome.traceback)
+
+
+def _done(scenario: Scenario, outcome: Outcome, expert: Demonstrator | None) -> Done:
+    """Return the message with the result of an episode."""
+    record = outcome.record
     log = b"" if outcome.log is None else outcome.log.encoded()
     demonstration = (
-        b""
-        if expert is None
-        else expert.encoded_demonstration(job.scenario, outcome.record, outcome.log)
+        b"" if expert is None else expert.encoded_demonstration(scenario, record, outcome.log)
     )
-    done = Done(
-        name, outcome.record.status, outcome.record.encoded(), log, outcome.again, demonstration
-    )
-    return done, bool(outcome.traceback)
+    return Done(scenario.id, record.status, record.encoded(), log, outcome.again, demonstration)
 
 
 class _Watcher:
@@ -328,13 +332,13 @@ class _Watcher:
         self._every_s = job.options.frames_every_s
         self._send = send
         self._next_frame_s = 0.0
-        self._progress = Progress(job.scenario.id, 0.0, 0.0, 0)
+        self._progress = EpisodeProgress(job.scenario.id, 0.0, 0.0, 0)
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         time_s = Clock().time_s(step.tick)
         name = self._progress.scenario
         failures = self._progress.failures + len(verdict.failures)
-        self._progress = Progress(name, time_s, step.route_s_after_m, failures)
+        self._progress = EpisodeProgress(name, time_s, step.route_s_after_m, failures)
         if step.frame is not None and self._every_s and time_s >= self._next_frame_s:
             import cv2
 

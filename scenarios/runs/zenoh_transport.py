@@ -312,9 +312,9 @@ class ZenohWorkers:
         def answer(outcome: ResultOutcome) -> None:
             if outcome == "conflict":
                 self.registry.conflict(
-                    f"{report.scenario} by {report.worker} came out otherwise than what is "
-                    f"kept: the same scenario "
-                    "must give the same result on every machine; the first one stays"
+                    f"{report.scenario} by {report.worker} differs from the stored "
+                    f"result: the same scenario "
+                    "must give the same result on every machine; the first one is used"
                 )
             else:
                 self.registry.note(

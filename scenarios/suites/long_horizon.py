@@ -262,7 +262,7 @@ def fenced_route(
         raise SpecError("length of the line does not fit")
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
-        raise SpecError("the way lies on a road: cars drive through who walks there")
+        raise SpecError("the way lies on a road: cars drive through pedestrians there")
     if on_car_paths_m(street_map, route, crossings, robot) > TURNED_OVER_M:
         raise SpecError("cars turn over the way")
     return route, crossings, fences(street_map, route, way, robot.width_m / 2 + WAY_SPARE_M)

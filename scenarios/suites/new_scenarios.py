@@ -36,7 +36,7 @@ _ROUTE_M: Final = (80.0, 200.0)
 _MAX_SEED: Final = 2**31 - 1
 
 
-class Fresh(msgspec.Struct, frozen=True, kw_only=True):
+class NewScenarios(msgspec.Struct, frozen=True, kw_only=True):
     """Endless sequence of scenarios.
 
     kind: suite that they resemble.
@@ -54,8 +54,8 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
     def drawn(
         self, first: int, count: int, jobs: int = 1, progress: Progress = ignore
     ) -> list[Scenario]:
-        """Draw `count` scenarios from number `first` on, without those that have no room in their
-        city.
+        """Draw `count` scenarios from number `first` on; those without room in their city are left
+        out.
 
         They are drawn city by city, by `jobs` processes; the result does not depend on `jobs`.
         Raises MachineError if a process is killed.
@@ -100,7 +100,7 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
         return repeated(slot, candidate(replace(slot, structure=next(iter(EVENT_KINDS))), again))
 
 
-def fresh_cities(words: str) -> tuple[int, ...]:
+def new_cities(words: str) -> tuple[int, ...]:
     """Return the seeds of a range such as "900:940", 900 to 939.
 
     Raises UsageError for cities that a suite uses.
@@ -115,18 +115,18 @@ def fresh_cities(words: str) -> tuple[int, ...]:
         named = f"{used[0]}" if len(used) == 1 else f"{used[0]} to {used[-1]}"
         raise UsageError(
             f"--cities {words}: the suites use {named}, and a policy that has learnt there has "
-            "seen where it is measured: take others, such as 900:940"
+            "seen where it is measured: choose others, such as 900:940"
         )
     return tuple(range(first, end))
 
 
-def fresh(
+def new_scenarios(
     kind: str,
     seeds: tuple[int, ...],
     structures: Sequence[str] = (),
     size_m: float = 2000.0,
     decoys: bool = False,
-) -> Fresh:
+) -> NewScenarios:
     """Return new scenarios like those of a suite.
 
     structures: only these.
@@ -145,4 +145,4 @@ def fresh(
         picked = tuple(
             one for name in picked for one in (name, name + DECOY)[: 1 + (name in EVENT_KINDS)]
         )
-    return Fresh(kind=kind, structures=picked, seeds=seeds, size_m=size_m)
+    return NewScenarios(kind=kind, structures=picked, seeds=seeds, size_m=size_m)

@@ -195,7 +195,7 @@ def prove_gap(scenario: Scenario, street_map: StreetMap, to_spare_m: float = TO_
         what = "its obstacles leave" if scenario.obstacles else "there is"
         raise SpecError(
             f"scenario '{scenario.id}': {what} no gap of {room.gap_m:.2f} m between start and "
-            "goal: move or remove what stands in the narrowest place"
+            "goal: move or remove obstacles in the narrowest place"
         )
 
 

@@ -330,7 +330,7 @@ def _placed(
             for rival in placed.get((i + a, j + b), ())
         ]
         if any(np.hypot(*(xy - other)) < radius + reach + _GAP_M for other, reach in rivals):
-            counts["left out where another one stands"] += 1
+            counts["left out where another one is"] += 1
             continue
         if at is not spot:
             counts["moved aside by up to 3 m, off the road or the middle of a sidewalk"] += 1

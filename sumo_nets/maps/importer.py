@@ -302,7 +302,7 @@ def _left_hand(found: OsmFacts, options: Options, changes: list[str]) -> bool:
     lon, lat = found.centre
     country = left_hand_country(lon, lat)
     if options.lefthand is not None:
-        changes.append(f"traffic on the {'left' if options.lefthand else 'right'}, as asked")
+        changes.append(f"traffic on the {'left' if options.lefthand else 'right'}, as requested")
         return options.lefthand
     if country is None:
         changes.append(

@@ -85,7 +85,7 @@ def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
             f"{source}: cropping to --bbox {bbox} (in {unit}) failed{covers}: {error}"
         ) from error
     work.changes.append(
-        f"cropped to {bbox}; whole streets are kept, and only the largest connected part"
+        f"cropped to {bbox}; whole streets are included, and only the largest connected part"
     )
     return net
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
@@ -152,32 +152,50 @@ def _parse(path: Path, data: bytes) -> _Raw:
     return raw
 
 
-def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
-    walk: dict[str, tuple[_Edge, Attributes, int]] = {}
-    areas: dict[str, Attributes] = {}
-    driven: list[tuple[_Edge, Attributes, Literal["road", "verge"]]] = []
+@dataclass(frozen=True)
+class _Ground:
+    """Lanes and areas of a net.
+
+    walk: walked lane of each strip, by its edge, with its index
+    areas: walking areas
+    driven: all other lanes, with their kind
+    """
+
+    walk: dict[str, tuple[_Edge, Attributes, int]]
+    areas: dict[str, Attributes]
+    driven: list[tuple[_Edge, Attributes, Literal["road", "verge"]]]
+
+
+def _ground(raw: _Raw) -> _Ground:
+    """Sort the lanes of a net by their use."""
+    found = _Ground({}, {}, [])
     for edge in raw.edges:
         function = edge.attributes.get("function", "")
         if function == "walkingarea" and edge.lanes:
-            areas[edge.attributes["id"]] = edge.lanes[0]
+            found.areas[edge.attributes["id"]] = edge.lanes[0]
             continue
         if function == "crossing" and edge.lanes:
-            walk[edge.attributes["id"]] = (edge, edge.lanes[0], 0)
+            found.walk[edge.attributes["id"]] = (edge, edge.lanes[0], 0)
             continue
         footway = -1 if function == "internal" else _footway(edge)
         for i, lane in enumerate(edge.lanes):
             if i == footway:
-                walk[edge.attributes["id"]] = (edge, lane, i)
+                found.walk[edge.attributes["id"]] = (edge, lane, i)
             elif (function != "internal" or not _only_walked(lane)) and not _is_track(lane):
-                driven.append((edge, lane, "verge" if _is_verge(lane) else "road"))
-    left_hand = raw.net.get("lefthand") in ("true", "1")
+                found.driven.append((edge, lane, "verge" if _is_verge(lane) else "road"))
+    return found
+
+
+def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
+    ground = _ground(raw)
+    walk, driven = ground.walk, ground.driven
     lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
     lines = polylines([lane["shape"] for lane in lanes], [lane["id"] for lane in lanes])
     widths = np.array([_width_m(lane) for lane in lanes])
     # Foreign nets write -1 for the default width.
     widths[widths <= 0.0] = LANE_M
     polygons = bands(lines, widths)
-    corners = _corners(areas, raw.links)
+    corners = _corners(ground.areas, raw.links)
     ports, signalised = _ports(raw.links, walk, corners, lines)
     end_corners = [
         (corners.get(ports.get((name, 0), "")), corners.get(ports.get((name, 1), "")))
@@ -188,35 +206,9 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
         polygons[: len(walk)] = close_seams(
             polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], end_corners
         )
-    plans = raw.programs.plans(raw.links, signalised)
-    lengths_m = {
-        name: float(np.hypot(*np.diff(lines[k], axis=0).T).sum())
-        for k, name in enumerate(walk)
-        if name in signalised
-    }
-    short = raw.programs.short_greens(raw.links, lengths_m) - plans.keys()
-    strips: dict[str, Strip] = {}
-    for k, (name, (edge, _, index)) in enumerate(walk.items()):
-        ends = ports.get((name, 0)), ports.get((name, 1))
-        built = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends)
-        strips[name] = (
-            replace(built, signalised=True, plan=plans.get(name), short_green=name in short)
-            if name in signalised
-            else built
-        )
-    roads = {
-        lane["id"]: Lane(
-            id=lane["id"],
-            edge=edge.attributes["id"],
-            kind=kind,
-            line=lines[k],
-            width_m=float(widths[k]),
-            polygon=polygons[k],
-            internal=edge.attributes.get("function", "") == "internal",
-            cars=allows(lane, "passenger"),
-        )
-        for k, (edge, lane, kind) in enumerate(driven, len(walk))
-    }
+    strips = _strips(raw, walk, _Bands(lines, widths, polygons), ports, signalised)
+    first = len(walk)
+    roads = _roads(driven, _Bands(lines[first:], widths[first:], polygons[first:]))
     apart = {edge.attributes["id"] for edge in raw.edges if all(map(_only_walked, edge.lanes))}
     terrain, elevation = terrain_of_net(
         raw.edges, apart, {name: index for name, (_, _, index) in walk.items()}, ports
@@ -244,11 +236,78 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
             [lane.polygon for lane in roads.values() if lane.kind == "road"],
         ),
         net_hash=net_hash,
-        left_hand=left_hand,
+        left_hand=_is_left_hand(raw),
         terrain=terrain,
         elevation=elevation,
         planned=any("street_class" in edge.params for edge in raw.edges),
     )
+
+
+class _Bands(NamedTuple):
+    """Lanes as bands: lines (K, 2) and widths (N,) in metres, and polygons."""
+
+    lines: Sequence[Floats]
+    widths_m: Floats
+    polygons: Sequence[Polygon]
+
+
+def _strips(
+    raw: _Raw,
+    walk: Mapping[str, tuple[_Edge, Attributes, int]],
+    shapes: _Bands,
+    ports: Mapping[tuple[str, int], str],
+    signalised: Collection[str],
+) -> dict[str, Strip]:
+    """Build the strips, with the signals of crossings. shapes: those of `walk` come first."""
+    left_hand = _is_left_hand(raw)
+    plans = raw.programs.plans(raw.links, signalised)
+    lengths_m = {
+        name: float(np.hypot(*np.diff(shapes.lines[k], axis=0).T).sum())
+        for k, name in enumerate(walk)
+        if name in signalised
+    }
+    short = raw.programs.short_greens(raw.links, lengths_m) - plans.keys()
+    strips: dict[str, Strip] = {}
+    for k, (name, (edge, _, index)) in enumerate(walk.items()):
+        ends = ports.get((name, 0)), ports.get((name, 1))
+        built = _strip(
+            edge,
+            index,
+            left_hand,
+            shapes.lines[k],
+            float(shapes.widths_m[k]),
+            shapes.polygons[k],
+            ends,
+        )
+        strips[name] = (
+            replace(built, signalised=True, plan=plans.get(name), short_green=name in short)
+            if name in signalised
+            else built
+        )
+    return strips
+
+
+def _roads(
+    driven: Sequence[tuple[_Edge, Attributes, Literal["road", "verge"]]], shapes: _Bands
+) -> dict[str, Lane]:
+    """Build the lanes that are not walked."""
+    return {
+        lane["id"]: Lane(
+            id=lane["id"],
+            edge=edge.attributes["id"],
+            kind=kind,
+            line=shapes.lines[k],
+            width_m=float(shapes.widths_m[k]),
+            polygon=shapes.polygons[k],
+            internal=edge.attributes.get("function", "") == "internal",
+            cars=allows(lane, "passenger"),
+        )
+        for k, (edge, lane, kind) in enumerate(driven)
+    }
+
+
+def _is_left_hand(raw: _Raw) -> bool:
+    return raw.net.get("lefthand") in ("true", "1")
 
 
 def _width_m(lane: Attributes) -> float:

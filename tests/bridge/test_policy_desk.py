@@ -31,7 +31,7 @@ from cosim.episode.interfaces import Observation
 from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.robot import COURIER
 from scenarios.ipc.observation_codec import ObservationDecoder
-from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
+from scenarios.runs.hosted_policy import HostedCaller, HostedPolicy
 from tests.conftest import without_lines
 
 MANIFEST = Manifest("mine", camera=None, waypoints=WaypointRule(index=1))
@@ -258,8 +258,8 @@ class ToDesk:
         """Nothing to release."""
 
 
-def hosted(policy: Any) -> HostedDriver:
-    return HostedDriver(HostedPolicy(MANIFEST, ToDesk(policy), "r"), "remote", "")
+def hosted(policy: Any) -> HostedCaller:
+    return HostedCaller(HostedPolicy(MANIFEST, ToDesk(policy), "r"), "remote", "")
 
 
 def seen(tick: int, *, reset: bool = False) -> Observation:

@@ -41,8 +41,8 @@ from cosim.spec.odometry import Odometry
 from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
 from scenarios.ipc.deadlines import ServerTimes
-from scenarios.runs.policy_host import inspected_driver
-from scenarios.runs.remote_policy import PolicyServers, RemoteDriver, remote_driver
+from scenarios.runs.policy_host import inspected_caller
+from scenarios.runs.remote_policy import PolicyServers, RemoteCaller, remote_caller
 from tests.conftest import PATIENCE_S, ROOT, Cosim, wait_until
 from tests.support.plain import free_port
 
@@ -168,8 +168,8 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
 @contextmanager
 def driver_at(
     at: Connection, name: str = "counting", run: str = "run1", times: ServerTimes = TIMES
-) -> Iterator[RemoteDriver]:
-    driver = remote_driver(f"zenoh:{name}", PolicyHost(servers=(at,), run=run), times=times)
+) -> Iterator[RemoteCaller]:
+    driver = remote_caller(f"zenoh:{name}", PolicyHost(servers=(at,), run=run), times=times)
     try:
         yield driver
     finally:
@@ -295,7 +295,7 @@ def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Conn
             served(hub, Counting(), "together"),
             pytest.raises(UsageError, match="are of two policies"),
         ):
-            remote_driver("zenoh:together", PolicyHost(servers=(hub,)))
+            remote_caller("zenoh:together", PolicyHost(servers=(hub,)))
 
 
 @pytest.mark.engine
@@ -324,7 +324,7 @@ def test_a_server_that_listens_has_lost_its_episode_as_soon_as_another_listens_t
     with ExitStack() as stack:
         with open_session(there) as first, served(first.inside, Counting(), listen=there.listen):
             run = Connection(role="coordinator", connect=there.listen)
-            driver = remote_driver(
+            driver = remote_caller(
                 "zenoh:counting", PolicyHost(servers=(run,), run="run1"), times=times
             )
             stack.callback(driver.close)
@@ -336,10 +336,10 @@ def test_a_server_that_listens_has_lost_its_episode_as_soon_as_another_listens_t
 
 
 @contextmanager
-def driver_after(hub: Connection) -> Iterator[RemoteDriver]:
+def driver_after(hub: Connection) -> Iterator[RemoteCaller]:
     """A driver that has seen a server, which is gone again."""
     with served(hub, Counting()):
-        driver = remote_driver("zenoh:counting", PolicyHost(servers=(hub,), run="run1"), times=SOON)
+        driver = remote_caller("zenoh:counting", PolicyHost(servers=(hub,), run="run1"), times=SOON)
     try:
         yield driver
     finally:
@@ -352,14 +352,14 @@ def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection)
     an answer."""
     wrong: dict[str, Callable[[ActRequest], bytes]] = {
         "sent what is no answer": lambda one: b"\xc1 no message",
-        "answered step 7 of 'k1' when it was asked step 0": lambda one: answer_to(one, step=7),
-        "answered step 0 of 'k1' when it was asked step 0, in another attempt": lambda one: (
-            answer_to(one, attempt="0")
+        "answered step 7 of 'k1' instead of step 0": lambda one: answer_to(one, step=7),
+        "answered step 0 of 'k1' instead of step 0, in another attempt": lambda one: answer_to(
+            one, attempt="0"
         ),
         "sent what is no answer: Invalid value 'info'": lambda one: encode_message(
             PolicyInfo("s", "wrong", {})
         ),
-        "answered step -1 of 'k1' when it was asked step 0": begin,
+        "answered step -1 of 'k1' instead of step 0": begin,
     }
     for words, answer in wrong.items():
         with liar(hub, answer), driver_at(hub, "wrong") as driver:
@@ -443,24 +443,24 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
     anything is started."""
     at = PolicyHost(servers=(hub,))
     with pytest.raises(MachineError, match="no server of policy 'counting' at unixsock"):
-        remote_driver("zenoh:counting", at, times=ServerTimes(first_found_s=0.2))
+        remote_caller("zenoh:counting", at, times=ServerTimes(first_found_s=0.2))
     with pytest.raises(UsageError, match="needs --policy-at ENDPOINT"):
-        inspected_driver("zenoh:counting", PolicyHost())
+        inspected_caller("zenoh:counting", PolicyHost())
     with pytest.raises(
         UsageError, match="--policy-at goes with --policy zenoh:NAME, not with 'route'"
     ):
-        inspected_driver("route", at)
+        inspected_caller("route", at)
     with (
         served(hub, Counting()),
         pytest.raises(UsageError, match="answers for 1 episodes at a time, and there are 4 jobs"),
     ):
-        inspected_driver("zenoh:counting", at, 4)
+        inspected_caller("zenoh:counting", at, 4)
     knows = Counting.manifest | {"privileged": True}
     with (
         served(hub, Counting(), manifest=knows),
-        pytest.raises(UsageError, match="a remote one sees only observations"),
+        pytest.raises(UsageError, match="a remote one gets only observations"),
     ):
-        inspected_driver("zenoh:counting", at)
+        inspected_caller("zenoh:counting", at)
     wrong = Counting.manifest | {"camera": {"width": 64, "hight": 64}}
     with (
         served(hub, Counting(), manifest=wrong),
@@ -469,13 +469,13 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
             match=r"unknown field of camera 'hight'\. Valid choices: .*Did you mean height",
         ),
     ):
-        inspected_driver("zenoh:counting", at)
+        inspected_caller("zenoh:counting", at)
     large = Counting.manifest | {"camera": {"width": 2000, "height": 2000}}
     with (
         served(hub, Counting(), manifest=large),
         pytest.raises(UsageError, match="MiB of pictures a step"),
     ):
-        inspected_driver("zenoh:counting", at)
+        inspected_caller("zenoh:counting", at)
 
 
 def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:
@@ -527,7 +527,7 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
             servers = PolicyServers("both", PolicyHost(servers=(at,)))
             wait_until(lambda: len(servers.find_policy(PATIENCE_S)) == 2)
             servers.close()
-            driver = remote_driver("zenoh:both", PolicyHost(servers=(at,), run="r"))
+            driver = remote_caller("zenoh:both", PolicyHost(servers=(at,), run="r"))
             driver.reset("k1", 1)
             assert driver.act(seen_at(0)).v_mps == pytest.approx(1.0 + RGB.mean() / 1e4)
             driver.close()
@@ -541,7 +541,7 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
 def test_a_policy_that_knows_everything_is_not_served(cosim: Cosim) -> None:
     """Nor is there an endpoint for a policy of this machine: in a line."""
     said = cosim("serve", "route")
-    assert said.returncode == 2 and "a remote one sees only observations" in said.stderr
+    assert said.returncode == 2 and "a remote one gets only observations" in said.stderr
     said = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
     assert (
         said.returncode == 2

@@ -17,7 +17,7 @@ from cosim.results.delay import Tracks
 from cosim.spec.scenario import City, Scenario
 from physics.people.appearance import family_of
 from physics.people.parts import placed_parts
-from scenarios.tools.bench.crowd import Tally
+from scenarios.tools.bench.crowd import StreetCounter
 from tests.support.tiny_street import tiny_map
 
 
@@ -64,7 +64,7 @@ def test_columns_travel_with_their_people() -> None:
 
 
 def test_who_reads_people_reads_the_columns() -> None:
-    """Bystanders, tally, delays, strides, bodies and the minimap, told of people whose names would
+    """Bystanders, counts, delays, strides, bodies and the minimap, told of people whose names would
     mislead them."""
     people = STREET.people
     assert [b.kind for b in nearby_people(people)] == [
@@ -73,9 +73,9 @@ def test_who_reads_people_reads_the_columns() -> None:
         PersonKind.RESIDENT,
     ]
     street_map = tiny_map()
-    tally = Tally(street_map, 0.05)
-    tally.see(STREET)
-    assert tally.counts["overlaps: with an event pedestrian"] == 0.05
+    counter = StreetCounter(street_map, 0.05)
+    counter.update(STREET)
+    assert counter.counts["overlaps: with an event pedestrian"] == 0.05
     tracks = Tracks()
     tracks.add(people)
     assert set(tracks.began) == set(NAMES)

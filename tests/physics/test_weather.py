@@ -20,7 +20,7 @@ from cosim.spec.weather import CLEAR, SNOW_GRIP, WEATHERS, WET_GRIP
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.cameras.gl.variants import Variant
-from physics.cameras.gl.weather import lit_share, look_of, weathered_sky
+from physics.cameras.gl.weather import lit_share, weather_look, weathered_sky
 from physics.dynamics.bullet import p
 from physics.dynamics.world import BulletWorld
 from physics.street.street_surface import StreetSurface
@@ -138,7 +138,7 @@ def test_clear_days_have_no_weather_in_their_pictures(
 ) -> None:
     """Clear, overcast and foggy days use the programs of days; a clear day has the same bits."""
     for name, look in (
-        (name, look_of(weather, weathered_sky(Light(), weather, 1), 1, True))
+        (name, weather_look(weather, weathered_sky(Light(), weather, 1), 1, True))
         for name, weather in WEATHERS.items()
     ):
         assert (look is None) == (name in (CLEAR, "overcast", "fog")), name

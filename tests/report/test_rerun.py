@@ -29,8 +29,8 @@ from tests.support.blind_policy import BEND, Blind
     "name, episodes, told",
     [
         ("e.mp4", 1, "use a name that ends in .rrd"),
-        ("e.rrd", 0, "and none are asked"),
-        ("e.rrd", 3, "and 3 are asked"),
+        ("e.rrd", 0, "and none are chosen"),
+        ("e.rrd", 3, "and 3 are chosen"),
     ],
     ids=["another ending", "no episode", "several"],
 )

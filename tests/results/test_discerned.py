@@ -18,7 +18,7 @@ from cosim.report.page.plots import plots_of
 from cosim.report.page.runs import read_runs
 from cosim.report.page.three_tables import summary_table, tables_of
 from cosim.results.compare import compare_runs
-from cosim.results.discerned import pairs_of
+from cosim.results.discerned import episode_pairs
 from cosim.results.intervals import wilson
 from cosim.results.merge import merge_runs
 from cosim.results.run_folder import read_records
@@ -74,7 +74,7 @@ def test_a_pair_counts_only_if_both_are_solved(runs: Path) -> None:
         part = whole[whole["structure"] == kind]
         found = summary_of(part, ["discerned"]).loc["discerned"]
         assert (found["mean"], found["n"]) == (mean, 4)
-        assert pairs_of(part).in_words == "4 pairs; left out: 1 with an invalid member"
+        assert episode_pairs(part).in_words == "4 pairs; left out: 1 with an invalid member"
     found = summary_of(whole).loc["discerned"]
     assert (found["mean"], found["low"], found["high"], found["n"]) == (0.5, *wilson(4.0, 8), 8)
     assert summary_of(table(runs / "b")).loc["discerned", ["mean", "n"]].tolist() == [1.0, 10]
@@ -97,7 +97,7 @@ def test_without_the_other_member_there_is_no_pair(runs: Path) -> None:
     alone = summary_of(decoys).loc[["discerned", "success"]]
     assert alone["n"].tolist() == [0, 0] and alone["mean"].isna().all()
     halves = pd.concat([events.iloc[:3], decoys.iloc[2:]])
-    assert pairs_of(halves).in_words == "1 pair; left out: 9 episodes without the other member"
+    assert episode_pairs(halves).in_words == "1 pair; left out: 9 episodes without the other member"
     nothing = pd.concat([events.iloc[:2], decoys.iloc[2:4]])
     assert summary_of(nothing).loc["discerned", "n"] == 0
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -22,7 +23,7 @@ from cosim.results.metrics import METRICS
 from cosim.results.record import Record, ScanLook
 from cosim.results.run_folder import RunFolder, read_records, read_spec, record_difference
 from cosim.results.run_setup import RunSetup
-from cosim.results.run_spec import Shard
+from cosim.results.run_spec import RUN_FILE, Shard, decode_spec
 from cosim.results.table import summary_of, table_of, table_row
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import WaypointRule
@@ -564,3 +565,22 @@ def test_records_differ_if_only_one_has_a_scan() -> None:
     scanned = msgspec.structs.replace(plain, scan=ScanLook(appearance="splats"))
     assert record_difference(plain, scanned).startswith("scan is None, there {'appearance'")
     assert record_difference(scanned, plain).endswith("there None")
+
+
+@pytest.mark.parametrize(
+    ("values", "fault"),
+    [
+        (
+            {"camera": CameraSpec(width=-1)},
+            "camera must have sides of 1 to 4096 pixels, not -1 x 96",
+        ),
+        ({"rate_hz": -1.0}, "rate_hz must be a positive number, not -1.0"),
+    ],
+    ids=["width", "rate"],
+)
+def test_recorded_cameras_and_rates_are_in_range(values: dict[str, Any], fault: str) -> None:
+    """A record or a run file with a camera or a rate out of range is refused with the value."""
+    with pytest.raises(RunError, match=re.escape(fault)):
+        Record.decoded(changed(record("s-0"), **values).encoded(), Path("record.json"))
+    with pytest.raises(msgspec.ValidationError, match=re.escape(fault)):
+        decode_spec(RUN_FILE.encode(changed(SPEC, **values)), Path("run.json"))

@@ -11,9 +11,9 @@ import pytest
 import shapely
 
 from cosim.core.errors import MachineError
-from scenarios.tools.bench.people import (
-    Flow,
-    MeanSd,
+from scenarios.tools.bench.people_data import MeanSd
+from scenarios.tools.bench.people_streets import Flow, walk_round
+from scenarios.tools.bench.people_tracks import (
     encroachments_s,
     free_speeds,
     in_bins,
@@ -22,7 +22,6 @@ from scenarios.tools.bench.people import (
     normal_distance,
     percentile_distance,
     speeds_by_density,
-    walk_round,
 )
 
 

@@ -273,9 +273,9 @@ def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(
 def test_fresh_scenarios_are_drawn_the_same_in_pieces() -> None:
     """Two structures in two small cities: each is drawn under its name and by a light of its own,
     and who draws them in two pieces gets the same."""
-    from scenarios.suites.new_scenarios import Fresh
+    from scenarios.suites.new_scenarios import NewScenarios
 
-    there = Fresh(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
+    there = NewScenarios(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
     drawn = there.drawn(0, 5)
     assert {one.id for one in drawn} <= {
         "straight-1-000",
@@ -374,7 +374,9 @@ def test_a_learner_that_explores_drives_alone_and_its_commands_have_rewards(desk
     )
     outcome = run_episode(way, demonstrator, EpisodeOptions(goal="route_point", seed=0))
     assert outcome.log is not None
-    shown = Demonstration.decoded(demonstrator.kept(way, outcome.record, outcome.log), way.id)
+    shown = Demonstration.decoded(
+        demonstrator.encoded_demonstration(way, outcome.record, outcome.log), way.id
+    )
     assert not shown.disturbed.any() and shown.driven.min() != shown.driven.max()
     np.testing.assert_allclose(shown.command, outcome.log.command[::4], atol=1e-6)
     plain = np.isclose(shown.command, [0.7, 0.1]).all(axis=1)

@@ -22,7 +22,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.episodes.run_episode import run_episode
 from scenarios.episodes.wiring import crowd_of
-from scenarios.ipc.messages import Done, Hello, Message, Progress
+from scenarios.ipc.messages import Done, EpisodeProgress, Hello, Message
 from scenarios.places.nets import place
 from scenarios.runs.local import LocalProcesses
 from scenarios.runs.pool import run_all
@@ -146,7 +146,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
         hello = Hello("orca", manifest, driver.source_hash)
         transport = LocalProcesses(folder.path / "logs")
         run_all(folder, short.scenarios, hello, transport, handle=told.append, options=options)
-    assert [type(message) for message in told] == [Progress] * 10 + [Done]
+    assert [type(message) for message in told] == [EpisodeProgress] * 10 + [Done]
     assert [getattr(message, "compared", None) for message in told[5:-1]] == [
         0.0,
         0.2,

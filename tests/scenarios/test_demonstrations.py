@@ -39,7 +39,7 @@ from scenarios.episodes.demonstration import (
     waypoints_ahead,
 )
 from scenarios.episodes.demonstrator import Demonstrator, _Bursts
-from scenarios.suites.new_scenarios import fresh, fresh_cities
+from scenarios.suites.new_scenarios import new_cities, new_scenarios
 from scenarios.tools.dataset.collect import _Rounds
 from scenarios.tools.dataset.collected import Collected
 from scenarios.tools.dataset.lerobot import Filmed, write_lerobot
@@ -86,7 +86,7 @@ def shown(episode: int, count: int) -> Demonstration:
         waypoints=np.stack([rows, rows + 0.75], axis=1),
         driven=np.full(count, 2, np.int32),
         disturbed=rows[:, 1] == 1,
-        told=np.array([""] * count),
+        instruction=np.array([""] * count),
         glimpses=np.stack([glimpse(one) for one in pictures]),
         colours=np.stack([np.bincount(pictures[..., c].ravel(), minlength=256) for c in range(3)]),
         clip=np.frombuffer(clip.finished(), np.uint8),
@@ -508,7 +508,7 @@ def test_cities_of_the_suites_are_refused(words: str) -> None:
     """Seeds that a suite uses, and what names no seeds, are refused with an example of what may be
     asked for."""
     with pytest.raises(CosimError, match=f"--cities {words}: .*900:940"):
-        fresh_cities(words)
+        new_cities(words)
 
 
 @pytest.mark.parametrize(
@@ -540,22 +540,22 @@ def test_raw_demonstrations_name_the_robot_of_their_scenarios(tmp_path: Path) ->
 
 def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:
     """Structures take turns, then cities, and then all once more; none is of a city of a suite."""
-    there = fresh("reactive", fresh_cities("900:902"), ["gesturing", "static"])
+    there = new_scenarios("reactive", new_cities("900:902"), ["gesturing", "static"])
     assert there.structures == ("gesturing", "static")
     assert not {*there.seeds} & {*SEEDS}
     with pytest.raises(
         CosimError,
         match=r"unknown structure of 'unit' 'gesturing'\. Valid choices: crosswalk, curve",
     ):
-        fresh("unit", (900,), ["gesturing"])
+        new_scenarios("unit", (900,), ["gesturing"])
     with pytest.raises(
         CosimError,
         match=r"unknown suite for --cities 'scans'\. Valid choices: long-horizon, reactive, unit",
     ):
-        fresh("scans", (900,))
-    with_decoys = fresh("reactive", (900,), ["gesturing", "static"], decoys=True)
+        new_scenarios("scans", (900,))
+    with_decoys = new_scenarios("reactive", (900,), ["gesturing", "static"], decoys=True)
     assert with_decoys.structures == ("gesturing", "gesturing-decoy", "static")
-    assert fresh("long-horizon", (900,)).structures == ("route",)
+    assert new_scenarios("long-horizon", (900,)).structures == ("route",)
 
 
 def test_a_damaged_demonstration_is_named(demonstrations: list[Demonstration]) -> None:

@@ -30,7 +30,7 @@ from cosim.spec.scenario import CrowdSpec, Scenario, Suite, write_suite
 from physics.cameras.choice import renderer_of
 from scenarios.ipc.sandbox import KINDS
 from scenarios.runs import run as suite_run
-from scenarios.runs.isolated_policy import isolated_driver
+from scenarios.runs.isolated_policy import isolated_caller
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, ROOT, WIDE, Cosim, Said, without_lines
 from tests.support import hostile
@@ -371,9 +371,9 @@ def test_an_isolated_policy_that_cannot_be_loaded_is_refused(
     }
     for name, words in messages.items():
         with pytest.raises(UsageError, match=words):
-            isolated_driver(name)
+            isolated_caller(name)
     with pytest.raises(UsageError, match=r"it gave no answer for 1 s: --start-timeout gives it"):
-        isolated_driver(f"{hostile.__name__}:Hanging", start_s=1.0)
+        isolated_caller(f"{hostile.__name__}:Hanging", start_s=1.0)
     said = cosim("run", "unit", "--policy", "route", "--isolated", "--episodes", "1", cwd=tmp_path)
     assert said.returncode == 2 and "needs privileged state" in said.stderr
     with pytest.raises(UsageError, match="needs a policy by its name"):

@@ -12,7 +12,7 @@ import pytest
 from cosim.core.errors import MachineError, UsageError
 from cosim.policies.load import load_policy
 from cosim.spec.connection import Connection
-from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Message, Progress, Ready
+from scenarios.ipc.messages import Done, EpisodeProgress, FrameDrawn, Hello, Job, Message, Ready
 from scenarios.runs import job_client, zenoh_worker
 from scenarios.runs.job_client import CoordinatorRequest, JobClient, WorkerIdentity
 from scenarios.runs.protocol import Assignment, Claim, CoordinatorReply, Reply, Report, encode_reply
@@ -76,10 +76,12 @@ def test_a_result_is_sent_until_it_is_acknowledged(tmp_path: Path) -> None:
     is claimed."""
     bench = Bench(tmp_path)
     process = bench.assigned()
-    process.says(Progress("s-0", 1.0, 1.0, 0))
+    process.says(EpisodeProgress("s-0", 1.0, 1.0, 0))
     request, report = bench.report()
     assert (
-        report.said == (Progress("s-0", 1.0, 1.0, 0),) and report.done is None and report.lease == 7
+        report.said == (EpisodeProgress("s-0", 1.0, 1.0, 0),)
+        and report.done is None
+        and report.lease == 7
     )
     bench.answer(request, Reply("renewed"))
     done = Done("s-0", "done", b"record", b"log")

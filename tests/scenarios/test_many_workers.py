@@ -25,7 +25,7 @@ from cosim.results.run_folder import RunFolder, read_records
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import City, CityMap, Scenario, Suite
 from scenarios.ipc.faults import RULES, AttemptFailure
-from scenarios.ipc.messages import Done, Hello, Progress
+from scenarios.ipc.messages import Done, EpisodeProgress, Hello
 from scenarios.runs import status
 from scenarios.runs import zenoh_transport as remote
 from scenarios.runs.net_transfer import MapDownload, RunMaps, is_missing
@@ -80,7 +80,7 @@ ATTEMPTS, LOSSES = (RULES[fault].attempts for fault in ("process_ended", "machin
 GARBAGE = (
     b"",
     b"\xc1" * 100,
-    encode(Progress("s-0", 1.0, 1.0, 0)),
+    encode(EpisodeProgress("s-0", 1.0, 1.0, 0)),
     b"\x91" * 100_000,
     b"\xdd\xff\xff\xff\xff",
 )
@@ -200,7 +200,7 @@ class Hand:
         )
 
     def renew(self) -> CoordinatorReply:
-        return self.report(said=(Progress(self.scenario, 1.0, 4.5, 0),))
+        return self.report(said=(EpisodeProgress(self.scenario, 1.0, 4.5, 0),))
 
     def result(
         self, *, of: str = "", ticks: int = 40, record: Record | None = None

@@ -25,13 +25,13 @@ from scenarios.ipc.command_log import Driven
 from scenarios.ipc.deadlines import Patience, PendingCall, PendingCallMemory
 from scenarios.ipc.messages import (
     Done,
+    EpisodeProgress,
     FrameDrawn,
     Hello,
     Job,
     LostRenderer,
     Message,
     MessageHandler,
-    Progress,
     Ready,
     Repeat,
     Repeated,
@@ -386,7 +386,7 @@ def test_who_ends_its_process_gains_nothing_and_who_loses_it_to_an_engine_nothin
     """Twice lost to a fault of compiled code while nothing was asked of the policy: the simulator
     owes the episode. However else a process ends, its policy may have ended it: that has failed."""
     dies = [
-        Fake(Ready(), Progress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine)
+        Fake(Ready(), EpisodeProgress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine)
         for _ in range(2)
     ]
     (record,) = all_pooled(tmp_path, (SCENARIO,), *dies)
@@ -440,7 +440,13 @@ def test_a_replay_without_the_policy_finds_who_ended_a_process(
         for ticks, end in replays
     ]
     dies = [
-        Fake(Ready(), Progress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine, driven=driven)
+        Fake(
+            Ready(),
+            EpisodeProgress("s-0", 1.0, 1.0, 0),
+            ends=True,
+            in_engine=in_engine,
+            driven=driven,
+        )
         for _ in range(2)
     ]
     found = pooled(tmp_path, *dies, *again)

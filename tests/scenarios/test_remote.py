@@ -27,7 +27,7 @@ from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.runs import run as suite_run
-from scenarios.runs.remote_policy import RemoteDriver, remote_driver
+from scenarios.runs.remote_policy import RemoteCaller, remote_caller
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, ROOT, Cosim, seed_in_order
 from tests.support.documents import blocks
@@ -96,7 +96,7 @@ def running(words: list[str], folder: Path) -> Iterator[None]:
             thread.join(0.1)
 
 
-def seen_at(tick: int, driver: RemoteDriver) -> Observation:
+def seen_at(tick: int, driver: RemoteCaller) -> Observation:
     spec = driver.manifest.camera
     assert spec is not None
     rgb = np.zeros((spec.height, spec.width, 3), np.uint8)
@@ -105,11 +105,11 @@ def seen_at(tick: int, driver: RemoteDriver) -> Observation:
     )
 
 
-def found(name: str, endpoint: str, printed: Path) -> RemoteDriver:
+def found(name: str, endpoint: str, printed: Path) -> RemoteCaller:
     """The driver of a policy, as soon as it is served."""
     for _ in range(int(PATIENCE_S / 10)):
         try:
-            return remote_driver(
+            return remote_caller(
                 name,
                 PolicyHost(servers=(Connection(role="coordinator", connect=endpoint),), run="r"),
             )

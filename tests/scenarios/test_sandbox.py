@@ -22,7 +22,7 @@ from cosim.policies.load import load_policy
 from cosim.spec.options import PolicyHost
 from cosim.spec.run_config import Isolation
 from scenarios.ipc.sandbox import KINDS
-from scenarios.runs.isolated_policy import isolated_driver, sandbox_lacks
+from scenarios.runs.isolated_policy import isolated_caller, sandbox_lacks
 from tests.conftest import ROOT, Cosim
 from tests.support.graphs import bundle, tiny_graph
 
@@ -181,7 +181,7 @@ def test_a_policy_in_a_sandbox_reaches_nothing_outside(
         isolated=kind, data=(str(data),), hidden=(str(desk / "own/runs/now"),), memory_gb=2.0
     )
     mode = (desk / "outside.txt").stat().st_mode
-    driver = isolated_driver("probe:Probe", host=host)
+    driver = isolated_caller("probe:Probe", host=host)
     user = max(users_of_policies())
     victim = subprocess.Popen(["sleep", "600"], user=user if os.getuid() == 0 else None)
     targets = {
@@ -224,9 +224,9 @@ def test_the_error_of_a_missing_file_names_the_remedy(kind: Isolation, desk: Pat
     """The error names `--policy-data`, with which the policy loads."""
     host = PolicyHost(isolated=kind)
     with pytest.raises(UsageError, match=r"outside\.txt.*--policy-data PATH"):
-        isolated_driver("probe:Lost", host=host)
+        isolated_caller("probe:Lost", host=host)
     given = msgspec.structs.replace(host, data=(str(desk / "outside.txt"),))
-    isolated_driver("probe:Lost", host=given).close()
+    isolated_caller("probe:Lost", host=given).close()
 
 
 def test_a_policy_that_fills_its_descriptors_gets_a_new_process(
@@ -234,7 +234,7 @@ def test_a_policy_that_fills_its_descriptors_gets_a_new_process(
 ) -> None:
     """Its process ends after the episode, also where /proc cannot be read."""
     (desk / "own/fills.py").write_text(_FILLS)
-    driver = isolated_driver("fills:Fills", host=PolicyHost(isolated=kind))
+    driver = isolated_caller("fills:Fills", host=PolicyHost(isolated=kind))
     spent = []
     for files in (0, 600):
         driver.reset("e1", files)
@@ -250,7 +250,7 @@ def test_a_bundle_loads_in_a_sandbox(
     """An ONNX bundle, by a relative name: the same graph as outside."""
     monkeypatch.chdir(tmp_path)
     bundle(tmp_path / "net", tiny_graph())
-    driver = isolated_driver("onnx:net", host=PolicyHost(isolated=kind))
+    driver = isolated_caller("onnx:net", host=PolicyHost(isolated=kind))
     driver.close()
     assert driver.source_hash == load_policy("onnx:net").source_hash
 
@@ -261,7 +261,7 @@ def test_a_policy_in_a_shared_folder_is_refused(
     """A home folder would show all that is in it."""
     monkeypatch.setenv("HOME", str(desk / "own"))
     with pytest.raises(UsageError, match="put it in a folder of its own"):
-        isolated_driver("probe:Probe")
+        isolated_caller("probe:Probe")
 
 
 @pytest.mark.parametrize(
@@ -281,11 +281,11 @@ def test_without_namespaces_a_policy_runs_under_landlock_or_not_at_all(
 from cosim.core.errors import MachineError
 from scenarios.ipc.kernel_calls import drop_privileges, filter_calls, prctl
 from scenarios.ipc.seccomp import Rule
-from scenarios.runs.isolated_policy import isolated_driver
+from scenarios.runs.isolated_policy import isolated_caller
 prctl("forbid new privileges", 38, 1)
 filter_calls([Rule(name) for name in {denied}])
 try:
-    print(isolated_driver("straight").runs)
+    print(isolated_caller("straight").runs)
 except MachineError as error:
     print(error)
 """
@@ -323,7 +323,7 @@ os.abort()
         (("--isolated=weak", "--policy-memory", "2"), "--policy-memory goes with --isolated"),
         (("--isolated", "--policy-data", "nowhere"), "--policy-data nowhere: there is no such"),
         (("--isolated=strong",), "'strong' is not one of"),
-        (("--isolated",), "an isolated one sees only observations"),
+        (("--isolated",), "an isolated one gets only observations"),
     ],
     ids=["alone", "weak", "missing", "kind", "privileged"],
 )

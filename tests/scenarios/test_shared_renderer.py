@@ -41,14 +41,14 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CityMap, Light, Scenario, Suite, write_suite
 from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello, Progress
+from scenarios.ipc.messages import EpisodeProgress, Hello
 from scenarios.ipc.observation_codec import encode_constants, encode_observation
 from scenarios.ipc.render_link import RendererLink
 from scenarios.ipc.render_protocol import Draw, Rendered, Request, encode_exchange
 from scenarios.ipc.shared_memory import SharedMemory
 from scenarios.places.nets import place
 from scenarios.runs import run as suite_run
-from scenarios.runs.policy_host import shared_driver
+from scenarios.runs.policy_host import shared_caller
 from scenarios.runs.shared_renderer import RendererEnd, SharedRenderer, check_shared
 from scenarios.tools.bench.cameras import busy_street
 from scenarios.tools.verify.doctor import small_scenario
@@ -253,7 +253,7 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
         assert [
             msgspec.structs.replace(reply, words=without_lines(reply.words)) for reply in replies
         ] == [refused] * 2
-        driver = shared_driver(Knowing.manifest, "", renderer.at, "r")
+        driver = shared_caller(Knowing.manifest, "", renderer.at, "r")
         with pytest.raises(
             PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt.* \(reset\)"
         ):
@@ -354,7 +354,7 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
     killed: list[int] = []
 
     def kill(message: object) -> None:
-        if isinstance(message, Progress) and not killed:
+        if isinstance(message, EpisodeProgress) and not killed:
             killed.append(renderer_pid())
             os.kill(killed[0], signal.SIGKILL)
 

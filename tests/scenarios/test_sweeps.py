@@ -214,7 +214,7 @@ def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, co
     several = cosim(*words[:-1], "others", "--rerun", "both.rrd", cwd=tmp_path)
     assert (
         several.returncode == 2
-        and "and 2 are asked for" in several.stderr
+        and "and 2 are chosen" in several.stderr
         and not (tmp_path / "others").exists()
     )
     refused = cosim("run", "told.toml", cwd=tmp_path)

@@ -12,7 +12,7 @@ from cosim.results.run_folder import RunFolder
 from cosim.results.run_spec import RunSpec, Shard
 from cosim.spec.episode_id import episode_id_of, seed_for
 from cosim.spec.scenario import Suite
-from cosim.spec.selection import pairs_of, select_scenarios, selection_in_words
+from cosim.spec.selection import scenario_pairs, select_scenarios, selection_in_words
 from scenarios.suites.catalog import load_suite
 from tests.run_specs import spec_of
 
@@ -139,7 +139,7 @@ def test_episodes_counts_pairs_wherever_their_decoys_are(reactive: Suite) -> Non
 
 def test_shards_keep_pairs_together(reactive: Suite) -> None:
     """However many they are, each scenario is in one shard, its decoy in the same."""
-    pairs = pairs_of(with_decoys_of(reactive).scenarios)
+    pairs = scenario_pairs(with_decoys_of(reactive).scenarios)
     assert sorted(map(len, pairs)) == [1] * 2 + [2] * 8
     for of in (2, 3, 7):
         parts = [
@@ -159,7 +159,7 @@ def test_shards_keep_pairs_together(reactive: Suite) -> None:
 def test_nothing_that_a_policy_gets_tells_a_decoy(reactive: Suite) -> None:
     """Ids, seeds and order of a pair are drawn independently of each other: over many seeds of a
     run, each of them puts the decoy first in about half of all pairs."""
-    pairs = [pair for pair in pairs_of(with_decoys_of(reactive).scenarios) if len(pair) == 2]
+    pairs = [pair for pair in scenario_pairs(with_decoys_of(reactive).scenarios) if len(pair) == 2]
     told = [[episode_id_of(seed, one) for one in pair] for seed in range(250) for pair in pairs]
     drawn = [
         [[seed_for(purpose, seed, one) for one in pair] for seed in range(250) for pair in pairs]

@@ -1,4 +1,4 @@
-"""What the tally counts, on streets made by hand."""
+"""Counts of behaviour on streets made by hand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import shapely
 
 from cosim.core.state import People, Signal, Street, Vehicles
 from cosim.place.street_map import StreetMap, Strip
-from scenarios.tools.bench.crowd import Tally
+from scenarios.tools.bench.crowd import StreetCounter
 
 LINE = np.array([[0.0, 0.0], [8.0, 0.0]])
 CROSSING = Strip(
@@ -33,25 +33,25 @@ def street(
 def test_overlaps_are_counted_in_pair_seconds_with_their_place() -> None:
     """Of three people two are 0.2 m apart on the crossing for two seconds, and all pairs are in
     contact range."""
-    tally = Tally(MAP, 0.05, [])
+    counter = StreetCounter(MAP, 0.05, [])
     for tick in range(100):
-        tally.see(street(tick, [(4.0, 0.0), (4.0, 0.2 if tick >= 60 else 0.7), (4.0, 1.2)]))
-    assert tally.counts["pairs in contact range"] == pytest.approx(3 * 5.0)
-    assert tally.counts["overlaps"] == pytest.approx(2.0)
-    assert tally.counts["overlaps: on crossings"] == pytest.approx(2.0)
+        counter.update(street(tick, [(4.0, 0.0), (4.0, 0.2 if tick >= 60 else 0.7), (4.0, 1.2)]))
+    assert counter.counts["pairs in contact range"] == pytest.approx(3 * 5.0)
+    assert counter.counts["overlaps"] == pytest.approx(2.0)
+    assert counter.counts["overlaps: on crossings"] == pytest.approx(2.0)
 
 
 def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
     """Who comes a metre far 0.5 s after the change began at green; who comes 3 s after walked at
     red."""
-    tally = Tally(MAP, 0.05, [])
+    counter = StreetCounter(MAP, 0.05, [])
     for tick in range(100):
         walked_m = -1.0 + 0.07 * tick
-        tally.see(street(tick, [(walked_m, 0.0), (walked_m - 2.9, 1.0)], walk=tick < 20))
-    assert tally.counts["persons entered signalised crossings"] == 2
-    assert tally.counts["persons entered within a second of red"] == 1
-    assert tally.counts["persons entered at red"] == 1
-    assert tally.crossings == {":j_c0"}
+        counter.update(street(tick, [(walked_m, 0.0), (walked_m - 2.9, 1.0)], walk=tick < 20))
+    assert counter.counts["persons entered signalised crossings"] == 2
+    assert counter.counts["persons entered within a second of red"] == 1
+    assert counter.counts["persons entered at red"] == 1
+    assert counter.crossings == {":j_c0"}
 
 
 def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
@@ -60,12 +60,12 @@ def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
 
     def counted(xs: list[float], walks: list[bool | None]) -> list[float]:
         """How many entered, entered at red, and entered within a second of red."""
-        tally = Tally(MAP, 0.05, [])
+        counter = StreetCounter(MAP, 0.05, [])
         for tick, (x_m, walk) in enumerate(zip(xs, walks, strict=True)):
             seen = street(tick, [(x_m, 0.0)], walk=bool(walk))
-            tally.see(replace(seen, signals=MappingProxyType({})) if walk is None else seen)
+            counter.update(replace(seen, signals=MappingProxyType({})) if walk is None else seen)
         kinds = "signalised crossings", "at red", "within a second of red"
-        return [tally.counts[f"persons entered {kind}"] for kind in kinds]
+        return [counter.counts[f"persons entered {kind}"] for kind in kinds]
 
     comes = [-4.0 + 0.1 * k for k in range(60)]
     waits = [-4.0] * 100
@@ -91,22 +91,24 @@ def test_who_walks_on_one_crossing_does_not_enter_another_that_overlaps_it() -> 
         (None, None),
         signalised=True,
     )
-    tally = Tally(
+    counter = StreetCounter(
         StreetMap("m", MAP.bounds, {**MAP.strips, ":j_c1": slanting}, {}, {}, {}), 0.05, []
     )
     for tick in range(150):
         seen = street(tick, [(-1.0 + 0.06 * tick, 0.0)])
-        tally.see(replace(seen, signals=MappingProxyType({**seen.signals, ":j_c1": Signal(False)})))
-    assert tally.counts["persons entered signalised crossings"] == 1
-    assert tally.counts["persons entered at red"] == 0
+        counter.update(
+            replace(seen, signals=MappingProxyType({**seen.signals, ":j_c1": Signal(False)}))
+        )
+    assert counter.counts["persons entered signalised crossings"] == 1
+    assert counter.counts["persons entered at red"] == 0
 
 
 def test_people_in_things_and_vehicles_are_seen() -> None:
     """One of two people stands in a bench, the other in a car that moves; both for one second."""
-    tally = Tally(MAP, 0.05, [("bench", shapely.box(1.0, -1.0, 2.0, 1.0))])
+    counter = StreetCounter(MAP, 0.05, [("bench", shapely.box(1.0, -1.0, 2.0, 1.0))])
     car = Vehicles.of(("v0",), [[6.0, 0.0]], [0.0], [3.0], [[4.0, 2.0]])
     for tick in range(20):
-        tally.see(street(tick, [(1.5, 0.0), (6.0, 0.5)], vehicles=car))
-    assert tally.counts["persons"] == pytest.approx(2.0)
-    assert tally.counts["in a bench"] == pytest.approx(1.0)
-    assert tally.counts["in a vehicle that moves"] == pytest.approx(1.0)
+        counter.update(street(tick, [(1.5, 0.0), (6.0, 0.5)], vehicles=car))
+    assert counter.counts["persons"] == pytest.approx(2.0)
+    assert counter.counts["in a bench"] == pytest.approx(1.0)
+    assert counter.counts["in a vehicle that moves"] == pytest.approx(1.0)

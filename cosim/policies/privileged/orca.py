@@ -182,7 +182,7 @@ class Orca:
     def act(self, observation: Observation) -> Command:
         known = observation.privileged
         if known is None:
-            raise ValueError("the orca policy needs privileged observations")
+            raise ValueError("policy orca needs privileged state")
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
         robot = observation.robot

@@ -82,7 +82,7 @@ class Route:
     def act(self, observation: Observation) -> Command:
         known = observation.privileged
         if known is None:
-            raise ValueError("the route policy needs privileged observations")
+            raise ValueError("policy route needs privileged state")
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
 

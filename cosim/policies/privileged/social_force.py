@@ -68,7 +68,7 @@ class SocialForce:
     def act(self, observation: Observation) -> Command:
         known = observation.privileged
         if known is None:
-            raise ValueError("the social_force policy needs privileged observations")
+            raise ValueError("policy social_force needs privileged state")
         robot, state = observation.robot, known.robot
         heading = state.pose.heading_rad
         velocity = state.v_mps * np.array([math.cos(heading), math.sin(heading)])

@@ -457,7 +457,7 @@ def _cause_rates_plot(runs: Sequence[ReportedRun]) -> Plot | None:
         return None
     note = (
         "Failures per 100 m, all metres of episodes that ended. After a failure the robot is put "
-        "back and goes on."
+        "back and continues."
     )
     crash_counts = [
         f"{sum(which)} of {len(which)} of {label}" for label, which in crashed.items() if any(which)

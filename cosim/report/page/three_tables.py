@@ -20,9 +20,9 @@ from cosim.report.page.runs import PAPER_SUITES, PaperTable, ReportedRun
 from cosim.results.discerned import (
     DISCERNED,
     DISCERNED_IN_WORDS,
+    episode_pairs,
     has_decoys,
     is_decoy,
-    pairs_of,
     with_discerned,
 )
 from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
@@ -347,7 +347,7 @@ def _notes(table: pd.DataFrame) -> str:
     notes = [f"{episodes} episode{'s' * (episodes != 1)}"]
     notes += ["oracle"] * (ORACLE in {*table["policy"]})
     notes.append(track_of(table))
-    notes += [pairs_of(table).in_words] * has_decoys(table)
+    notes += [episode_pairs(table).in_words] * has_decoys(table)
     notes += [f"robot {name}" for name in sorted({*table["robot"]} - {COURIER.name})]
     gaits = table[["gait", "gait_hash"]].drop_duplicates().itertuples(index=False)
     notes += [gait_in_words(*gait) for gait in gaits if gait[0]]

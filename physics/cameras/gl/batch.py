@@ -48,7 +48,7 @@ from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.targets import Frame, Target
 from physics.cameras.gl.traffic import Driven, TrafficDrawing
 from physics.cameras.gl.variants import Variant
-from physics.cameras.gl.weather import Look, WeatherBlocks
+from physics.cameras.gl.weather import WeatherBlocks, WeatherLook
 from physics.cameras.view import Shot
 from physics.people.wardrobe import Season
 from physics.street.surface import Surface
@@ -77,7 +77,7 @@ class Stage(NamedTuple):
     cloud: SplatCloud | None = None
     season: Season = "mild"
     rain: bool = False
-    look: Look | None = None
+    look: WeatherLook | None = None
 
     @property
     def variant(self) -> Variant:

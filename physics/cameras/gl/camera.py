@@ -28,7 +28,7 @@ from physics.cameras.gl.readback import SinglePicture
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shadows import ShadowMaps, ShadowSlot, shadow_layers
 from physics.cameras.gl.splat_layers import scan_sky, splat_pictures
-from physics.cameras.gl.weather import Look, exposed, look_of, weathered_sky
+from physics.cameras.gl.weather import WeatherLook, exposed, weather_look, weathered_sky
 from physics.cameras.view import Shot, View
 from physics.dynamics.world import BulletWorld
 from physics.people.wardrobe import season_of
@@ -57,11 +57,11 @@ class GlCamera(WorldCamera):
         scan = world.surface.scan
         self._splats = scan.splats if scan is not None and appearance == "splats" else None
         seed = world.surface.seed
-        self._look: Look | None = None
+        self._look: WeatherLook | None = None
         if scan is None:
             self._sky = weathered_sky(light, weather, seed)
             hour = light.hour if weather.sun_deg is None else None
-            self._look = look_of(weather, self._sky, seed, light.shadows, hour)
+            self._look = weather_look(weather, self._sky, seed, light.shadows, hour)
         else:
             self._sky = scan_sky(light, scan.facts, seed)
         contact = light.shadows and self._look is not None

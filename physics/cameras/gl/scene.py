@@ -45,7 +45,7 @@ from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.tiles import DECALS_M, decal_rows, ground_rows
 from physics.cameras.gl.variants import Variant
 from physics.cameras.gl.walls import wall_rows
-from physics.cameras.gl.weather import Look
+from physics.cameras.gl.weather import WeatherLook
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.dynamics.world import BulletWorld
 from physics.ground.mesh import Detail, Part
@@ -126,7 +126,7 @@ class GlScene:
         world: BulletWorld,
         light: Lighting,
         splats: bool = False,
-        look: Look | None = None,
+        look: WeatherLook | None = None,
         layers: bool = False,
     ) -> None:
         self._look = look

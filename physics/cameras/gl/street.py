@@ -25,7 +25,7 @@ from physics.cameras.gl.surfaces import SurfaceShaders, surfaces
 from physics.cameras.gl.tiles import decal_shaders, tile_shaders
 from physics.cameras.gl.variants import Variant
 from physics.cameras.gl.walls import wall_shaders
-from physics.cameras.gl.weather import Look
+from physics.cameras.gl.weather import WeatherLook
 
 if TYPE_CHECKING:
     from physics.cameras.gl.scene import GlScene
@@ -60,7 +60,7 @@ class Style(NamedTuple):
     splats: bool
 
 
-def style_of(light: Lighting, splats: bool, look: Look | None, layers: bool) -> Style:
+def style_of(light: Lighting, splats: bool, look: WeatherLook | None, layers: bool) -> Style:
     """Return the style of a scene. The arguments are those of `GlScene`."""
     together = Variant.LAYERS if layers else Variant.NONE
     variant = Variant(light.shadows) if look is None else look.variant

@@ -43,7 +43,7 @@ _GLOW_FROM_PER_M: Final = 0.004
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class WeatherLook:
     """Constants of a camera's weather.
 
     variant: of all programs
@@ -89,9 +89,9 @@ def lit_share(hour: float) -> float:
     return float(np.interp(hour % 24.0, hours, shares))
 
 
-def look_of(
+def weather_look(
     weather: Weather, sky: Sky, seed: int, shadows: bool, hour: float | None = None
-) -> Look | None:
+) -> WeatherLook | None:
     """Return what weather and night change in pictures besides the sky; None without a change.
 
     shadows: shadow maps are drawn
@@ -112,7 +112,7 @@ def look_of(
     # Air scatters the light of lamps towards the eye; rain and snow as the fog of their visibility.
     scattering = sky.lamps * min(0.6 * sky.fog_per_m, 0.02)
     clear = 1.0 if weather.cloud_cover is None else 1.0 - weather.cloud_cover
-    return Look(
+    return WeatherLook(
         variant,
         (weather.wetness, weather.puddles, weather.snow, share),
         (rain, min(weather.snow_mm_h / _FULL_SNOW_MM_H, 1.0), drops, bloom),
@@ -141,7 +141,7 @@ class WeatherBlocks:
     def put(
         self,
         place: int,
-        look: Look,
+        look: WeatherLook,
         lamps: Lamps | None,
         people: Floats,
         anchor: Floats,

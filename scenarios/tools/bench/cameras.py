@@ -1,7 +1,7 @@
 """Measures frames per second of the cameras in a busy street: `cosim bench camera`.
 
 Every figure is taken in a process of its own, several rounds in turn; medians are shown. People
-walk from frame to frame, so nothing can be kept from the last one.
+walk from frame to frame, so nothing of the last frame can be reused.
 """
 
 from __future__ import annotations
@@ -39,22 +39,24 @@ _STANDING: Final[tuple[Doing, ...]] = ("stand", "look", "talk", "stop")
 _STRIDE_M: Final = 1.4
 
 
-class Busy(NamedTuple):
-    """A street to draw: where the robot is, and what moves around it, frame by frame."""
+class BusyStreet(NamedTuple):
+    """Street to draw: the robot, and the moving people and vehicles of each frame."""
 
     robot: RobotState
     streets: tuple[Street, ...]
 
 
-def busy_street(street_map: StreetMap, persons: int, frames: int) -> Busy:
+def busy_street(street_map: StreetMap, persons: int, frames: int) -> BusyStreet:
     """Fill the view of a robot that looks along the longest sidewalk with people."""
     longest = max(
         (s for s in street_map.strips.values() if s.kind == "sidewalk"), key=lambda s: s.length_m
     )
-    return busy_at(Pose(*Polyline(longest.line[:, :2]).at(0.3 * longest.length_m)), persons, frames)
+    return busy_street_at(
+        Pose(*Polyline(longest.line[:, :2]).at(0.3 * longest.length_m)), persons, frames
+    )
 
 
-def busy_at(pose: Pose, persons: int, frames: int) -> Busy:
+def busy_street_at(pose: Pose, persons: int, frames: int) -> BusyStreet:
     """Fill the view of a robot at a pose with people, four of five of whom walk, and cars."""
     rng = np.random.default_rng(persons)
     x, y, heading = pose.x_m, pose.y_m, pose.heading_rad
@@ -74,10 +76,10 @@ def busy_at(pose: Pose, persons: int, frames: int) -> Busy:
     def street(k: int) -> Street:
         walked = speed * PERIOD_S * k
         xy = start + walked[:, None] * np.column_stack([np.cos(facing), np.sin(facing)])
-        who = People.of(ids, xy, facing, speed, doing, walked / _STRIDE_M, speed)
-        return Street(k, who, cars(k * PERIOD_S))
+        people = People.of(ids, xy, facing, speed, doing, walked / _STRIDE_M, speed)
+        return Street(k, people, cars(k * PERIOD_S))
 
-    return Busy(RobotState(Pose(x, y, heading)), tuple(map(street, range(frames))))
+    return BusyStreet(RobotState(Pose(x, y, heading)), tuple(map(street, range(frames))))
 
 
 def _cars(x_m: float, y_m: float, heading_rad: float) -> Callable[[float], Vehicles]:
@@ -108,8 +110,10 @@ def camera_city(size_m: float) -> StreetMap:
 
 
 def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) -> float:
-    """Time a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read back;
-    median seconds."""
+    """Time a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read back.
+
+    Returns: median seconds
+    """
     from physics.cameras.choice import camera_of
     from physics.dynamics.world import BulletWorld
     from physics.street.street_surface import StreetSurface
@@ -122,8 +126,10 @@ def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) ->
 
 
 def people_alone(persons: int, frames: int, size_m: float) -> float:
-    """Time a picture of people alone: posed, skinned, drawn, and read back while the next is
-    drawn; median seconds."""
+    """Time a picture of people alone; each is read back while the next is drawn.
+
+    Returns: median seconds
+    """
     from physics.cameras.gl.people_only import PeopleAlone
 
     busy = busy_street(camera_city(size_m), persons, frames)
@@ -138,8 +144,10 @@ def people_alone(persons: int, frames: int, size_m: float) -> float:
 
 
 def together(environments: int, frames: int, size_m: float) -> float:
-    """Time one environment's picture of several that are drawn into one atlas and read back at
-    once; median seconds."""
+    """Time pictures of several environments, drawn into one atlas and read back at once.
+
+    Returns: median seconds of one environment's picture
+    """
     from physics.cameras.gl.atlas import Atlas
     from physics.dynamics.world import BulletWorld
     from physics.street.street_surface import StreetSurface
@@ -160,8 +168,10 @@ def together(environments: int, frames: int, size_m: float) -> float:
 
 
 def median_s(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> float:
-    """Return the median seconds of a picture without the first tenth, in which tiles and bodies
-    are built."""
+    """Return the median seconds of a picture.
+
+    The first tenth, in which tiles and bodies are built, is left out.
+    """
     stamps = [time.perf_counter()]
     for street in streets:
         draw(street)
@@ -182,8 +192,11 @@ def _scanned_together(size_m: float) -> float:
 
 
 class Drawing(NamedTuple):
-    """A row of the table. work(size_m) -> seconds a picture; least_fps: what it should reach,
-    here and on a GPU."""
+    """Row of the table.
+
+    work: function of a city's size that returns the seconds of a picture
+    least_fps: targets without and with a GPU
+    """
 
     name: str
     work: Callable[[float], float]
@@ -264,15 +277,17 @@ RATIOS: Final = (
 
 
 class _Found(NamedTuple):
-    """Result of a figure: frames per second of each round; why: the reason where there are none."""
+    """Frames per second of a figure in each round; why: the reason where there are none."""
 
     fps: list[float]
     why: str = ""
 
 
 def time_cameras(rounds: int, progress: Progress) -> dict[str, _Found]:
-    """Measure every figure `rounds` times, each in a fresh process. A figure that fails is not
-    repeated."""
+    """Measure every figure `rounds` times, each in a fresh process.
+
+    A figure that fails is not repeated.
+    """
     found = {figure.name: _Found([]) for figure in FIGURES}
     for i in range(rounds):
         for figure in FIGURES:

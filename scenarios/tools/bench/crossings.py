@@ -2,7 +2,7 @@
 crossings`.
 
 Every crossing is an episode of its own with the real engines; each city has a process of its own,
-because SUMO can take one down. What such a process had not finished counts as crashed.
+because SUMO can end its process. Episodes that are not finished then count as crashed.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from cosim.spec.scenario import City, Scenario
 from scenarios.episodes.run_episode import Outcome, run_episode
 from scenarios.places.nets import place
 from scenarios.suites.crossings import build_all
-from scenarios.tools.bench.crowd import Tally
+from scenarios.tools.bench.crowd import StreetCounter
 from sumo_nets.crowd.stoplines import StopLines
 
 _SIZE_M = 2000.0
 """Side of the cities, in metres; their seeds count from 1."""
 
 
-class Crossed(msgspec.Struct, frozen=True, kw_only=True):
+class CrossingResult(msgspec.Struct, frozen=True, kw_only=True):
     """Result of driving over one crossing.
 
     ended: end of the episode; "crashed" if it did not reach one.
     waited_s: seconds that the robot waited at red.
     red_entries, vehicles_braked, carriageway_s: of the robot.
     failures: failures, with the kind of body in collisions.
-    counts, at_red: of the surrounding street, see `Tally`.
+    counts, at_red: of the surrounding street, see `StreetCounter`.
     entered: signalised crossings that a pedestrian entered.
     """
 
@@ -67,18 +67,18 @@ class Crossed(msgspec.Struct, frozen=True, kw_only=True):
 
 def cross_all(
     crossings: int, cities: int, policy: str, jobs: int, progress: Progress
-) -> list[Crossed]:
+) -> list[CrossingResult]:
     """Drive over crossings spread over cities, `jobs` cities at a time."""
     if cities > crossings:
         raise SpecError(
             f"{crossings} crossings cannot lie in {cities} cities: ask for fewer cities"
         )
     shares = [crossings // cities + (i < crossings % cities) for i in range(cities)]
-    found: list[Crossed] = []
+    found: list[CrossingResult] = []
 
     def one(seed: int, count: int) -> None:
-        for crossed in cross_city(City(seed=seed, size_m=_SIZE_M), count, policy):
-            found.append(crossed)
+        for result in cross_city(City(seed=seed, size_m=_SIZE_M), count, policy):
+            found.append(result)
             progress(f"driving: {len(found)} of {crossings} crossings")
 
     with ThreadPoolExecutor(jobs) as pool:
@@ -88,10 +88,10 @@ def cross_all(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return sorted(found, key=lambda crossed: (crossed.city, crossed.scenario))
+    return sorted(found, key=lambda result: (result.city, result.scenario))
 
 
-def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
+def cross_city(city: City, count: int, policy: str) -> Iterator[CrossingResult]:
     """Drive over crossings of one city, one after another, in a new process."""
     context = multiprocessing.get_context("spawn")
     names = [""] * count
@@ -107,7 +107,7 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
                 done += 1
     except BrokenProcessPool:
         for name in names[done:]:
-            yield Crossed(
+            yield CrossingResult(
                 scenario=name,
                 city=city.name,
                 crossing="",
@@ -123,32 +123,34 @@ def _drawn(city: City, count: int) -> list[Scenario]:
 
 
 @cache
-def driver_of(policy: str) -> PolicyCaller:
+def caller_of(policy: str) -> PolicyCaller:
     """Load the policy once for all crossings of this process."""
     return load_policy(policy)
 
 
-def cross(scenario: Scenario, policy: str) -> Crossed:
-    """Drive over one crossing and count what happens around it. A policy that raised is loaded
-    again for the next."""
+def cross(scenario: Scenario, policy: str) -> CrossingResult:
+    """Drive over one crossing, and count people and vehicles around it.
+
+    A policy that raised is loaded again for the next crossing.
+    """
     _, street_map = place(scenario.place)
-    tally = Tally(street_map, Clock().tick_s)
+    counter = StreetCounter(street_map, Clock().tick_s)
     lines = StopLines(Clock().tick_s)
 
     def watch(step: Step, verdict: Verdict) -> None:
-        tally.see(step.street_after)
-        tally.drove(lines.passed(step.street_after.vehicles.ids))
+        counter.update(step.street_after)
+        counter.count_vehicles(lines.passed(step.street_after.vehicles.ids))
 
-    outcome = run_episode(scenario, driver_of(policy), watches=[watch])
+    outcome = run_episode(scenario, caller_of(policy), watches=[watch])
     if outcome.traceback:
-        driver_of.cache_clear()
-    return crossing_row(scenario, outcome, tally)
+        caller_of.cache_clear()
+    return crossing_row(scenario, outcome, counter)
 
 
-def crossing_row(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
+def crossing_row(scenario: Scenario, outcome: Outcome, counter: StreetCounter) -> CrossingResult:
     """Return an episode and the counts around it as a row."""
     record, log = outcome.record, outcome.log
-    nothing = Crossed(
+    nothing = CrossingResult(
         scenario=scenario.id,
         city=scenario.place.name,
         crossing=scenario.crossings[0].id,
@@ -167,12 +169,14 @@ def crossing_row(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
         carriageway_s=record.measures["carriageway_time_s"] or 0.0,
         minutes=len(log) * log.tick_s / 60.0,
         failures=tuple(f"{f.kind} {f.other_kind}".strip() for f in record.failures),
-        counts=dict(tally.counts),
-        entered=tuple(sorted(f"{scenario.place.name} {crossing}" for crossing in tally.crossings)),
-        at_red=tuple(tally.at_red),
+        counts=dict(counter.counts),
+        entered=tuple(
+            sorted(f"{scenario.place.name} {crossing}" for crossing in counter.crossings)
+        ),
+        at_red=tuple(counter.at_red),
     )
 
 
-def crossings_entered(rows: Iterable[Crossed]) -> int:
+def crossings_entered(rows: Iterable[CrossingResult]) -> int:
     """Return how many different signalised crossings the crowd entered."""
     return len({crossing for row in rows for crossing in row.entered})

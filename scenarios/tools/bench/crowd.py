@@ -2,9 +2,8 @@
 crowd`.
 
 In each city the `route` policy drives long-horizon routes, one after another, among the crowd and
-the event pedestrians; a body that does at once what it is told stands in for the physics, so that
-hours can be looked at. Everything counted is about what is shown: the people and vehicles of a
-`Street`, after every filter.
+the event pedestrians. A robot that follows commands at once replaces the physics, so that hours
+can be simulated. Counts are of the people and vehicles of a `Street`, after every filter.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ from scenarios.episodes.episode import Episode
 from scenarios.episodes.wiring import StagedScenario
 from scenarios.places.nets import place
 from scenarios.suites.long_horizon import build_long_horizon
-from scenarios.tools.bench.figures import Spent, TimedEngine
+from scenarios.tools.bench.figures import PartTimes, TimedEngine
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.stoplines import StopLineCrossing, StopLines
 
@@ -64,14 +63,13 @@ GROUPS_EVERY_TICKS = 10
 CONTACT_M: Final = 1.5
 """Two people whose centres are nearer than this are in contact range."""
 OVERLAP_M: Final = 0.3
-"""Two people whose centres are nearer than this stand in each other."""
+"""Two people whose centres are nearer than this overlap."""
 ENTERING_S: Final = 3.0
 """Time after a person appears that counts as entering, in seconds."""
 _NARROW_M: Final = 2.5
 """A sidewalk narrower than this counts as narrow."""
 EVERY_TICKS: Final = 5
-"""Ticks between two checks of things, crossings and vehicles; pairs of people are checked at
-every tick."""
+"""Ticks between checks of things, crossings and vehicles; people are checked at every tick."""
 INTO_M: Final = 1.0
 """Metres beyond the end of a crossing's line from which a person has entered it."""
 GRACE_S: Final = 1.0
@@ -82,14 +80,14 @@ APART_M: Final = 2.0
 """A group with a member farther than this from all others is apart, in metres."""
 
 
-class Watched(msgspec.Struct, frozen=True, kw_only=True):
+class CityCounts(msgspec.Struct, frozen=True, kw_only=True):
     """Observations of one city.
 
-    counts: see `Tally`.
+    counts: see `StreetCounter`.
     crossings: signalised crossings that a pedestrian entered.
     crowd_ms: mean CPU milliseconds of a step of the crowd.
     group_gaps_m: for each group, every half second, the largest distance of a member to its
-        nearest fellow.
+        nearest other.
     """
 
     place: str
@@ -101,7 +99,7 @@ class Watched(msgspec.Struct, frozen=True, kw_only=True):
     group_gaps_m: tuple[float, ...] = ()
 
 
-class Glider:
+class InstantRobot:
     """A robot without physics: it follows commands at once."""
 
     def __init__(self, footprint_m: tuple[float, float]) -> None:
@@ -127,8 +125,8 @@ class Glider:
         return Motion(self._robot, write_protected_copy([pose] * substeps))
 
 
-def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
-    """Watch the crowd of a city for a number of simulated minutes."""
+def measure_crowd(city: City, minutes: float, crowd: CrowdSpec) -> CityCounts:
+    """Count the crowd's behaviour in a city for a number of simulated minutes."""
     _, street_map = place(city)
     graph = WalkGraph(street_map)
     clock = Clock.for_rate(Route.manifest.rate_hz)
@@ -145,11 +143,11 @@ def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
             build_long_horizon(city, street_map, graph, seed, f"crowd-{seed}"), crowd=crowd
         )
         seed += 1
-        tally, done, shown, spent_s = _drive(scenario, street_map, wanted - ticks, gaps_m)
-        counts.append(tally.counts)
-        crossings |= tally.crossings
+        counter, done, shown, spent_s = _drive(scenario, street_map, wanted - ticks, gaps_m)
+        counts.append(counter.counts)
+        crossings |= counter.crossings
         ticks, persons, crowd_s = ticks + done, persons + shown, crowd_s + spent_s
-    return Watched(
+    return CityCounts(
         place=city.name,
         minutes=clock.time_s(ticks) / 60.0,
         persons=persons / ticks,
@@ -162,43 +160,42 @@ def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
 
 def _drive(
     scenario: Scenario, street_map: StreetMap, limit_ticks: int, gaps_m: list[float]
-) -> tuple[Tally, int, int, float]:
-    """Drive one route. Returns what was counted, the ticks, the sum of persons shown, the crowd's
-    CPU seconds.
+) -> tuple[StreetCounter, int, int, float]:
+    """Drive one route. Returns counter, ticks, sum of persons shown, and the crowd's CPU seconds.
 
-    gaps_m: takes up the gaps within groups.
+    gaps_m: list to which the gaps within groups are appended
     """
     clock = Clock.for_rate(Route.manifest.rate_hz)
     policy = Route()
-    tally = Tally(street_map, clock.tick_s, things_along(scenario, street_map))
+    counter = StreetCounter(street_map, clock.tick_s, things_along(scenario, street_map))
     lines = StopLines(clock.tick_s)
     crowd: SumoCrowd
-    spent = Spent(time.process_time)  # what else runs on the machine does not count
+    spent = PartTimes(time.process_time)  # what else runs on the machine does not count
     persons = 0
 
-    def gliding(stage: StagedScenario) -> None:
+    def replace_engines(stage: StagedScenario) -> None:
         nonlocal crowd
         crowd = cast(SumoCrowd, stage.engines.crowd)
         timed = cast(Crowd, TimedEngine(crowd, "step", "crowd", spent))
         stage.engines = replace(
-            stage.engines, world=Glider(stage.engines.world.footprint_m), crowd=timed
+            stage.engines, world=InstantRobot(stage.engines.world.footprint_m), crowd=timed
         )
 
     def watch(step: Step, _: Verdict) -> None:
         nonlocal persons
         street = step.street_after
         persons += int(street.people.are(PersonKind.CROWD).sum())
-        tally.see(street)
-        tally.drove(lines.passed(street.vehicles.ids))
+        counter.update(street)
+        counter.count_vehicles(lines.passed(street.vehicles.ids))
         if (step.tick + 1) % GROUPS_EVERY_TICKS == 0:
             gaps_m.extend(widest_gaps(crowd.groups, street.people))
 
-    with Episode(scenario, policy.manifest, watches=[watch], through=gliding) as episode:
+    with Episode(scenario, policy.manifest, watches=[watch], through=replace_engines) as episode:
         policy.reset(episode.id, episode.seed)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < limit_ticks:
             observation = episode.advance(policy.act(observation), until_tick=limit_ticks)
-        return tally, episode.moment.tick, persons, spent["crowd"]
+        return counter, episode.moment.tick, persons, spent["crowd"]
 
 
 def things_along(scenario: Scenario, street_map: StreetMap) -> list[tuple[str, Polygon]]:
@@ -216,14 +213,16 @@ def things_along(scenario: Scenario, street_map: StreetMap) -> list[tuple[str, P
     ]
 
 
-def watch_all(cities: int, minutes: float, crowd: CrowdSpec, progress: Progress) -> list[Watched]:
-    """Watch the crowd in several cities, a process for each, one after another."""
+def measure_crowds(
+    cities: int, minutes: float, crowd: CrowdSpec, progress: Progress
+) -> list[CityCounts]:
+    """Count the crowd's behaviour in several cities, one process each, one after another."""
     found = []
     for seed in range(cities):
-        progress(f"watching the crowd: city {seed + 1} of {cities}")
+        progress(f"simulating the crowd: city {seed + 1} of {cities}")
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             arguments: tuple[Any, ...] = (City(seed=100 + seed, size_m=CITY_M), minutes, crowd)
-            found.append(pool.apply(watch, arguments))
+            found.append(pool.apply(measure_crowd, arguments))
     return found
 
 
@@ -236,14 +235,15 @@ def summed(counts: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return dict(total)
 
 
-class Tally:
-    """Counts of one place. `counts`: seconds of pairs, seconds of persons, numbers of entries, by
-    name.
+class StreetCounter:
+    """Counter of people's and vehicles' behaviour in one place.
 
-    things: what cannot be walked through, as (kind, ground). crossings: ids of the signalised ones
-    that were entered. at_red: who and what went at red, when and where, in words. A light that is
-    red when it comes into view has been red at least since then; who is on its crossing at that
-    moment has not entered it.
+    counts: seconds of pairs, seconds of persons and numbers of entries, by name
+    crossings: ids of the signalised crossings that were entered
+    at_red: entries at red, with name, place and time, in words
+    things: obstacles, as (kind, ground)
+    A light that comes into view red counts as red since then. People on its crossing at that
+    moment do not count as entering.
     """
 
     def __init__(
@@ -267,8 +267,8 @@ class Tally:
         self._over: set[tuple[str, str]] = set()
         self._boxes: dict[str, tuple[Floats, Floats]] = {}
 
-    def see(self, street: Street) -> None:
-        """Take in the street of the next tick."""
+    def update(self, street: Street) -> None:
+        """Count people in the street of the next tick."""
         people = street.people
         self._since = {name: self._since.get(name, street.tick) for name in people.ids}
         self._pairs(street.tick, people)
@@ -282,8 +282,8 @@ class Tally:
         self._signals(street)
         self._tick = street.tick
 
-    def drove(self, passed: Iterable[StopLineCrossing]) -> None:
-        """Take in the vehicles that drove over stop lines in the last tick."""
+    def count_vehicles(self, passed: Iterable[StopLineCrossing]) -> None:
+        """Count vehicles that drove over stop lines in the last tick."""
         for one in passed:
             self.counts["vehicles passed stop lines"] += 1
             if one.light in "Gg":
@@ -364,8 +364,7 @@ class Tally:
         return bool(shapely.distance(shapely.linestrings(strip.line[:, :2]), point) < 0.6)
 
     def _signals(self, street: Street) -> None:
-        """Count entries of people at every tick, and vehicles on crossings at walk every
-        EVERY_TICKS."""
+        """Count entries of people, and each EVERY_TICKS the vehicles on crossings at walk."""
         people, vehicles = street.people, street.vehicles
         crowd = people.are(PersonKind.CROWD)
         now: set[str] = set()
@@ -376,8 +375,7 @@ class Tally:
             inside = crowd & (point_gaps(middle, half - (INTO_M, 0.0), people.xy) <= 0.0)
             for i in np.flatnonzero(inside).tolist():
                 name = people.ids[i]
-                # Crossings of one junction may overlap: who walks on one of them does not enter
-                # another.
+                # Crossings of one junction may overlap: a person on one does not enter another.
                 begins = (
                     name not in now and name not in self._on and street.tick > self._since[name]
                 )
@@ -416,8 +414,7 @@ class Tally:
                 self.counts["vehicles within 1 m of a walker on it"] += self._tick_s * EVERY_TICKS
 
     def _box(self, crossing: str) -> tuple[Floats, Floats]:
-        """Return a crossing as a box: (3,) x, y, heading of its middle and (2,) half its length
-        and width."""
+        """Return a crossing's box: (3,) x, y, heading of its middle; (2,) half length and width."""
         if crossing not in self._boxes:
             strip = self._map.strips[crossing]
             first = strip.line[0, :2]
@@ -449,8 +446,10 @@ def box_gaps(vehicles: Vehicles, xy: Floats) -> Floats:
 
 
 def widest_gaps(groups: Iterable[Sequence[str]], people: People) -> list[float]:
-    """Return for each group with two or more shown members the largest distance to the nearest
-    other member, metres."""
+    """Return the largest distance of a member to its nearest other, metres, for each group.
+
+    Groups with fewer than two shown members are left out.
+    """
     row = {name: i for i, name in enumerate(people.ids)}
     gaps = []
     for names in groups:

@@ -35,7 +35,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import ROBOTS, Legs
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite
-from scenarios.tools.bench.figures import MORE, Figure, Spent, TimedEngine, taken
+from scenarios.tools.bench.figures import MORE, Figure, PartTimes, TimedEngine, taken
 
 if TYPE_CHECKING:
     from scenarios.episodes.scorer import Scorer
@@ -70,7 +70,7 @@ _TOGETHER: Final = 10
 _TOGETHER_S: Final = 30.0
 """Simulated seconds of each of these that are measured, on average."""
 _QUESTIONS: Final = 500
-"""Questions about a place whose mean time is taken."""
+"""Queries of a place whose mean time is measured."""
 
 
 class FourHertz(Route):
@@ -137,8 +137,10 @@ def driving() -> list[Figure]:
 
 
 def own_memory_mib() -> float:
-    """Return the memory that this process wrote, MiB: a further process needs as much. Pages of
-    files are shared."""
+    """Return the memory that this process wrote, MiB: a further process needs as much.
+
+    Pages of files are shared.
+    """
     rows = (row.split() for row in Path("/proc/self/smaps_rollup").read_text().splitlines())
     return sum(int(words[1]) for words in rows if words[0] == "Private_Dirty:") / 1024.0
 
@@ -198,8 +200,7 @@ def _factor(name: str, drive: _Drive, reach: float) -> Figure:
 
 
 def _bare_query_ms() -> float:
-    """Time an empty query at intervals as in an episode, so that nothing of Zenoh's is in a
-    cache."""
+    """Time an empty query at intervals as in an episode, so that Zenoh's data is in no cache."""
     from bridge.session import LocalSession
 
     between = np.ones(_BETWEEN)
@@ -225,8 +226,8 @@ def _drive(size_m: float, policy: Route, robot: str = "") -> _Drive:
     from scenarios.episodes.episode import Episode
 
     scenario = scenario_in(size_m).driven_by(robot)
-    spent = Spent()
-    engine = Spent()
+    spent = PartTimes()
+    engine = PartTimes()
     physics.dynamics.bullet.time_physics_calls(engine.timed)
     sumo_nets.engine.time_crowd_steps(engine.timed)
 
@@ -266,12 +267,11 @@ def _drive(size_m: float, policy: Route, robot: str = "") -> _Drive:
 
 
 def walking(persons: int) -> list[Figure]:
-    """Time the street's step while a robot goes along a route among `persons` for a simulated
-    minute."""
+    """Time the street's step for a simulated minute of a route among `persons`."""
     import sumo_nets.engine
     from scenarios.episodes.wiring import crowd_of
 
-    inside = Spent()
+    inside = PartTimes()
     scenario = msgspec.structs.replace(
         scenario_in(2000.0), crowd=CrowdSpec(persons=persons, vehicles=_VEHICLES)
     )
@@ -304,7 +304,7 @@ def walking(persons: int) -> list[Figure]:
 
 
 def _cast(middle: Pose) -> tuple[Actor, ...]:
-    """Return _CAST people who walk abreast."""
+    """Return _CAST people walking abreast."""
     x_m, y_m, heading_rad = middle
     return tuple(
         Actor(
@@ -342,8 +342,10 @@ def starting(began_s: float) -> list[Figure]:
 
 
 def engines_starting(began_s: float) -> list[Figure]:
-    """Time SUMO on the net of that first scenario, PyBullet and OpenGL alone, in a process
-    started at `began_s`."""
+    """Time SUMO, PyBullet and OpenGL alone, in a process started at `began_s`.
+
+    SUMO opens the net of the first scenario of `starting`.
+    """
     from physics.cameras.gl.context import context
     from physics.dynamics.bullet import p
     from sumo_nets import engine
@@ -366,21 +368,24 @@ def engines_starting(began_s: float) -> list[Figure]:
 
 
 def first_episode(began_s: float) -> list[Figure]:
-    """Time by how much later the first episode of a local run ends than in one process, each
-    started for it."""
+    """Compare the first episode of a local run with that of a run in one process.
+
+    Each is run by a process started for it.
+    """
     late_s = _first_over_s(began_s, local=True) - taken("first episode alone")[0].value
     return [Figure("first episode of a local run, later than in one process, s", late_s, reach=1.0)]
 
 
 def first_episode_alone(began_s: float) -> list[Figure]:
-    """Time until the first episode of a run in this process alone ends; it was started at
-    `began_s`."""
+    """Time the first episode of a run in this process alone, which was started at `began_s`."""
     return [Figure("first episode in one process, s", _first_over_s(began_s, local=False))]
 
 
 def _first_over_s(began_s: float, *, local: bool) -> float:
-    """Run one short episode. local: in an environment process, as `cosim run` does; else in this
-    process."""
+    """Run one short episode.
+
+    local: in an environment process, as `cosim run` does; else in this process
+    """
     from cosim.policies.load import load_policy
     from scenarios.runs.run import run
     from scenarios.suites.catalog import load_suite
@@ -488,8 +493,10 @@ def _episodes_per_s(jobs: int) -> float:
 
 
 class StraightTogether(Straight):
-    """Drives straight in all episodes at once, slower where it is dark; stacks all pictures as a
-    model would."""
+    """Policy that drives all episodes straight, slower where it is dark.
+
+    It stacks all pictures as a model would.
+    """
 
     manifest = Manifest("straight-together", rate_hz=4.0, camera=CameraSpec(96, 96))
 
@@ -503,8 +510,7 @@ class StraightTogether(Straight):
 
 
 def driving_together() -> list[Figure]:
-    """Measure environments with one renderer and one policy: their simulated seconds per second,
-    in all."""
+    """Measure simulated seconds per second of environments with one renderer and one policy."""
     from cosim.policies.load import load_policy
     from cosim.results.run_folder import RunFolder
     from scenarios.ipc.messages import Hello
@@ -521,17 +527,17 @@ def driving_together() -> list[Figure]:
     ]
     suite = Suite(name="together", version="1", scenarios=tuple(picked))
     name = f"{__name__}:{StraightTogether.__name__}"
-    driver = load_policy(name)
+    caller = load_policy(name)
     options = EpisodeOptions(camera="gl")
-    hello = Hello(name, driver.manifest, driver.source_hash)
-    watch = _Watch()
+    hello = Hello(name, caller.manifest, caller.source_hash)
+    watch = _RateMeter()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
-        spec = run_spec(suite, picked, name, driver, options, True)
+        spec = run_spec(suite, picked, name, caller, options, True)
         held = stack.enter_context(RunFolder.create(folder, spec, suite))
         logs = held.path / "logs"
         renderer = stack.enter_context(SharedRenderer(logs, hello, asks=True))
-        with suppress(_Enough):
+        with suppress(_RateMeasured):
             processes = LocalProcesses(logs, _TOGETHER)
             run_all(
                 held,
@@ -546,12 +552,12 @@ def driving_together() -> list[Figure]:
     return [Figure(what, watch.rate(), reach=60.0, better=MORE)]
 
 
-class _Enough(Exception):
-    """The figure can be taken."""
+class _RateMeasured(Exception):
+    """Raised when the time to measure is over."""
 
 
-class _Watch:
-    """Receives the progress of every environment."""
+class _RateMeter:
+    """Handler of every environment's progress that measures simulated seconds per second."""
 
     def __init__(self) -> None:
         self._at_s: dict[str, float] = {}
@@ -559,10 +565,10 @@ class _Watch:
         self._ended: tuple[float, float] | None = None
 
     def handle(self, message: object) -> None:
-        """Raises _Enough at the end of the time to measure."""
-        from scenarios.ipc.messages import Progress
+        """Count a message. Raises _RateMeasured at the end of the time to measure."""
+        from scenarios.ipc.messages import EpisodeProgress
 
-        if not isinstance(message, Progress):
+        if not isinstance(message, EpisodeProgress):
             return
         self._at_s[message.scenario] = message.time_s
         so_far = time.perf_counter(), sum(self._at_s.values())
@@ -571,7 +577,7 @@ class _Watch:
                 self._began = so_far
         elif so_far[1] - self._began[1] >= _TOGETHER_S * _TOGETHER:
             self._ended = so_far
-            raise _Enough
+            raise _RateMeasured
 
     def rate(self) -> float:
         """Return simulated seconds per second. Raises EngineError when environments ended early."""
@@ -583,8 +589,7 @@ class _Watch:
 
 
 def places() -> list[Figure]:
-    """Time a 2 km city: made from its seed, read from the cache, and queried for points and
-    shortest walks."""
+    """Time a 2 km city: generation, reading from the cache, queries of points and of walks."""
     from cosim.place.street_map import WalkableArea
     from cosim.place.walk_graph import WalkGraph
     from sumo_nets.city.store import build_city, city_net

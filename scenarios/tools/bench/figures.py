@@ -1,4 +1,4 @@
-"""Holds the figures that a measurement gives, and takes measurements in fresh processes."""
+"""Figures of measurements, which are taken in fresh processes."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ ROOT: Final = Path(__file__).resolve().parents[3]
 class Figure(msgspec.Struct, frozen=True):
     """One figure of one round.
 
-    limit: the same by the engine alone, where there is one. limit_is: what was timed for the limit.
-    reach: value to be reached on a quiet machine of two cores; with `reach_ratio`, ratio to the
-    limit on any machine.
+    limit: the same by the engine alone, where it exists
+    limit_is: description of the limit
+    reach: target on a quiet machine of two cores; with `reach_ratio`, target of the ratio to
+        the limit on any machine
     """
 
     name: str
@@ -48,8 +49,8 @@ class Figure(msgspec.Struct, frozen=True):
         return None if self.limit is None else self.value / self.limit
 
 
-class Spent(defaultdict[str, float]):
-    """Seconds spent in each part, by a clock."""
+class PartTimes(defaultdict[str, float]):
+    """Seconds of each part, measured by a clock."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         super().__init__(float)
@@ -71,7 +72,7 @@ class Spent(defaultdict[str, float]):
 class TimedEngine:
     """An engine behind its port, with a stopwatch on one method."""
 
-    def __init__(self, engine: object, method: str, part: str, spent: Spent) -> None:
+    def __init__(self, engine: object, method: str, part: str, spent: PartTimes) -> None:
         self._engine = engine
         self._methods = {method: spent.timed(part, getattr(engine, method))}
 
@@ -80,7 +81,7 @@ class TimedEngine:
 
 
 def measuring_module(checkout: Path) -> str:
-    """Return the module of a checkout that takes measurements; older ones have it elsewhere.
+    """Return the module of a checkout that takes measurements; older checkouts have another.
 
     Raises UsageError for a folder without one.
     """
@@ -93,8 +94,9 @@ def measuring_module(checkout: Path) -> str:
 
 
 def taken(name: str, checkout: Path = ROOT) -> list[Figure]:
-    """Take a measurement of a checkout of cosim, in a fresh process of its own environment, if it
-    has one.
+    """Take a measurement of a checkout, in a fresh process.
+
+    The process uses the virtual environment of the checkout, if it has one.
 
     Raises UsageError for a folder that has no such measurements, EngineError when its process
     fails.
@@ -132,8 +134,10 @@ def spread(values: Sequence[float]) -> tuple[str, str]:
 
 
 def alone(work: Callable[[Any], Any], size: float) -> Any:
-    """Run `work(size)` in a fresh process. Raises what it raises there, EngineError when its
-    process dies."""
+    """Run `work(size)` in a fresh process.
+
+    Raises its exceptions, and EngineError when its process dies.
+    """
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_into, args=(theirs, work, size), daemon=True)

@@ -192,7 +192,7 @@ def stand(walk: Walk, seconds: float) -> tuple[float, float]:
     return math.dist(begin.xy, end.xy), math.degrees(turned)
 
 
-class Wandered(NamedTuple):
+class RandomMotion(NamedTuple):
     """Motion by random commands.
 
     commands, fallen: number of commands, and of falls.
@@ -210,7 +210,7 @@ class Wandered(NamedTuple):
     jitter_deg: float
 
 
-def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> Wandered:
+def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> RandomMotion:
     """Follow random commands of COMMAND_S each.
 
     A tenth are to stand.
@@ -230,12 +230,14 @@ def wander(walk: Walk, robot: Robot, minutes: float, seed: int) -> Wandered:
         pitches += [m.robot.legs.pitch_rad for m in motions if m.robot.legs is not None]
     v, w, v_sway, w_sway = np.array(errors).mean(axis=0).tolist()
     jitter_deg = math.degrees(float(np.std(pitches))) if pitches else 0.0
-    return Wandered(count, walk.fallen, v, w, v_sway, w_sway, jitter_deg)
+    return RandomMotion(count, walk.fallen, v, w, v_sway, w_sway, jitter_deg)
 
 
 def down_curb(robot: Robot, v_mps: float, start_m: float, drive: Drive | None = None) -> int:
-    """Return the falls of a walk down a curb. start_m: distance of the start from it, which sets
-    the phase of the gait."""
+    """Return the falls of a walk down a curb.
+
+    start_m: distance of the start from the curb, which sets the phase of the gait
+    """
     with walking(robot, CURB, Pose(-start_m, 0.0, 0.0), drive) as walk:
         walk.drive(STILL, 0.5)
         for _ in range(_CLOCK.ticks((start_m + 1.5) / v_mps)):

@@ -1,4 +1,4 @@
-"""Names every measurement; each is taken in a fresh process, of this checkout or of another one."""
+"""Tables of the measurements; each is taken in a fresh process, of this or another checkout."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scenarios.tools.bench.figures import MORE, Figure, taken
 
 _Take = Callable[[], list[Figure]]
 _TakeFromStart = Callable[[float], list[Figure]]
-"""Takes the moment when the process was started, in seconds of the monotonic clock."""
+"""Function of the time when its process was started, seconds of the monotonic clock."""
 
 ENVIRONMENT: Final = (
     "driving",
@@ -60,7 +60,7 @@ _TAKEN: Final[Mapping[str, _Take]] = {
     "legs": environment.driving_on_legs,
     "ten environments": environment.driving_together,
     "200 episodes": environment.growing,
-    "serving": serving.asking_elsewhere,
+    "serving": serving.policy_processes,
     "two processes": environment.two_processes,
     **CAMERA,
 }
@@ -78,8 +78,10 @@ def figures_of(name: str, started_s: float) -> list[Figure]:
 
 
 def chosen(only: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the named measurements, or all where none is named. Raises UsageError for an
-    unknown name."""
+    """Return the named measurements, or all where none is named.
+
+    Raises UsageError for an unknown name.
+    """
     for name in only:
         if name not in names:
             raise unknown("measurement", name, names)
@@ -89,8 +91,10 @@ def chosen(only: Sequence[str], names: Sequence[str]) -> list[str]:
 def take_rounds(
     names: Sequence[str], checkouts: Sequence[Path], rounds: int, progress: Progress
 ) -> list[dict[str, list[Figure]]]:
-    """Return for each checkout its figures by name, one for each round. Checkouts alternate, and
-    so does the first."""
+    """Return for each checkout its figures by name, one for each round.
+
+    Checkouts alternate, and so does the first.
+    """
     found: list[dict[str, list[Figure]]] = [{} for _ in checkouts]
     for k in range(rounds):
         for name in names:

@@ -1,8 +1,8 @@
 """Surveys generated cities, and tests whether SUMO endures bodies that go anywhere on a map.
 
 In the test of a map the bodies walk from sidewalk to sidewalk, drive along lanes, cut straight
-across everything, stand at the ends of sidewalks and jump, as resets do. Each map has a process of
-its own: SUMO takes its process down when it dies.
+across everything, wait at the ends of sidewalks and jump, as resets do. Each map has a process of
+its own, because a crash of SUMO ends it.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def survey(city: City) -> Survey:
     tightest = min(widths, key=lambda strip: widths[strip][0])
     faults = list(found.faults)
     if (side_m := widths[tightest][0]) < MIN_CLEAR_M:
-        faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide beside what stands on it")
+        faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide next to its objects")
     if blocked := props_on_driveways(sidewalks, props):
         faults.append(f"{len(blocked)} props stand on driveways: {', '.join(blocked[:3])}")
     memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
@@ -105,11 +105,12 @@ def surveys(cities: Sequence[City], jobs: int) -> Iterator[Survey]:
             raise
 
 
-class Endured(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of a place. ticks: simulated; persons, vehicles: around the robot, on the mean over
-    the ticks.
+class EnduranceResult(msgspec.Struct, frozen=True, kw_only=True):
+    """Result of a place.
 
-    reason: what ended it before its time, "" when nothing did.
+    ticks: number of simulated ticks
+    persons, vehicles: means over the ticks of those around the robot
+    reason: error that ended the simulation early, or ""
     """
 
     place: str
@@ -120,9 +121,10 @@ class Endured(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
 
 
-def endure(where: Place, seed: int, minutes: float = 10.0, progress: Progress = ignore) -> Endured:
-    """Simulate a place in a process of its own. Whatever goes wrong there becomes the reason,
-    not an exception."""
+def endure(
+    where: Place, seed: int, minutes: float = 10.0, progress: Progress = ignore
+) -> EnduranceResult:
+    """Simulate a place in a process of its own; errors become the result's reason."""
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe(duplex=False)
     ticks = Clock().ticks(60.0 * minutes)
@@ -132,10 +134,10 @@ def endure(where: Place, seed: int, minutes: float = 10.0, progress: Progress = 
     began = time.monotonic()
     process.start()
     theirs.close()
-    last = Endured(place=where.name)
+    last = EnduranceResult(place=where.name)
     try:
         while mine.poll(HANG_S):
-            last = msgspec.json.decode(mine.recv_bytes(), type=Endured)
+            last = msgspec.json.decode(mine.recv_bytes(), type=EnduranceResult)
             progress(f"{minutes:g} min on {where.name}", last.ticks / ticks)
         process.kill()
         reason = f"SUMO showed no sign of life for {HANG_S:g} s"
@@ -149,7 +151,7 @@ def endure(where: Place, seed: int, minutes: float = 10.0, progress: Progress = 
 
 def _child(pipe: Connection, where: Place, seed: int, ticks: int, parent: int) -> None:
     exit_with_parent(parent)
-    so_far = Endured(place=where.name)
+    so_far = EnduranceResult(place=where.name)
     try:
         for so_far in simulated(where, seed, ticks):
             pipe.send_bytes(msgspec.json.encode(so_far))
@@ -157,7 +159,7 @@ def _child(pipe: Connection, where: Place, seed: int, ticks: int, parent: int) -
         pipe.send_bytes(msgspec.json.encode(msgspec.structs.replace(so_far, reason=str(error))))
 
 
-def simulated(where: Place, seed: int, ticks: int) -> Iterator[Endured]:
+def simulated(where: Place, seed: int, ticks: int) -> Iterator[EnduranceResult]:
     """Simulate a place in this process; yields its state every REPORT_TICKS and at the end."""
     from scenarios.episodes.wiring import crowd_of
     from scenarios.places.nets import place
@@ -202,7 +204,7 @@ def simulated(where: Place, seed: int, ticks: int) -> Iterator[Endured]:
             vehicles += len(street.vehicles)
             done = tick + 1
             if done % REPORT_TICKS == 0 or done == ticks:
-                yield Endured(
+                yield EnduranceResult(
                     place=where.name, ticks=done, persons=persons / done, vehicles=vehicles / done
                 )
 

@@ -88,14 +88,14 @@ CLASSES: Final = {
 }
 """Classes of Cityscapes, and labels that mean the same. Networks trained from cars call sidewalks
 under the robot road, so both are one class."""
-_DRIVER: Final = "orca"
+_POLICY: Final = "orca"
 _PERSONS: Final = 50
 _SAME: Final = 0.5
 """Overlap (IoU) from which a box shows a person."""
 _OTHER: Final = 0.3
 """Overlap with all people, and share of pixels of people, below which a box is false."""
 _SEEN: Final = 0.7
-"""Share of a person's height that must be seen; people of whom less is seen do not count."""
+"""Share of a person's height that must be visible, for the person to count."""
 _ADULT_M: Final = 1.7
 _APART_M: Final = 0.9
 """Largest distance on the ground between a person and pixels of it, in metres."""
@@ -131,7 +131,7 @@ class SeenPeople(NamedTuple):
 class Detections:
     """Counts of one detector's boxes.
 
-    people: found and all people by class of size.
+    people: numbers of found and of all people, by class of size.
     expected: how many real people of the same heights would be found.
     boxes: number of boxes.
     false: boxes without a person, by what they show (`Things.under`).
@@ -360,7 +360,7 @@ class Things:
 def count_boxes(
     counts: Realism, detector: str, boxes: Floats, picture: Picture
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Count detected boxes (M, 4). Returns who is found (N,), and which boxes are false (M,)."""
+    """Count detected boxes (M, 4). Returns found people (N,) and false boxes (M,), as booleans."""
     seen, labels = picture.seen, picture.frame.labels
     assert labels is not None
     found, overlap = _matched(seen.boxes, boxes)
@@ -504,7 +504,7 @@ def _scenarios(place: str, split: Split) -> Iterator[Scenario]:
 
 
 def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> Iterator[Picture]:
-    driver = load_policy(_DRIVER)
+    caller = load_policy(_POLICY)
     surface = surface_of_place(scenario.place)
     robot_model = robot_called(scenario.robot)
     scenario = options.apply_to(scenario)
@@ -520,10 +520,10 @@ def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> 
     )
     progress(f"starting {scenario.id}")
     with (
-        Episode(scenario, driver.manifest, options) as episode,
+        Episode(scenario, caller.manifest, options) as episode,
         episode.eyes(CAMERA) as camera,
     ):
-        driver.reset(episode.id, episode.seed)
+        caller.reset(episode.id, episode.seed)
         observation = episode.reset()
         next_s = FIRST_S
         while not episode.over:
@@ -535,13 +535,13 @@ def _driven(scenario: Scenario, options: EpisodeOptions, progress: Progress) -> 
                 heads_m = heads_with_companions(street.people, surface, scenario)
                 seen = seen_people(frame, street.people, taken, heads_m)
                 yield Picture(frame, seen, Things(surface, scenario, taken), conditions)
-            observation = episode.advance(driver.act(observation))
+            observation = episode.advance(caller.act(observation))
 
 
 def _matched(people: Floats, boxes: Floats) -> tuple[NDArray[np.bool_], Floats]:
     """Match people (N, 4) with boxes (M, 4), the largest overlap first.
 
-    Returns who is found (N,), and all overlaps (N, M).
+    Returns which people are found (N,), and all overlaps (N, M).
     """
     overlap = _overlaps(people, boxes)
     found = np.zeros(len(people), dtype=bool)

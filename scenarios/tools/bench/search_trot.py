@@ -1,4 +1,4 @@
-"""Searches the numbers of the quadruped's trot.
+"""Searches the gains of the quadruped's trot.
 
 Run it with `python -m scenarios.tools.bench.search_trot EVALUATIONS SEED`. It prints every better
 set of numbers. The best one is written by hand into `physics.dynamics.legs.trot`.
@@ -54,8 +54,10 @@ _MINUTES: Final = 0.6
 
 
 def cost(gains: TrotGains, enough: float = np.inf) -> float:
-    """Return the cost of a trot: errors of speed and yaw rate, distance from the line, shaking,
-    and 1 for each fall. It stops above `enough`."""
+    """Return the cost of a trot; the simulation stops where it exceeds `enough`.
+
+    It sums errors of speed and yaw rate, distance from the line, shaking, and 1 for each fall.
+    """
     legs = DOG.drive
     assert isinstance(legs, Legs)
 

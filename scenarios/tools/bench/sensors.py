@@ -1,6 +1,6 @@
 """Measures the sensors in a busy street: a scan of 360 rays and the visible people.
 
-Times are those of one thread. The peer are PyBullet's rays on the same shapes.
+Times are of one thread. They are compared with PyBullet's rays on the same shapes.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""Measures the cost of a policy in another process: isolated, over Zenoh for one and for
-many episodes, and as a ROS 2 node."""
+"""Measures the cost of a policy in another process: isolated, over Zenoh, and as a ROS 2 node."""
 
 from __future__ import annotations
 
@@ -33,44 +32,46 @@ from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
 from cosim.spec.ros2 import CMD_VEL, PUBLISHED_TOPICS, ROS2_SCHEME, Ros2Settings
 from scenarios.ipc.observation_codec import ObservationDecoder
-from scenarios.runs.isolated_policy import isolated_driver
-from scenarios.runs.remote_policy import remote_driver
-from scenarios.runs.ros2_policy import ros2_driver
+from scenarios.runs.isolated_policy import isolated_caller
+from scenarios.runs.remote_policy import remote_caller
+from scenarios.runs.ros2_policy import ros2_caller
 from scenarios.tools.bench.figures import MORE, Figure
 
 _SPEC: Final = CameraSpec(width=512, height=288)
-_ASKED: Final = 500
+_QUERIES: Final = 500
 _TOGETHER: Final = 8
-_HERE: Final = "the same policy asked in this process"
+_HERE: Final = "the same policy queried in this process"
 _REMOTE: Final = "the remote policy"
-_NAME: Final = f"{__name__}:Blind"
+_NAME: Final = f"{__name__}:FixedPolicy"
 
 
-class Blind:
-    """Answers at once, whatever it sees."""
+class FixedPolicy:
+    """Policy that always returns the same command."""
 
-    manifest = Manifest("blind", rate_hz=4.0, camera=_SPEC)
+    manifest = Manifest("fixed", rate_hz=4.0, camera=_SPEC)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Do nothing: it has no state."""
+        """Do nothing: the policy has no state."""
 
     def act(self, observation: Observation) -> Command:
         return Command(1.0, 0.0)
 
 
-class BlindTogether(Blind):
-    """The same policy, which answers many episodes at once."""
+class FixedBatchPolicy(FixedPolicy):
+    """The same policy for many episodes at once."""
 
     def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
         return [Command(1.0, 0.0) for _ in observations]
 
 
-def asking_elsewhere() -> list[Figure]:
+def policy_processes() -> list[Figure]:
     """Time round trips of a 512x288 picture, and answers of one server to eight clients."""
-    here = PolicyCaller(Blind())
-    isolated = isolated_driver(_NAME, expected=Blind.manifest, host=PolicyHost(isolated="auto"))
+    here = PolicyCaller(FixedPolicy())
+    isolated = isolated_caller(
+        _NAME, expected=FixedPolicy.manifest, host=PolicyHost(isolated="auto")
+    )
     with _served() as host, _ros2_node() as ros2:
-        remote = remote_driver("zenoh:blind", host)
+        remote = remote_caller("zenoh:fixed", host)
         here_ms, isolated_ms, remote_ms, ros2_ms = _in_turns(here, isolated, remote, ros2)
         remote.close()
         ros2.close()
@@ -88,42 +89,42 @@ def asking_elsewhere() -> list[Figure]:
     ]
 
 
-def _in_turns(*drivers: PolicyCaller) -> list[float]:
-    """Return the median milliseconds of an answer of each driver."""
-    took: list[list[float]] = [[] for _ in drivers]
-    for driver in drivers:
-        driver.reset("k1", 1)
-    for tick in range(_ASKED):
-        for driver, times in zip(drivers, took, strict=True):
+def _in_turns(*callers: PolicyCaller) -> list[float]:
+    """Return the median milliseconds of an answer of each caller."""
+    took: list[list[float]] = [[] for _ in callers]
+    for caller in callers:
+        caller.reset("k1", 1)
+    for tick in range(_QUERIES):
+        for caller, times in zip(callers, took, strict=True):
             began = time.perf_counter()
-            driver.act(_seen(tick))
+            caller.act(_seen(tick))
             times.append(1000.0 * (time.perf_counter() - began))
     return [statistics.median(times) for times in took]
 
 
 def _together(host: PolicyHost) -> float:
     """Return answers per second of one server with several clients, by the slowest client."""
-    code = f"from {__name__} import ask_alone; ask_alone({host.servers[0].connect!r})"
-    asking = [
+    code = f"from {__name__} import query_alone; query_alone({host.servers[0].connect!r})"
+    clients = [
         subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
         for _ in range(_TOGETHER)
     ]
-    said = [process.communicate()[0] for process in asking]
-    return _TOGETHER * min(map(float, said))
+    rates = [process.communicate()[0] for process in clients]
+    return _TOGETHER * min(map(float, rates))
 
 
-def ask_alone(endpoint: str) -> None:
+def query_alone(endpoint: str) -> None:
     """Query a served policy for one episode, and print its answers per second."""
     servers = (Connection(role="coordinator", connect=endpoint),)
-    driver = remote_driver("zenoh:blind", PolicyHost(servers=servers, run=str(os.getpid())))
-    driver.reset("k1", 1)
-    driver.act(_seen(0))
+    caller = remote_caller("zenoh:fixed", PolicyHost(servers=servers, run=str(os.getpid())))
+    caller.reset("k1", 1)
+    caller.act(_seen(0))
     began = time.perf_counter()
-    for tick in range(_ASKED):
-        driver.act(_seen(tick))
-    print(_ASKED / (time.perf_counter() - began))
-    driver.ended()
-    driver.close()
+    for tick in range(_QUERIES):
+        caller.act(_seen(tick))
+    print(_QUERIES / (time.perf_counter() - began))
+    caller.ended()
+    caller.close()
 
 
 @contextmanager
@@ -131,7 +132,7 @@ def _served() -> Iterator[PolicyHost]:
     """Serve the policy in another process, behind a socket."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint = f"unixsock-stream/{Path(folder)}/hub"
-        code = f"from {__name__} import serve_blind; serve_blind({endpoint!r})"
+        code = f"from {__name__} import serve_fixed; serve_fixed({endpoint!r})"
         process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
         try:
             yield PolicyHost(
@@ -144,7 +145,7 @@ def _served() -> Iterator[PolicyHost]:
 
 @contextmanager
 def _ros2_node() -> Iterator[PolicyCaller]:
-    """Yield the driver of a ROS 2 node in another process, which connects to a hub as in a run."""
+    """Yield the caller of a ROS 2 node in another process, which connects to a hub as in a run."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint = f"unixsock-stream/{Path(folder)}/hub"
         at = Connection(role="coordinator", listen=endpoint, guests=("ros2",))
@@ -153,7 +154,7 @@ def _ros2_node() -> Iterator[PolicyCaller]:
             process = subprocess.Popen([sys.executable, "-c", code])
             try:
                 settings = Ros2Settings(connection=hub.inside)
-                yield ros2_driver(ROS2_SCHEME, PolicyHost(ros2=settings))
+                yield ros2_caller(ROS2_SCHEME, PolicyHost(ros2=settings))
             finally:
                 process.kill()
                 process.wait()
@@ -162,7 +163,7 @@ def _ros2_node() -> Iterator[PolicyCaller]:
 def answer_pictures(endpoint: str) -> None:
     """Answer each picture at once with /cmd_vel, until killed."""
     with open_session(Connection(role="coordinator", connect=endpoint)) as session:
-        node = Ros2Node(session, Network(), "blind")
+        node = Ros2Node(session, Network(), "fixed")
         node.advertise(CMD_VEL, TWIST_STAMPED)
         picture = "/camera/image_raw"
 
@@ -176,9 +177,9 @@ def answer_pictures(endpoint: str) -> None:
             time.sleep(3600.0)
 
 
-def serve_blind(endpoint: str) -> None:
-    """Serve it until killed."""
-    serve(BlindTogether(), listen=endpoint, decoder=ObservationDecoder)
+def serve_fixed(endpoint: str) -> None:
+    """Serve the policy until killed."""
+    serve(FixedBatchPolicy(), listen=endpoint, decoder=ObservationDecoder)
 
 
 def _seen(tick: int) -> Observation:

@@ -16,10 +16,10 @@ from cosim.core.state import LABELS, RobotState, Street
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, ScanMesh, ScanSun, Splats
 from cosim.spec.camera import CameraSpec
 from cosim.spec.run_config import Appearance
-from scenarios.tools.bench.cameras import SIZE, Busy, busy_at, camera_city, median_s
+from scenarios.tools.bench.cameras import SIZE, BusyStreet, busy_street_at, camera_city, median_s
 
 STEP_M: Final = 0.3
-"""Way of the robot from frame to frame: more than the lattice of eyes."""
+"""Distance of the robot from frame to frame, metres: more than the lattice of eyes."""
 _LONG_M: Final = 80.0
 _WIDE_M: Final = 12.0
 _HIGH_M: Final = 8.0
@@ -65,8 +65,10 @@ def scanned_frame(
 def scanned_together(
     environments: int, count: int, persons: int, frames: int, size_m: float
 ) -> float:
-    """Time one environment's picture of several in one scanned street, in an atlas; median
-    seconds."""
+    """Time pictures of several environments in one scanned street, drawn into one atlas.
+
+    Returns: median seconds of one environment's picture
+    """
     from physics.cameras.gl.atlas import Atlas
     from physics.dynamics.world import BulletWorld
     from physics.street.scan_surface import ScanSurface
@@ -85,12 +87,12 @@ def scanned_together(
         return median_s(draw, busy.streets[:frames]) / environments
 
 
-def _driving(persons: int, frames: int) -> tuple[Busy, list[RobotState]]:
+def _driving(persons: int, frames: int) -> tuple[BusyStreet, list[RobotState]]:
     start = Pose(-0.4 * _LONG_M, 0.5, 0.0)
     robots = [
         RobotState(Pose(start.x_m + STEP_M * (k % 100), start.y_m, 0.0)) for k in range(frames)
     ]
-    return busy_at(start, persons, frames), robots
+    return busy_street_at(start, persons, frames), robots
 
 
 def _surfaces(spacing: float) -> tuple[Floats, Floats]:

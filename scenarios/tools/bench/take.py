@@ -1,8 +1,8 @@
 """Takes one measurement in a process of its own: `python -m scenarios.tools.bench.take NAME STARTED
 FILE`.
 
-STARTED: when the process was started, seconds of the monotonic clock. FILE: where its figures are
-written, as JSON.
+STARTED: time when the process was started, seconds of the monotonic clock.
+FILE: JSON file for its figures.
 """
 
 from __future__ import annotations

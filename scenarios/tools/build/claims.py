@@ -29,7 +29,7 @@ from scenarios.suites.decoys import (
     people_in_obstacles,
     time_limit_s,
 )
-from scenarios.suites.exploits import ALL, Exploit, Share, kind_of
+from scenarios.suites.exploits import ALL, Exploit, Share, scenario_kind
 from scenarios.suites.lanes import THINGS
 from scenarios.suites.long_horizon import LENGTH_SLACK_M
 from scenarios.suites.proofs import Proofs, proofs_path
@@ -547,7 +547,7 @@ def _exploitability(read: Read) -> Iterator[str]:
     scenarios = {one.id: one for one in suite.scenarios}
     test = [one for one in _test(read) if not one.decoy_of]
     for one in exploit.found:
-        events = {s.id for s in test if one.kind in (ALL, kind_of(s))}
+        events = {s.id for s in test if one.kind in (ALL, scenario_kind(s))}
         decoys = {s.id for s in suite.scenarios if s.decoy_of in events}
         driven = {episode.scenario: episode for episode in one.episodes}
         if driven.keys() != events | decoys or len(driven) != len(one.episodes):

@@ -50,7 +50,7 @@ from scenarios.runs.policy_host import settled_host
 from scenarios.runs.pool import run_all
 from scenarios.suites.catalog import with_robot, with_weather
 from scenarios.suites.fits import check_places
-from scenarios.suites.new_scenarios import Fresh
+from scenarios.suites.new_scenarios import NewScenarios
 from scenarios.tools.dataset.collected import ABOUT, RUNS, Collected
 from scenarios.tools.dataset.variety import varied
 from scenarios.tools.viewing.bag import write_bag
@@ -58,7 +58,7 @@ from scenarios.tools.viewing.bag import write_bag
 if TYPE_CHECKING:
     from scenarios.tools.dataset.read import ReadBack
 
-_ASKED: Final = "collect.json"
+_SPEC_FILE: Final = "collect.json"
 _WRITING: Final = "writing"
 _PARTS: Final = ("videos", "data", "meta")
 _MAX_ROUNDS: Final = 8
@@ -77,7 +77,7 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
     suite: str
     suite_hash: str = ""
     scenarios: tuple[str, ...] = ()
-    fresh: Fresh | None = None
+    new_scenarios: NewScenarios | None = msgspec.field(default=None, name="fresh")
     episodes: int
     policy: str
     policy_source: str
@@ -90,10 +90,10 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
     renderer: str
     versions: dict[str, str]
 
-    def refuse_other(self, asked: CollectSpec, path: Path) -> None:
+    def refuse_other(self, requested: CollectSpec, path: Path) -> None:
         """Raise RunError, with the first difference, if the requested options differ."""
         for name in self.__struct_fields__:
-            mine, theirs = getattr(self, name), getattr(asked, name)
+            mine, theirs = getattr(self, name), getattr(requested, name)
             if isinstance(mine, msgspec.Struct) and isinstance(theirs, msgspec.Struct):
                 for part in mine.__struct_fields__:
                     _refuse(path, part, getattr(mine, part), getattr(theirs, part, None))
@@ -109,19 +109,19 @@ def _refuse(path: Path, name: str, mine: object, theirs: object) -> None:
 
 
 @dataclass(frozen=True)
-class Gathered:
+class CollectResult:
     """Result of a collection.
 
-    kept, rows: of the data set.
-    run: episodes that were driven.
+    stored, rows: number of episodes and rows of the data set.
+    run: number of driven episodes.
     dropped: numbers of excluded episodes by reason.
-    spare: solved episodes beyond the requested number.
-    back: result of reading the data set back, None if it was complete before or has no tables.
-    form: of the data set.
-    whole: whether it is complete; otherwise the time was up.
+    spare: number of solved episodes beyond the requested number.
+    back: result of reading the data set back; None if it was complete before or has no tables.
+    form: format of the data set.
+    whole: true if it is complete, false if the time was up.
     """
 
-    kept: int
+    stored: int
     rows: int
     run: int
     dropped: Counter[str]
@@ -142,7 +142,7 @@ def _unshown(
 
 
 def collect(
-    source: Suite | Fresh,
+    source: Suite | NewScenarios,
     expert: PolicyCaller,
     policy: str,
     out: Path,
@@ -156,13 +156,13 @@ def collect(
     minutes: float = math.inf,
     showing: _Showing = _unshown,
     progress: Progress = ignore,
-) -> Gathered:
+) -> CollectResult:
     """Collect demonstrations into a folder.
 
     The same arguments give the same bytes, for any `jobs` and any number of calls with `resume`.
 
     source: scenarios, in order.
-    expert: driver of the robot.
+    expert: policy that drives the robot.
     policy: name of the expert.
     options: seed, robot, weather, goal, own_camera and camera are used.
     episodes: number of episodes in the data set; by default all that are solved.
@@ -175,78 +175,119 @@ def collect(
     """
     ends_s = time.monotonic() + 60.0 * minutes
     form = collecting.format
+    _check_packages(form)
+    policy = importable_name(policy)
+    collecting = msgspec.structs.replace(collecting, learner=importable_name(collecting.learner))
+    options = msgspec.structs.replace(options, collecting=collecting, seed=options.seed or 0)
+    demonstrator = Demonstrator(expert, collecting, options.goal, load_learner(collecting))
+    wanted = episodes or (
+        len(source.structures) * len(source.seeds) if isinstance(source, NewScenarios) else None
+    )
+    rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, ends_s, progress)
+    spec = rounds.requested(wanted or len(rounds.all), expert)
+    _open(out, spec, resume)
+    if form == "raw":
+        _write_about(out, _about(spec, demonstrator, rounds.robot))
+    host = settled_host(host, expert)
+    hello = _hello(policy, expert, host, collecting.learner, demonstrator)
+    with ExitStack() as stack:
+        driven = _drive_rounds(stack, rounds, spec, hello, showing)
+        found = driven.episodes
+        whole = len(found) >= spec.episodes or not rounds.over()
+        if not found and whole:
+            raise SpecError(f"{out}: {driven.why_none}")
+        stored = found[: spec.episodes]
+        back = None
+        if whole and form == "rosbag2":
+            folders = {one.scenario.id: driven.folders[one.scenario.id] for one in stored}
+            _write_bags(out, folders, progress)
+        elif whole and form == "lerobot" and not (out / "meta").exists():
+            back = _written(out, stored, spec, demonstrator, progress)
+    rows = sum(len(one.load()) for one in stored) if whole and form != "raw" else 0
+    spare = len(found) - len(stored)
+    return CollectResult(len(stored), rows, driven.run, driven.dropped, spare, back, form, whole)
+
+
+def _check_packages(form: DataFormat) -> None:
+    """Raise MachineError if a package that writes the format is missing."""
     if form == "rosbag2":
         message_store()
     if form != "raw":
         check_parquet()
-    policy = importable_name(policy)
-    collecting = msgspec.structs.replace(collecting, learner=importable_name(collecting.learner))
-    options = msgspec.structs.replace(options, collecting=collecting, seed=options.seed or 0)
-    learner = load_learner(collecting)
-    demonstrator = Demonstrator(expert, collecting, options.goal, learner)
-    wanted = episodes or (
-        len(source.structures) * len(source.seeds) if isinstance(source, Fresh) else None
-    )
-    rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, ends_s, progress)
-    spec = rounds.asked(wanted or len(rounds.all), expert)
-    _open(out, spec, resume)
-    if form == "raw":
-        _write_about(out, _about(spec, demonstrator, rounds.robot))
-    beside = (
-        None
-        if learner is None
-        else Hello(collecting.learner, learner.manifest, learner.source_hash)
-    )
-    hello = Hello(
-        policy,
-        expert.manifest,
-        expert.source_hash,
-        host=settled_host(host, expert),
-        learner=beside,
-    )
-    with ExitStack() as stack:
-        found: list[Collected] = []
-        runs: dict[str, Path] = {}
-        dropped = Counter[str]()
-        run = 0
-        taken = 0
-        number = 0
-        blocks = -(-spec.episodes // _BLOCK) if form == "raw" else 1
-        while len(found) < spec.episodes and number < _MAX_ROUNDS * blocks and not rounds.over():
-            lacking = spec.episodes - len(found)
-            count = lacking + (lacking // 2 + 1 if number else 0)
-            count = min(count, _BLOCK) if form == "raw" else count
-            held, scenarios = rounds.opened(stack, number, taken, count)
-            if held is None:
-                break
-            rounds.run(held, scenarios, hello, showing)
-            found += _kept(held, scenarios, dropped)
-            runs |= dict.fromkeys((one.id for one in scenarios), held.path)
-            run += len(scenarios)
-            taken = taken + count
-            number = number + 1
-        whole = len(found) >= spec.episodes or not rounds.over()
-        if not found and whole:
-            reasons = (
-                "; ".join(f"{words} ({count})" for words, count in dropped.most_common())
-                or "none were drawn"
-            )
-            raise SpecError(f"{out}: none of {run} episodes can be stored: {reasons}")
-        kept = found[: spec.episodes]
-        back = None
-        if whole and form == "rosbag2":
-            _write_bags(out, {one.scenario.id: runs[one.scenario.id] for one in kept}, progress)
-        elif whole and form == "lerobot" and not (out / "meta").exists():
-            back = _written(out, kept, spec, demonstrator, progress)
-    rows = sum(len(one.load()) for one in kept) if whole and form != "raw" else 0
-    return Gathered(len(kept), rows, run, dropped, len(found) - len(kept), back, form, whole)
+
+
+def _hello(
+    policy: str,
+    expert: PolicyCaller,
+    host: PolicyHost,
+    learner_name: str,
+    demonstrator: Demonstrator,
+) -> Hello:
+    """Return the message that names expert and learner to environment processes."""
+    learner = None
+    if (caller := demonstrator.learner) is not None:
+        learner = Hello(learner_name, caller.manifest, caller.source_hash)
+    return Hello(policy, expert.manifest, expert.source_hash, host=host, learner=learner)
+
+
+@dataclass
+class _Driven:
+    """Result of all rounds.
+
+    episodes: accepted ones, in order.
+    folders: run folder of each scenario.
+    dropped: numbers of excluded episodes by reason.
+    run: number of driven episodes.
+    """
+
+    episodes: list[Collected]
+    folders: dict[str, Path]
+    dropped: Counter[str]
+    run: int = 0
+
+    @property
+    def why_none(self) -> str:
+        """Error message where no episode was accepted."""
+        reasons = (
+            "; ".join(f"{words} ({count})" for words, count in self.dropped.most_common())
+            or "none were drawn"
+        )
+        return f"none of {self.run} episodes can be stored: {reasons}"
+
+
+def _drive_rounds(
+    stack: ExitStack, rounds: _Rounds, spec: CollectSpec, hello: Hello, showing: _Showing
+) -> _Driven:
+    """Drive rounds until enough episodes are accepted, the time is up or scenarios run out.
+
+    stack: closes the run folders.
+    """
+    driven = _Driven([], {}, Counter[str]())
+    is_raw = spec.collecting.format == "raw"
+    taken = 0
+    number = 0
+    limit = _MAX_ROUNDS * (-(-spec.episodes // _BLOCK) if is_raw else 1)
+    while len(driven.episodes) < spec.episodes and number < limit and not rounds.over():
+        lacking = spec.episodes - len(driven.episodes)
+        count = lacking + (lacking // 2 + 1 if number else 0)
+        count = min(count, _BLOCK) if is_raw else count
+        held, scenarios = rounds.opened(stack, number, taken, count)
+        if held is None:
+            break
+        rounds.run(held, scenarios, hello, showing)
+        driven.episodes += _demonstrated(held, scenarios, driven.dropped)
+        driven.folders |= dict.fromkeys((one.id for one in scenarios), held.path)
+        driven.run += len(scenarios)
+        taken += count
+        number += 1
+    return driven
 
 
 @dataclass(frozen=True)
 class _Rounds:
     """Runs that form a data set."""
 
-    source: Suite | Fresh
+    source: Suite | NewScenarios
     out: Path
     policy: str
     demonstrator: Demonstrator
@@ -262,7 +303,7 @@ class _Rounds:
     @property
     def all(self) -> tuple[Scenario, ...]:
         """The scenarios of a suite."""
-        return () if isinstance(self.source, Fresh) else self.source.scenarios
+        return () if isinstance(self.source, NewScenarios) else self.source.scenarios
 
     @property
     def robot(self) -> str:
@@ -274,22 +315,22 @@ class _Rounds:
         """The scenarios of a suite with the requested robot, or a placeholder for new ones."""
         some = self.all or _nowhere(self.source)
         return with_robot(
-            Suite(name="asked", version="1", scenarios=tuple(some)), self.options.robot
+            Suite(name="requested", version="1", scenarios=tuple(some)), self.options.robot
         )
 
-    def asked(self, episodes: int, expert: PolicyCaller) -> CollectSpec:
+    def requested(self, episodes: int, expert: PolicyCaller) -> CollectSpec:
         """Return the requested options, checked as far as possible without a place. Raises
         UsageError.
         """
         whole = self._whole
-        told = run_spec(whole, whole.scenarios, self.policy, self.demonstrator, self.options)
-        is_fresh = isinstance(self.source, Fresh)
+        run = run_spec(whole, whole.scenarios, self.policy, self.demonstrator, self.options)
+        is_new = isinstance(self.source, NewScenarios)
         return CollectSpec(
-            suite=self.source.kind if isinstance(self.source, Fresh) else self.source.name,
-            suite_hash="" if isinstance(self.source, Fresh) else self.source.content_hash,
-            scenarios=() if is_fresh else tuple(one.id for one in self.all),
-            fresh=self.source if isinstance(self.source, Fresh) else None,
-            episodes=episodes if is_fresh else min(episodes, len(self.all)),
+            suite=self.source.kind if isinstance(self.source, NewScenarios) else self.source.name,
+            suite_hash="" if isinstance(self.source, NewScenarios) else self.source.content_hash,
+            scenarios=() if is_new else tuple(one.id for one in self.all),
+            new_scenarios=self.source if isinstance(self.source, NewScenarios) else None,
+            episodes=episodes if is_new else min(episodes, len(self.all)),
             policy=self.policy,
             policy_source=expert.source_hash,
             robot=self.options.robot,
@@ -300,7 +341,7 @@ class _Rounds:
             learner_source=""
             if (learner := self.demonstrator.learner) is None
             else learner.source_hash,
-            renderer=told.setup.renderer,
+            renderer=run.setup.renderer,
             versions=versions(),
         )
 
@@ -318,13 +359,13 @@ class _Rounds:
         if not suite.scenarios:
             return None, ()
         spec = run_spec(suite, suite.scenarios, self.policy, self.demonstrator, self.options)
-        if not begun and not isinstance(self.source, Fresh):
+        if not begun and not isinstance(self.source, NewScenarios):
             check_places(suite, suite.scenarios, self.progress, self.jobs)
         held = RunFolder.resume(path, spec) if begun else RunFolder.create(path, spec, suite)
         return stack.enter_context(held), suite.scenarios
 
     def _suite(self, taken: int, count: int) -> Suite:
-        if isinstance(self.source, Fresh):
+        if isinstance(self.source, NewScenarios):
             drawn = self.source.drawn(taken, count, self.jobs, self.progress)
             version = f"cities-{self.source.seeds[0]}-{self.source.seeds[-1]}"
             made = Suite(name=self.source.kind, version=version, scenarios=tuple(drawn))
@@ -342,19 +383,25 @@ class _Rounds:
         done = held.finished_ids()
         todo = [one for one in scenarios if one.id not in done]
         if todo:
-            with showing(scenarios, done) as hear:
+            with showing(scenarios, done) as handle:
                 transport = LocalProcesses(held.path / "logs", self.jobs)
                 run_all(
-                    held, todo, hello, transport, handle=hear, options=self.options, over=self.over
+                    held,
+                    todo,
+                    hello,
+                    transport,
+                    handle=handle,
+                    options=self.options,
+                    over=self.over,
                 )
         held.finish()
 
 
-def _nowhere(source: Suite | Fresh) -> list[Scenario]:
+def _nowhere(source: Suite | NewScenarios) -> list[Scenario]:
     """Return a placeholder for new scenarios before any is drawn, for checks of robot and
     camera.
     """
-    name = source.kind if isinstance(source, Fresh) else source.name
+    name = source.kind if isinstance(source, NewScenarios) else source.name
     route = ((0.0, 0.0), (12.0, 0.0))
     return [
         Scenario(
@@ -371,7 +418,7 @@ def _nowhere(source: Suite | Fresh) -> list[Scenario]:
 
 def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
     """Create a folder, or resume it. Raises RunError for one of another data set."""
-    path = out / _ASKED
+    path = out / _SPEC_FILE
     try:
         if path.exists():
             try:
@@ -386,7 +433,7 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
                 )
             return
         if out.exists() and (
-            not out.is_dir() or any(one.name != f"{_ASKED}.part" for one in out.iterdir())
+            not out.is_dir() or any(one.name != f"{_SPEC_FILE}.part" for one in out.iterdir())
         ):
             raise RunError(f"{out} exists and is no data set. Choose another --out.")
         (out / RUNS).mkdir(parents=True, exist_ok=True)
@@ -395,7 +442,9 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
         raise unwritable(out, error) from error
 
 
-def _kept(held: RunFolder, scenarios: Sequence[Scenario], dropped: Counter[str]) -> list[Collected]:
+def _demonstrated(
+    held: RunFolder, scenarios: Sequence[Scenario], dropped: Counter[str]
+) -> list[Collected]:
     """Return the episodes of a run with a demonstration, in the order of its scenarios."""
     found = []
     done = held.finished_ids()
@@ -442,7 +491,7 @@ def _write_bags(out: Path, runs: Mapping[str, Path], progress: Progress) -> None
 
 def _written(
     out: Path,
-    kept: Sequence[Collected],
+    stored: Sequence[Collected],
     spec: CollectSpec,
     demonstrator: Demonstrator,
     progress: Progress,
@@ -453,7 +502,7 @@ def _written(
 
     progress(_STAGE)
     camera = spec.collecting.camera
-    robot = kept[0].scenario.robot
+    robot = stored[0].scenario.robot
     eye = camera.mount if isinstance(camera.mount, str) else "camera"
     filmed = Filmed(eye, camera.size, round(spec.collecting.rate_hz))
     about = _about(spec, demonstrator, robot)
@@ -462,8 +511,8 @@ def _written(
         for name in (_WRITING, *_PARTS):
             shutil.rmtree(out / name, ignore_errors=True)
         writing.mkdir()
-        write_lerobot(writing, kept, filmed, robot, about)
-        back = read_back(writing, kept, progress)
+        write_lerobot(writing, stored, filmed, robot, about)
+        back = read_back(writing, stored, progress)
         for name in _PARTS:
             (writing / name).rename(out / name)
         writing.rmdir()

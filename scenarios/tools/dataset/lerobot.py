@@ -92,7 +92,7 @@ def write_lerobot(
             "episode_index": index,
             "length": lengths[index],
             **place.columns,
-            **_told(one),
+            **_own_columns(one),
             **per_episode[index],
         }
         for index, (one, place) in enumerate(zip(episodes, where, strict=True))
@@ -156,7 +156,7 @@ def _places(
     return found
 
 
-def _told(one: Collected) -> dict[str, Any]:
+def _own_columns(one: Collected) -> dict[str, Any]:
     """Return the columns of an episode in `meta/episodes` beyond those of the format."""
     scenario = one.scenario
     return {
@@ -185,8 +185,8 @@ def _rows(
     for index, one in enumerate(episodes):
         shown = one.load()
         count = len(shown)
-        told = [words or _TASK for words in shown.told.tolist()]
-        numbered = [tasks.setdefault(words, len(tasks)) for words in told]
+        instructions = [words or _TASK for words in shown.instruction.tolist()]
+        numbered = [tasks.setdefault(words, len(tasks)) for words in instructions]
         part: dict[str, NDArray[Any]] = {"observation.state": shown.state}
         if not np.isnan(shown.goal).all():
             part["observation.goal"] = shown.goal
@@ -211,7 +211,7 @@ def _rows(
             for name, of in stats.items()
             for what, value in of.items()
         }
-        per_episode.append({"tasks": list(dict.fromkeys(told)), **flat})
+        per_episode.append({"tasks": list(dict.fromkeys(instructions)), **flat})
         parts.append(part)
         lengths.append(count)
         sizes.append(len(shown.clip))

@@ -89,16 +89,16 @@ def read_data_set(folder: Path) -> DataSet:
         table = pq.read_table(folder / info["data_path"].format(chunk_index=0, file_index=0))
         rows = {name: np.stack(table[name].to_numpy()) for name in table.column_names}
         (video_key,) = [name for name, one in info["features"].items() if one["dtype"] == "video"]
-        told = [
+        columns = [
             "scenario",
             "structure",
             *(f"videos/{video_key}/{at}_index" for at in ("chunk", "file")),
         ]
         (path,) = sorted((folder / "meta/episodes").glob("*/*.parquet"))
         if "weather" in pq.read_schema(path).names:  # older data sets lack it
-            told.append("weather")
-        episodes = pq.read_table(path, columns=told).to_pylist()
-        at = dict.fromkeys((one[told[2]], one[told[3]]) for one in episodes)
+            columns.append("weather")
+        episodes = pq.read_table(path, columns=columns).to_pylist()
+        at = dict.fromkeys((one[columns[2]], one[columns[3]]) for one in episodes)
         names = [
             info["video_path"].format(video_key=video_key, chunk_index=c, file_index=f)
             for c, f in at
@@ -156,7 +156,7 @@ def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = 
         if not same:
             raise RunError(
                 f"{folder}: the rows of episode {index}, {one.scenario.id}, are not those "
-                f"that were kept"
+                f"that were stored"
             )
         seen = np.stack([glimpse(next(pictures)) for _ in range(len(shown))]).astype(float)
         off = np.abs(seen - shown.glimpses).mean(axis=(1, 2, 3))

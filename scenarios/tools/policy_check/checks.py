@@ -22,7 +22,7 @@ from scenarios.tools.policy_check.answer_checks import (
     speed_unit,
     time_step,
 )
-from scenarios.tools.policy_check.drives import Drive, SceneName
+from scenarios.tools.policy_check.drives import SceneName, ShownDrive
 from scenarios.tools.policy_check.goal_checks import (
     goal_ignored,
     goal_mirrored,
@@ -91,14 +91,14 @@ class CheckedPolicy(NamedTuple):
 
 
 def checked_policy(
-    driver: PolicyCaller,
+    caller: PolicyCaller,
     manifest: Manifest,
-    drives: Mapping[SceneName, Drive],
+    drives: Mapping[SceneName, ShownDrive],
     progress: Progress = ignore,
     only: Collection[str] = (),
 ) -> CheckedPolicy:
     """Run all checks of a policy, or these. manifest: with the goals of the run."""
-    query = PolicyQuery(driver, manifest, drives, progress)
+    query = PolicyQuery(caller, manifest, drives, progress)
     outcomes: dict[str, CheckOutcome] = {}
     for name, check in POLICY_CHECKS.items():
         if only and name not in only:

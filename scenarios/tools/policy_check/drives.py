@@ -23,7 +23,7 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose, wrap_angle
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import NO_PEOPLE, Age, People, PersonKind, RobotState, Street
-from cosim.episode.interfaces import Observation
+from cosim.episode.interfaces import Observation, ViewCamera
 from cosim.episode.loop import Moment
 from cosim.episode.manifest_checks import check_camera
 from cosim.episode.observer import Observer
@@ -38,6 +38,7 @@ from physics.people.appearance import look_of
 from physics.people.body import COATS
 from physics.people.wardrobe import Season, season_of
 from physics.sensors.caster import RayCaster
+from physics.street.surface import PlaceSurface
 from scenarios.episodes.wiring import (
     CORRIDOR_M,
     draw_empty_street,
@@ -50,7 +51,7 @@ from scenarios.suites.catalog import load_suite
 SceneName = Literal["straight", "left", "right", "person"]
 SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
     {
-        "straight": "along a straight sidewalk, nobody there",
+        "straight": "along a straight sidewalk without people",
         "left": "askew on it, to the right: the way leads to the left",
         "right": "askew on it, to the left: the way leads to the right",
         "person": "along it, and three people stand 3 m ahead",
@@ -80,22 +81,20 @@ rest.
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """Observations for a policy, one for each of its answers, oldest first, with the goals of its
-    run.
-    """
+class ShownDrive:
+    """Drive that is shown to a policy: an observation for each of its answers, oldest first."""
 
     scene: SceneName
     seen: tuple[Observation, ...]
 
 
-def drives_for(
+def shown_drives(
     manifest: Manifest,
     count: int,
     camera: CameraName,
     own_camera: bool = False,
     progress: Progress = ignore,
-) -> dict[SceneName, Drive]:
+) -> dict[SceneName, ShownDrive]:
     """Return the drives of all scenes with `count` observations each.
 
     Raises UsageError for a camera that the robot lacks.
@@ -106,7 +105,7 @@ def drives_for(
     drives = {}
     for done, scene in enumerate(SCENES):
         progress("drawing streets", done / len(SCENES))
-        drives[scene] = _drive(scene, shown, manifest, count, camera)
+        drives[scene] = _shown_drive(scene, shown, manifest, count, camera)
     return drives
 
 
@@ -120,60 +119,23 @@ def _pose(route: Polyline, scene: SceneName, back_m: float) -> Pose:
     return Pose(x_m, y_m, heading)
 
 
-def _drive(
+def _shown_drive(
     scene: SceneName, scenario: Scenario, manifest: Manifest, count: int, camera: CameraName
-) -> Drive:
+) -> ShownDrive:
     """Compute the observations of a drive along a scene, without simulating it."""
     robot = robot_called(scenario.robot)
     route = scenario.route_line
     surface = surface_of_place(scenario.place)
     clock = Clock.for_rate(manifest.rate_hz)
-    street_map = place(scenario.place)[1]
     season = season_of(scenario.light.day_of_year, scenario.light.latitude_deg)
-    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
-
-    @cache
-    def free() -> Polygon | MultiPolygon:
-        ground = without_obstacles(street_map.walkable_near(around), surface.standing(around))
-        return shapely.buffer(ground, -robot.width_m / 2)
-
+    people = (
+        _standing_people(route, 0.5 * route.length_m + _PERSON_M, surface.seed, season)
+        if scene == "person"
+        else NO_PEOPLE
+    )
+    seen = []
     with ExitStack() as stack:
-        world = stack.enter_context(BulletWorld(surface, robot=robot))
-        cameras = {
-            name: stack.enter_context(
-                camera_of(
-                    camera,
-                    world,
-                    spec,
-                    light=scenario.light,
-                    weather=scenario.conditions,
-                    depth=spec.depth,
-                )
-            )
-            for name, spec in {"": manifest.camera, **manifest.cameras}.items()
-            if spec is not None
-        }
-        eye = cameras.pop("", None)
-        look = None if eye is None else partial(draw_empty_street, eye, surface, robot)
-        rays: RayCaster | None = None
-        if range_m := sensing_range_m(manifest):
-            rays = stack.enter_context(RayCaster(surface, (), (), robot, range_m))
-        exact = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
-        observer = Observer(
-            scenario,
-            exact,
-            0,
-            lambda now: privileged_state(scenario, free(), (), now),
-            cameras,
-            look,
-            rays,
-        )
-        people = (
-            _standing_people(route, 0.5 * route.length_m + _PERSON_M, surface.seed, season)
-            if scene == "person"
-            else NO_PEOPLE
-        )
-        seen = []
+        observer, eye = _observer(stack, scenario, manifest, camera, surface)
         for number in range(count):
             time_s = number / manifest.rate_hz
             back_m = _SPEED_MPS * (count - 1 - number) / manifest.rate_hz
@@ -187,7 +149,60 @@ def _drive(
             if manifest.odometry == "gps" and one.odometry is not None:
                 one = replace(one, odometry=msgspec.structs.replace(one.odometry, heading_rad=None))
             seen.append(one)
-    return Drive(scene, tuple(seen))
+    return ShownDrive(scene, tuple(seen))
+
+
+def _observer(
+    stack: ExitStack,
+    scenario: Scenario,
+    manifest: Manifest,
+    camera: CameraName,
+    surface: PlaceSurface,
+) -> tuple[Observer, ViewCamera | None]:
+    """Return the observer of a scenario without engines, and the policy's first camera.
+
+    stack: closes its cameras and rays
+    """
+    robot = robot_called(scenario.robot)
+    street_map = place(scenario.place)[1]
+    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
+
+    @cache
+    def free() -> Polygon | MultiPolygon:
+        ground = without_obstacles(street_map.walkable_near(around), surface.standing(around))
+        return shapely.buffer(ground, -robot.width_m / 2)
+
+    world = stack.enter_context(BulletWorld(surface, robot=robot))
+    cameras = {
+        name: stack.enter_context(
+            camera_of(
+                camera,
+                world,
+                spec,
+                light=scenario.light,
+                weather=scenario.conditions,
+                depth=spec.depth,
+            )
+        )
+        for name, spec in {"": manifest.camera, **manifest.cameras}.items()
+        if spec is not None
+    }
+    eye = cameras.pop("", None)
+    look = None if eye is None else partial(draw_empty_street, eye, surface, robot)
+    rays: RayCaster | None = None
+    if range_m := sensing_range_m(manifest):
+        rays = stack.enter_context(RayCaster(surface, (), (), robot, range_m))
+    exact = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
+    observer = Observer(
+        scenario,
+        exact,
+        0,
+        lambda now: privileged_state(scenario, free(), (), now),
+        cameras,
+        look,
+        rays,
+    )
+    return observer, eye
 
 
 def _standing_people(route: Polyline, s_m: float, seed: int, season: Season) -> People:

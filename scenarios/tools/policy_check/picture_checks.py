@@ -219,5 +219,5 @@ def _aside(query: PolicyQuery) -> CheckOutcome | None:
             if camera is not None and (
                 abs(camera.on_robot[1, 3]) > 0.05 or abs(camera.on_robot[1, 2]) > 0.05
             ):
-                return inapplicable("one of its cameras looks aside or stands aside")
+                return inapplicable("one of its cameras looks aside or is mounted aside")
     return None

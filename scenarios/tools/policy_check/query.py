@@ -17,7 +17,7 @@ from cosim.core.state import Command, WaypointCommand
 from cosim.episode.interfaces import Observation, Policy
 from cosim.episode.policy_caller import PolicyCaller
 from cosim.spec.manifest import Manifest, WaypointRule
-from scenarios.tools.policy_check.drives import Drive, SceneName
+from scenarios.tools.policy_check.drives import SceneName, ShownDrive
 from scenarios.tools.policy_check.edits import Edit, with_goal
 
 _SEED: Final = 1
@@ -80,21 +80,21 @@ class PolicyQuery:
 
     def __init__(
         self,
-        driver: PolicyCaller,
+        caller: PolicyCaller,
         manifest: Manifest,
-        drives: Mapping[SceneName, Drive],
+        drives: Mapping[SceneName, ShownDrive],
         progress: Progress = ignore,
     ) -> None:
         """manifest: with the goals of the run."""
         self.manifest = manifest
         self.drives = drives
         self.took_ms: list[float] = []
-        self._driver = driver
+        self._caller = caller
         self._progress = progress
         self._raw_answer: object = None
         self._known: dict[tuple[SceneName, tuple[str, ...]], Answered] = {}
         self._episodes = 0
-        driver.on_answer(self._store_answer)
+        caller.on_answer(self._store_answer)
 
     def answer(self, scene: SceneName, *edits: Edit) -> Answered:
         """Return the answer to the last observation of a drive with these edits. Raises
@@ -113,25 +113,25 @@ class PolicyQuery:
         self._episodes += 1
         name = f"check-{self._episodes:04d}"
         self._progress("querying the policy")
-        driver = self._driver
-        rule = self._driver.manifest.waypoints
+        caller = self._caller
+        rule = self._caller.manifest.waypoints
         answers: list[Answered] = []
-        driver.reset(name, seed)
+        caller.reset(name, seed)
         try:
             for one in seen:
                 began_s = time.perf_counter()
-                command = driver.act(replace(one, episode=name))
+                command = caller.act(replace(one, episode=name))
                 if answers:
                     self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
                 answers.append(answered(self._raw_answer, command, rule))
         finally:
-            driver.ended()
+            caller.ended()
         return answers
 
     @property
     def policy(self) -> Policy:
         """The policy that is queried."""
-        return self._driver.policy
+        return self._caller.policy
 
     @property
     def plain(self) -> Edit:

@@ -124,9 +124,9 @@ def traced(case: Scenario) -> Trace:
         if step.tick == PICTURE_AT_TICK:
             pictures.update(_pictures(stages[0], case, step))
 
-    driver = load_policy(POLICY)
-    with Episode(case, driver.manifest, watches=[watch], through=stages.append) as episode:
-        drive(episode, driver)
+    caller = load_policy(POLICY)
+    with Episode(case, caller.manifest, watches=[watch], through=stages.append) as episode:
+        drive(episode, caller)
         record, _ = episode.result()
     return Trace(
         scenario_hash=content_hash(case),

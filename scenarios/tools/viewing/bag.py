@@ -106,28 +106,28 @@ def _write(
     episode, answers = observed_replay(recorded, manifest, camera)
     stream = messages.EpisodeStream(episode.id, episode.seed)
     with Writer(path, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as writer, episode:
-        tape = _Tape(writer)
+        bag_writer = _BagWriter(writer)
         episode.watch(ReplayChecker(folder, recorded).watch)
         for topic, sent in stream.begun():
-            tape.write(topic, sent, stream.time_ns(0))
+            bag_writer.write(topic, sent, stream.time_ns(0))
         seen = episode.reset()
         while not episode.over:
             now_ns = stream.time_ns(seen.tick)
             for topic, sent in stream.observed(seen, lambda _: False):
                 at_ns = messages.ns_of(sent.clock) if topic == messages.CLOCK else now_ns
-                tape.write(topic, sent, at_ns)
+                bag_writer.write(topic, sent, at_ns)
             command, delay = answers.at(seen.tick)
-            tape.answer(command, now_ns)
+            bag_writer.answer(command, now_ns)
             seen = episode.advance(command, delay=delay)
             progress(f"recording {recorded.scenario.id}", episode.moment.tick / len(recorded.log))
         check_state_hash(folder, recorded, episode.state_hash)
     for file in path.iterdir():
         file.rename(path.parent / file.name)
     path.rmdir()
-    return tape.count
+    return bag_writer.count
 
 
-class _Tape:
+class _BagWriter:
     """Writes into a bag; a topic is declared with its first message."""
 
     def __init__(self, writer: Writer) -> None:

@@ -52,26 +52,26 @@ def look_at(
 
     Returns ((H, W, 3) uint8 RGB, seconds).
     """
-    driver = load_policy(policy)
+    caller = load_policy(policy)
     last = Clock().ticks(at_s)
     spec = (
         CameraSpec(*size)
-        if driver.manifest.camera is None
-        else CameraSpec(*size, driver.manifest.camera.fov_deg)
+        if caller.manifest.camera is None
+        else CameraSpec(*size, caller.manifest.camera.fov_deg)
     )
     progress(f"reading the street map of {scenario.place.name}")
     place(scenario.place)
     progress("starting SUMO, PyBullet and the camera")
     options = EpisodeOptions(camera=camera_name, appearance=appearance)
     with (
-        Episode(scenario, driver.manifest, options) as episode,
+        Episode(scenario, caller.manifest, options) as episode,
         episode.eyes(spec) as camera,
     ):
-        driver.reset(episode.id, episode.seed)
+        caller.reset(episode.id, episode.seed)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < last:
             progress(f"simulating to {at_s:g} s", episode.moment.tick / last)
-            observation = episode.advance(driver.act(observation), until_tick=last)
+            observation = episode.advance(caller.act(observation), until_tick=last)
         robot, street = episode.moment.robot, episode.moment.street
         progress("drawing")
         if view == "robot":

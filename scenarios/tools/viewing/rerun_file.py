@@ -119,7 +119,7 @@ def record_for_rerun(
                 recording.save(str(part), default_blueprint=_blueprint(rrb))
                 recording.set_log_time_enabled(False)
                 recording.set_log_tick_enabled(False)
-                _replay_into(_Tape(rr, recording, recorded), folder, recorded, progress)
+                _replay_into(_RerunWriter(rr, recording, recorded), folder, recorded, progress)
                 recording.flush()
             finally:
                 recording.disconnect()
@@ -152,15 +152,17 @@ def _blueprint(rrb: Any) -> Any:
     )
 
 
-def _replay_into(tape: _Tape, folder: Path, recorded: RecordedEpisode, progress: Progress) -> None:
+def _replay_into(
+    rerun: _RerunWriter, folder: Path, recorded: RecordedEpisode, progress: Progress
+) -> None:
     spec = replace(recorded.record.manifest.camera or _SPEC, depth=True, labels=True)
     episode, policy = replay_episode(recorded)
     with episode, episode.eyes(spec) as eyes, sensor_replay(recorded) as sensors:
         surface = surface_of_place(recorded.scenario.place)
-        tape.begin(surface, spec)
+        rerun.begin(surface, spec)
         for watch in (
             ReplayChecker(folder, recorded).watch,
-            lambda step, verdict: tape.tick(step, verdict, eyes, sensors),
+            lambda step, verdict: rerun.tick(step, verdict, eyes, sensors),
         ):
             episode.watch(watch)
         observation = episode.reset()
@@ -168,10 +170,10 @@ def _replay_into(tape: _Tape, folder: Path, recorded: RecordedEpisode, progress:
             observation = episode.advance(policy.act(observation))
             progress(f"recording {recorded.scenario.id}", episode.moment.tick / len(recorded.log))
         check_state_hash(folder, recorded, episode.result()[0].state_hash)
-    tape.plots()
+    rerun.plots()
 
 
-class _Tape:
+class _RerunWriter:
     """Writes into a recording. rr: the package."""
 
     def __init__(self, rr: Any, recording: Any, recorded: RecordedEpisode) -> None:

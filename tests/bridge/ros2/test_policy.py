@@ -28,8 +28,8 @@ from cosim.spec.robot import COURIER
 from cosim.spec.ros2 import CMD_VEL, PLAN, Ros2Settings
 from cosim.spec.run_config import RunConfig
 from scenarios.runs import ros2_policy
-from scenarios.runs.policy_host import policy_driver
-from scenarios.runs.ros2_policy import Ros2Driver, ros2_driver
+from scenarios.runs.policy_host import policy_caller
+from scenarios.runs.ros2_policy import Ros2Caller, ros2_caller
 from tests.conftest import wait_until
 from tests.support.plain import free_port
 from tests.support.ros2_peer import Peer, Seen, answers, stamped, steer, twist
@@ -60,13 +60,13 @@ def at() -> str:
 
 
 @contextmanager
-def driven(at: str, **more: Any) -> Iterator[Ros2Driver]:
+def driven(at: str, **more: Any) -> Iterator[Ros2Caller]:
     """The driver of `ros2:` that listens at an endpoint."""
     settings = Ros2Settings(
         connection=Connection(role="coordinator", listen=at, guests=("ros2",)),
         **({"camera": "none", "start_s": 6.0, "answer_s": 2.0} | more),
     )
-    driver = ros2_driver("ros2:", PolicyHost(ros2=settings))
+    driver = ros2_caller("ros2:", PolicyHost(ros2=settings))
     driver.policy._joined()  # type: ignore[attr-defined]  so that nodes find it
     try:
         yield driver
@@ -528,9 +528,9 @@ def test_settings_are_checked_before_anything_opens() -> None:
     config = RunConfig(
         policy="ros2:mine", ros2_scan="1024x16@50", ros2_camera="320x240@60", ros2_domain=4
     )
-    driver = policy_driver("ros2:mine", PolicyHost(ros2=config.ros2))
+    driver = policy_caller("ros2:mine", PolicyHost(ros2=config.ros2))
     assert driver.manifest.name == "mine" and driver.manifest.scan is not None
     assert (driver.manifest.scan.rings, driver.manifest.scan.range_m) == (16, 50.0)
     assert PolicyHost(ros2=config.ros2).of_job(2).ros2.domain == 6  # type: ignore[union-attr]
     with pytest.raises(UsageError, match="--isolated out"):
-        policy_driver("ros2:", PolicyHost(ros2=config.ros2, isolated="auto"))
+        policy_caller("ros2:", PolicyHost(ros2=config.ros2, isolated="auto"))

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.main import get_command
 
+from cosim.cli.app import app
 from scenarios.tools.bench.figures import Figure
 from scenarios.tools.bench.measurements import take_rounds
 from tests.conftest import Cosim
@@ -75,3 +78,15 @@ def test_what_cannot_be_measured_is_refused(tmp_path: Path, cosim: Cosim) -> Non
         and str(tmp_path) in said.stderr
         and "scenarios/tools/bench/take.py" in said.stderr
     )
+
+
+def test_options_of_bench_are_grouped_by_measurement(cosim: Cosim) -> None:
+    """The help shows each option below the measurement that reads it; shared ones name theirs."""
+    bench: Any = get_command(app).commands["bench"]  # type: ignore[attr-defined]
+    options = {one.name: one for one in bench.params if one.param_type_name == "option"}
+    assert all(one.rich_help_panel for one in options.values())
+    assert options["weights"].rich_help_panel == "Options of realism"
+    text = cosim("bench", "--help").stdout
+    panels = [line for line in text.splitlines() if "Options of " in line]
+    names = ("several", "environment", "crowd", "crossings", "exploit", "realism", "legs")
+    assert [name in line for name, line in zip(names, panels, strict=True)] == [True] * 7

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from cosim.cli.run_progress import SETUP_M, ProgressDisplay, RemainingWork
 from cosim.core.units import duration
-from scenarios.ipc.messages import Done, Progress
+from scenarios.ipc.messages import Done, EpisodeProgress
 from tests.support.shipped import long_ways, shipped
 
 
@@ -75,7 +75,7 @@ def test_an_episode_that_stands_still_comes_nearer_to_its_end() -> None:
     one = msgspec.structs.replace(shipped("reactive").scenarios[0], id="stuck")
     board, clock, _ = board_of((one,))
     clock.now_s = 30.0
-    board.tell(Progress(one.id, one.time_limit_s / 2, 0.0, 0))
+    board.tell(EpisodeProgress(one.id, one.time_limit_s / 2, 0.0, 0))
     length_m = one.route_line.length_m
     assert board.left.seconds(30.0) == pytest.approx(
         30.0 * 0.5 * length_m / (0.5 * length_m + SETUP_M)
@@ -87,9 +87,9 @@ def test_a_comparison_is_part_of_its_episode() -> None:
     still to come."""
     board, clock, _ = board_of(long_ways()[:1], compared=True)
     clock.now_s = 70.0
-    board.tell(Progress(long_ways()[0].id, 100.0, long_ways()[0].route_line.length_m, 0))
+    board.tell(EpisodeProgress(long_ways()[0].id, 100.0, long_ways()[0].route_line.length_m, 0))
     at_goal_s = board.left.seconds(70.0)
-    board.tell(Progress(long_ways()[0].id, 1.0, 1.0, 0, compared=0.5))
+    board.tell(EpisodeProgress(long_ways()[0].id, 1.0, 1.0, 0, compared=0.5))
     assert at_goal_s is not None and at_goal_s > 15.0
     assert (half_s := board.left.seconds(70.0)) is not None and half_s < at_goal_s / 1.5
 
@@ -106,7 +106,7 @@ def test_the_bars_fit_80_columns() -> None:
     named = msgspec.structs.replace(long_ways()[7], id="ped_crossing-001")
     board, clock, said = board_of((named, *long_ways()[:2]))
     clock.now_s = 4000.0
-    board.tell(Progress(named.id, 3185.2, 630.4, 88))
+    board.tell(EpisodeProgress(named.id, 3185.2, 630.4, 88))
     board.bars.refresh()
     Console(file=said, width=80).print(board.bars.get_renderable())
     lines = said.getvalue().splitlines()

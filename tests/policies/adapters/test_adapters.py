@@ -16,7 +16,7 @@ from cosim.policies.onnx.manifest import BundleManifest, read_bundle_manifest
 from cosim.policies.onnx.policy import OnnxPolicy
 from physics.cameras.choice import camera_of_choice
 from scenarios.tools.policy_check.checks import checked_policy
-from scenarios.tools.policy_check.drives import drives_for
+from scenarios.tools.policy_check.drives import shown_drives
 from tests.conftest import Cosim
 from tests.support.likenesses import Shapes, likeness
 
@@ -105,7 +105,7 @@ def test_an_adapter_passes_the_check(
     if name not in SAMPLE and not request.config.getoption("--whole"):
         pytest.skip("a sample is tested without --whole")
     policy = OnnxPolicy(bundle_of(name, tmp_path))
-    drives = drives_for(policy.manifest, 3, camera_of_choice("auto"))
+    drives = shown_drives(policy.manifest, 3, camera_of_choice("auto"))
     found = checked_policy(PolicyCaller(policy), policy.manifest, drives)
     assert {check: one for check, one in found.outcomes.items() if one.outcome == "failed"} == {}
     assert found.outcomes["picture_ignored"].outcome == found.outcomes["unit"].outcome == "passed"
@@ -117,7 +117,7 @@ def test_an_adapter_with_the_wrong_side_or_unit_fails_it(tmp_path: Path) -> None
     """The same graph under a manifest that a user may have got wrong does not pass."""
     for changes, check in (({"columns": ["y", "x"]}, "goal_mirrored"), ({"unit_m": 11.0}, "unit")):
         policy = OnnxPolicy(bundle_of("citywalker", tmp_path, **changes))
-        drives = drives_for(policy.manifest, 2, camera_of_choice("auto"))
+        drives = shown_drives(policy.manifest, 2, camera_of_choice("auto"))
         outcome, words = checked_policy(PolicyCaller(policy), policy.manifest, drives).outcomes[
             check
         ]

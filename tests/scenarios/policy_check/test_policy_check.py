@@ -17,18 +17,18 @@ from cosim.policies.privileged.route import Route
 from physics.cameras.choice import camera_of_choice
 from scenarios.tools.policy_check.answer_checks import example
 from scenarios.tools.policy_check.checks import POLICY_CHECKS, CheckedPolicy, checked_policy
-from scenarios.tools.policy_check.drives import Drive, SceneName, drives_for
+from scenarios.tools.policy_check.drives import SceneName, ShownDrive, shown_drives
 from scenarios.tools.policy_check.query import PolicyQuery
 from tests.conftest import Cosim
 from tests.support import planted
 from tests.support.graphs import bundle, tiny_graph
 
-Drives = Mapping[SceneName, Drive]
+Drives = Mapping[SceneName, ShownDrive]
 
 
 @pytest.fixture(scope="module")
 def drives() -> Drives:
-    return drives_for(planted.Right.manifest, 6, camera_of_choice("auto"))
+    return shown_drives(planted.Right.manifest, 6, camera_of_choice("auto"))
 
 
 def outcomes_of(policy: Policy, drives: Drives) -> CheckedPolicy:
@@ -73,7 +73,7 @@ def test_what_may_be_right_is_doubted_only(check: str, drives: Drives) -> None:
 @pytest.mark.engine
 def test_a_policy_that_is_told_the_street_passes() -> None:
     """It has failed in nothing, and what it is not asked says why."""
-    found = outcomes_of(Route(), drives_for(Route.manifest, 4, camera_of_choice("auto")))
+    found = outcomes_of(Route(), shown_drives(Route.manifest, 4, camera_of_choice("auto")))
     assert found.count("failed") == 0 and found.count("passed") >= 7
     assert "needs no picture" in found.outcomes["mirror"].words
 
