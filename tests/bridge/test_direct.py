@@ -101,8 +101,9 @@ class Blind:
 
 
 def frontal(scenario_id: str) -> Scenario:
-    """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the
-    robot."""
+    """A reactive scenario of a few seconds: a small city, few people, and a pedestrian who walks at
+    the robot.
+    """
     from scenarios.places.nets import place
     from scenarios.suites.reactive import build_reactive
 
@@ -115,7 +116,7 @@ def frontal(scenario_id: str) -> Scenario:
 
 
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
-    """A process that has said its first line."""
+    """A process that has printed its first line."""
     process = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None and process.stdout.readline()
     return process
@@ -127,8 +128,9 @@ def recorded(folder: Path, scenario_id: str) -> dict[str, Any]:
 
 @contextmanager
 def directing(folder: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
-    """Starts `cosim direct` in a folder, as often as called; the policy Killer knows of the last
-    one."""
+    """Return a function that starts `cosim direct` in a folder; the policy Killer knows the last
+    one started.
+    """
     started_here: list[subprocess.Popen[str]] = []
 
     def start() -> subprocess.Popen[str]:
@@ -149,7 +151,9 @@ def at_socket(folder: Path) -> str:
 
 
 def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> None:
-    """Killed and started again the episode comes to the hash of an undisturbed one."""
+    """When the director is killed and started again, the episode has the state hash of an
+    undisturbed one.
+    """
     from scenarios.episodes.run_episode import run_episode
 
     write_suite(
@@ -188,9 +192,10 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
     assert kept["status"] == "done" and kept["state_hash"] == undisturbed.state_hash
 
 
-def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> None:
-    """Killed for good while an episode runs: the run says that it waits, and that the simulator
-    owes it."""
+def test_a_director_that_does_not_return_is_reported(tmp_path: Path, cosim: Cosim) -> None:
+    """When it is killed for good, the run says that it waits, and the episode counts as an engine
+    failure.
+    """
     write_suite(
         Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json"
     )
@@ -214,11 +219,10 @@ def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> Non
     assert "t-1: waits at tick" in run.stderr and "5 s at most" in run.stderr
 
 
-def test_a_director_that_lies_spoils_its_episodes_and_no_other(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """The last tick's answer, too many states, noise, other code, an exception: each a record with
-    its reason."""
+def test_a_faulty_director_invalidates_only_its_own_episodes(tmp_path: Path, cosim: Cosim) -> None:
+    """A stale answer, too many states, noise, other code and an exception each give a record with
+    the reason.
+    """
     says = {
         "late": "it answered tick 2 of 'late'",
         "many": "it answered with 1000 states for 1 events",
@@ -306,8 +310,10 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     assert bad.returncode == 2 and "--listen '7448': write it as PROTOCOL/ADDRESS" in bad.stderr
 
 
-def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> None:
-    """The modules whose source is hashed hold all that a fresh process has loaded with them."""
+def test_the_version_of_the_behaviours_covers_every_module_they_load() -> None:
+    """The modules whose source is hashed include every module of the project that a fresh process
+    loads with them.
+    """
     from scenarios.episodes.director import behaviour_version, imported_sources
 
     code = "import sys, scenarios.events; print(*sys.modules)"

@@ -34,7 +34,7 @@ from tests.support.plain import free_port
 TICK_MS = 50
 
 
-class Nobody:
+class EmptyDirector:
     """A director without events."""
 
     def react(self, query: EventQuery) -> EventReply:
@@ -46,12 +46,12 @@ START = Pose(90.0, 90.0, -math.pi / 2)
 
 
 def injected_people(*script: Injected, director: Director | None = None) -> InjectedPeople:
-    """Injected people on a map that is the square of 100 m at the origin, along ROUTE."""
+    """Injected people on a map that is a square of 100 m at the origin, walking along ROUTE."""
 
     def on_map(x_m: float, y_m: float) -> bool:
         return 0.0 <= x_m <= 100.0 and 0.0 <= y_m <= 100.0
 
-    return InjectedPeople(director or Nobody(), TICK_MS, on_map, ROUTE, START, script)
+    return InjectedPeople(director or EmptyDirector(), TICK_MS, on_map, ROUTE, START, script)
 
 
 def query(tick: int, robot_x_m: float = 90.0) -> EventQuery:
@@ -81,9 +81,10 @@ def anna(**fields: object) -> Injection:
     return Injection(**known | fields)  # type: ignore[arg-type]
 
 
-def test_an_injected_person_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> None:
-    """Accepted between ticks 2 and 3 it is there at 3, 3 m at 1.5 m/s later it stands, a second
-    later it is gone."""
+def test_an_injected_person_enters_at_its_tick_walks_its_path_and_leaves() -> None:
+    """Accepted between ticks 2 and 3 it appears at 3, stands after 3 m at 1.5 m/s, and is gone a
+    second later.
+    """
     one = injected_people()
     for tick in range(3):
         assert not one.react(query(tick)).actors
@@ -98,9 +99,10 @@ def test_an_injected_person_enters_at_the_tick_it_was_told_walks_its_path_and_le
     assert one.log == (Injected(tick=3, injection=anna(doing="look")),)
 
 
-def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
-    """Who is to sit at its end is shown to stand as it appears, and to walk; it sits where its path
-    ends only."""
+def test_a_final_posture_is_shown_only_at_the_end_of_the_path() -> None:
+    """A person who is to sit at its end is shown standing as it appears, then walking, and sits
+    only at the end.
+    """
     one = injected_people(Injected(tick=0, injection=anna(doing="sit")))
     shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
     assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
@@ -110,11 +112,12 @@ def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
 
 
 @pytest.mark.parametrize("off_m", [(0.0, 0.0), (0.4, 0.3), (-0.7, 0.0), (0.7, 0.0)])
-def test_an_injected_person_whose_end_the_robot_stands_on_stays_beside_it(
+def test_an_injected_person_whose_end_the_robot_blocks_stops_near_it(
     off_m: tuple[float, float],
 ) -> None:
-    """It comes within a metre, stays for its time, and is gone, instead of walking round the robot
-    for ever."""
+    """It comes within a metre, stays for its time, and leaves, instead of walking round the robot
+    for ever.
+    """
     end = (90.0 + off_m[0], 90.0 + off_m[1])
     one = injected_people(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
     shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
@@ -123,9 +126,10 @@ def test_an_injected_person_whose_end_the_robot_stands_on_stays_beside_it(
     assert math.dist((shown[-1].x_m, shown[-1].y_m), end) < 1.0
 
 
-def test_the_log_alone_replays_the_injected_people() -> None:
-    """Two of them, injected at different ticks: a director that only has the log shows the same,
-    tick by tick."""
+def test_injected_people_are_replayed_from_the_log_alone() -> None:
+    """A director that only has the log shows two people, injected at different ticks, at the same
+    places tick by tick.
+    """
     live = injected_people()
     shown = []
     for tick in range(60):
@@ -137,9 +141,10 @@ def test_the_log_alone_replays_the_injected_people() -> None:
     assert [entry.tick for entry in live.log] == [4, 20]
 
 
-def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters() -> None:
-    """Ahead and left of its pose at that tick, beside points of the map; the log holds the map's
-    alone, and replays."""
+def test_points_relative_to_the_robot_are_resolved_when_the_pedestrian_enters() -> None:
+    """Points ahead and left of its pose at that tick mix with map points; the log holds map points
+    only, and replays.
+    """
     one = injected_people()
     robot = Pose(50.0, 50.0, math.pi / 2)
     one.react(query(0))
@@ -164,11 +169,12 @@ def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters(
     assert [again.react(query(tick)).actors for tick in range(1, 100)] == shown
 
 
-def test_a_tick_that_does_not_end_refuses_points_from_the_robot(
+def test_a_hanging_tick_refuses_points_relative_to_the_robot(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An engine that hangs holds no client up: points of the map are taken, the others are to be
-    sent again."""
+    """While an engine hangs, map points are accepted, and clients are told to send the others
+    again.
+    """
     monkeypatch.setattr(injected, "TICK_TIMEOUT_S", 0.01)
     one = injected_people()
     one.react(query(0))
@@ -187,11 +193,10 @@ def test_a_tick_that_does_not_end_refuses_points_from_the_robot(
     ["[[10,10],[170,252]]", '[[10,10],{"ahead":-3,"left":-200}]'],
     ids=["of the map", "from the robot"],
 )
-def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
+def test_a_refusal_has_the_robots_place_and_a_valid_point(
     robot: tuple[float, float, float, float], path: str
 ) -> None:
-    """At the start, in a turn and near the goal: the message with either form of the point in it is
-    accepted."""
+    """At the start, in a turn and near the goal, either form of the suggested point is accepted."""
     one = injected_people()
     one.set_robot(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
     reason = answer_injection(f'{{"id":"a","path":{path}}}'.encode(), one.offer).reason
@@ -284,16 +289,18 @@ def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
         "empty",
     ],
 )
-def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
-    """Nothing of it reaches the simulation."""
+def test_an_invalid_message_is_refused_with_a_reason(message: bytes, reason: str) -> None:
+    """An invalid message is refused with its reason, and nothing of it reaches the simulation."""
     one = injected_people()
     ack = answer_injection(message, one.offer)
     assert ack.status == "refused" and ack.tick is None and reason in ack.reason
     assert not one.react(query(0)).actors and one.log == ()
 
 
-def test_the_same_name_twice_is_refused() -> None:
-    """Also when the first one is gone: the log knows everybody by name."""
+def test_a_repeated_name_is_refused() -> None:
+    """A name is refused the second time even after the first person left, because the log
+    identifies people by name.
+    """
     one = injected_people()
     assert one.offer(anna()).status == "accepted"
     assert "of this id" in one.offer(anna()).reason
@@ -302,8 +309,10 @@ def test_the_same_name_twice_is_refused() -> None:
     assert not one.react(query(120)).actors and one.offer(anna()).status == "refused"
 
 
-def test_a_flood_is_bounded() -> None:
-    """Of 100,000 messages so many are taken as may be there at once; the rest is told why not."""
+def test_a_flood_of_messages_is_bounded() -> None:
+    """Of 100,000 messages as many are accepted as people may exist at once; the rest are refused
+    with the reason.
+    """
     one = injected_people()
     acks = [one.offer(anna(id=f"p{i}")) for i in range(100_000)]
     assert sum(ack.status == "accepted" for ack in acks) == MAX_INJECTED
@@ -312,7 +321,7 @@ def test_a_flood_is_bounded() -> None:
 
 
 def test_an_injected_person_does_not_walk_through_the_robot() -> None:
-    """With the robot on its path it goes round and arrives."""
+    """With the robot on its path the person walks round it and arrives."""
     one = injected_people()
     one.offer(anna(path=((80.0, 90.0), (99.0, 90.0)), stay_s=60.0))
     gaps = []
@@ -398,7 +407,7 @@ print(json.dumps(bad))
 
 
 class OnAir(NamedTuple):
-    """A run on the air in a folder. way: points on its sidewalk."""
+    """A live run in a folder; `way` are points on its sidewalk."""
 
     run: subprocess.Popen[str]
     folder: Path
@@ -417,14 +426,14 @@ class OnAir(NamedTuple):
         )
 
     def record(self) -> dict[str, Any]:
-        """The record, when the episode has been told to end."""
+        """Return the record, after the episode was ended."""
         (self.folder / "enough").touch()
         assert self.run.wait(timeout=PATIENCE_S) == 0
         return json.loads((self.folder / "run" / "episodes" / "t-0" / "record.json").read_bytes())
 
 
-def once(what: Callable[[], bool]) -> None:
-    """Wait until something is so: who asks a busy run may get no answer at first."""
+def wait_for(what: Callable[[], bool]) -> None:
+    """Wait until a condition holds; a busy run may not reply to the first query."""
     deadline = time.monotonic() + PATIENCE_S
     while not what():
         assert time.monotonic() < deadline
@@ -433,7 +442,7 @@ def once(what: Callable[[], bool]) -> None:
 
 @contextmanager
 def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
-    """`cosim run --live` of an episode that lasts until it is told to end."""
+    """`cosim run --live` of an episode that lasts until it is ended."""
     from scenarios.places.nets import place
     from scenarios.suites.long_horizon import build_long_horizon
 
@@ -470,8 +479,9 @@ def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
 def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(
     tmp_path: Path, cosim: Cosim
 ) -> None:
-    """`cosim inject` and `listen` beside `cosim run --live`, each with its own certificate alone;
-    `cosim replay` comes to the same state hash, given the injection."""
+    """`cosim inject` and `listen` each use their own certificate; `cosim replay` with the injection
+    has the same state hash.
+    """
     certs = tmp_path / "certs"
     at = f"tls/localhost:{free_port()}"
     make_authority(certs, ["localhost"], 1)
@@ -486,7 +496,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
             assert told.returncode == 0, told
             return dict(json.loads(told.stdout.splitlines()[0]))
 
-        once(lambda: log_on_air()["tick"] > 0)
+        wait_for(lambda: log_on_air()["tick"] > 0)
         message = json.dumps(
             {"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"}
         )
@@ -500,13 +510,13 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
             and "is of the role viewer, and this needs injector" in swapped.stderr
         )
         elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9", *injector)
-        once(
+        wait_for(
             lambda: (
                 "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr
                 and said.returncode == 2
             )
         )
-        once(lambda: [one["injection"]["id"] for one in log_on_air()["injections"]] == ["anna"])
+        wait_for(lambda: [one["injection"]["id"] for one in log_on_air()["injections"]] == ["anna"])
         words = [sys.executable, "-m", "cosim", "listen", "robot", *there, *viewer]
         for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
@@ -537,11 +547,10 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
 
 
 @pytest.mark.engine
-def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(
-    tmp_path: Path, cosim: Cosim
-) -> None:
+def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosim: Cosim) -> None:
     """The script of docs/viewing.md injects, a late listener gets all topics and the log, and
-    floods bounce."""
+    floods are refused.
+    """
     (script,) = blocks("python", "docs/viewing.md")
     with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
         text = script.text.replace("tcp/127.0.0.1:7447", air.at)

@@ -1,5 +1,4 @@
-"""Policies behind Zenoh: questions and answers over real sessions, without an engine of the
-street."""
+"""Policies behind Zenoh: queries and replies over real sessions, without an engine of the street."""
 
 from __future__ import annotations
 
@@ -57,8 +56,9 @@ SIZES = {"most": (50_000, 2), "many": (50_001, 2), "far too many": (2_000_000, 2
 
 
 class Counting:
-    """Its speed is the number of the question in its episode, in tenths; in some it does what they
-    are called."""
+    """A policy whose speed is the number of the query in its episode, in tenths; named episodes
+    misbehave as their names say.
+    """
 
     manifest: ClassVar = {
         "name": "counting",
@@ -91,7 +91,7 @@ class Counting:
 
 
 class Together(Counting):
-    """The same for many episodes at once; notes how many it was asked for."""
+    """The same for many episodes at once; records the batch sizes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -177,9 +177,10 @@ def driver_at(
 
 
 @pytest.mark.engine
-def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
-    """It is given the picture, goal and calibration to the bit; what it raises or answers wrongly
-    is its crash, in the words of one in this process; and how long it took is told."""
+def test_a_remote_policy_is_queried_like_a_local_one(hub: Connection) -> None:
+    """Picture, goal and calibration arrive to the bit, exceptions and bad answers crash with the
+    same messages, and durations are reported.
+    """
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver:
         assert (driver.runs, driver.manifest.camera, driver.at_once) == ("remote", SPEC, 1)
@@ -218,7 +219,7 @@ def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
 
 
 @pytest.mark.engine
-def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(hub: Connection) -> None:
+def test_a_repeated_step_is_answered_from_the_cache(hub: Connection) -> None:
     """A repeated query of a step is answered from the cache."""
     policy = Counting()
     with served(hub, policy), driver_at(hub, times=ServerTimes(try_s=0.2)) as driver:
@@ -231,7 +232,7 @@ def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(hub: Connecti
 
 
 @pytest.mark.engine
-def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
+def test_a_link_cut_during_a_long_query_is_waited_for(
     hub: Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server is lost a fixed time after its link was cut, however long its answer took before."""
@@ -253,8 +254,9 @@ def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
 
 @pytest.mark.engine
 def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None:
-    """Eight environments ask one policy with act_batch: each gets the answers of its own episode,
-    some were asked together, and nothing is remembered of those that have ended."""
+    """Eight environments share one policy with act_batch; each gets its own answers, some in one
+    batch, and ended episodes are forgotten.
+    """
     policy = Together()
 
     def drive(name: str, came: list[float]) -> None:
@@ -275,9 +277,10 @@ def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None
 
 
 @pytest.mark.engine
-def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Connection) -> None:
-    """Of two, the one with less to do takes the next episode; runs of the same seed are kept apart;
-    one that is of another policy is refused."""
+def test_servers_of_one_name_share_the_episodes(hub: Connection) -> None:
+    """The less busy of two servers takes the next episode; runs of one seed stay separate; a server
+    of another policy is refused.
+    """
     one, other = Together(), Together()
     with served(hub, one, "together"):
         with (
@@ -299,7 +302,7 @@ def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Conn
 
 
 @pytest.mark.engine
-def test_a_server_begun_anew_has_lost_the_episode(hub: Connection) -> None:
+def test_a_restarted_server_has_lost_its_episode(hub: Connection) -> None:
     """A restarted server has lost its episode, which starts again."""
     with driver_after(hub) as driver:
         with served(hub, Counting()):
@@ -315,10 +318,10 @@ def test_a_server_begun_anew_has_lost_the_episode(hub: Connection) -> None:
 
 
 @pytest.mark.engine
-def test_a_server_that_listens_has_lost_its_episode_as_soon_as_another_listens_there(
+def test_a_listening_server_is_lost_as_soon_as_another_takes_its_endpoint(
     tmp_path: Path,
 ) -> None:
-    """However long a link may be cut: nobody answers in its place any more."""
+    """The episode is lost at once, without waiting for the time that a cut link is allowed."""
     times = ServerTimes(lost_after_s=PATIENCE_S)
     there = Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")
     with ExitStack() as stack:
@@ -337,7 +340,7 @@ def test_a_server_that_listens_has_lost_its_episode_as_soon_as_another_listens_t
 
 @contextmanager
 def driver_after(hub: Connection) -> Iterator[RemoteDriver]:
-    """A driver that has seen a server, which is gone again."""
+    """A driver that has seen a server that is now gone."""
     with served(hub, Counting()):
         driver = remote_driver("zenoh:counting", PolicyHost(servers=(hub,), run="run1"), times=SOON)
     try:
@@ -347,9 +350,10 @@ def driver_after(hub: Connection) -> Iterator[RemoteDriver]:
 
 
 @pytest.mark.engine
-def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection) -> None:
-    """Garbage, another step, another attempt, another kind of answer: in words, and never taken for
-    an answer."""
+def test_a_wrong_reply_of_a_server_is_a_policy_crash(hub: Connection) -> None:
+    """Garbage, another step, attempt or kind of reply is reported with a reason, and never taken
+    for an answer.
+    """
     wrong: dict[str, Callable[[ActRequest], bytes]] = {
         "sent what is no answer": lambda one: b"\xc1 no message",
         "answered step 7 of 'k1' when it was asked step 0": lambda one: answer_to(one, step=7),
@@ -380,7 +384,7 @@ def begin(one: ActRequest | ResetRequest) -> bytes:
 
 @contextmanager
 def liar(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Session]:
-    """A server that begins as it should, and answers as it likes."""
+    """A server that begins correctly and then replies as given."""
     info = PolicyInfo("s", "wrong", {"name": "wrong"})
     below = policy_key("default", "wrong", "s")
     with open_session(hub) as session:
@@ -395,9 +399,10 @@ def liar(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Ses
 
 
 @pytest.mark.engine
-def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -> None:
-    """Garbage, depth without end, an episode that did not begin, a question to everybody: refused;
-    a run goes on."""
+def test_foreign_messages_are_refused_and_change_nothing(hub: Connection) -> None:
+    """Garbage, endless nesting, unknown episodes and wildcard queries are refused, and a run
+    continues.
+    """
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver, open_session(hub) as stranger:
         driver.reset("k1", 7)
@@ -423,8 +428,8 @@ def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -
 
 
 @pytest.mark.engine
-def test_pictures_come_as_jpeg_to_who_asks_for_that(hub: Connection) -> None:
-    """Nearly the same pixels, and every row will say so."""
+def test_pictures_come_as_jpeg_on_request(hub: Connection) -> None:
+    """Pixels are nearly the same, and every row records the compression."""
     policy = Counting()
     smooth = np.tile(np.linspace(0, 255, 64, dtype=np.uint8)[None, :, None], (40, 1, 3))
     with served(hub, policy, jpeg=True), driver_at(hub) as driver:
@@ -438,9 +443,10 @@ def test_pictures_come_as_jpeg_to_who_asks_for_that(hub: Connection) -> None:
 
 
 @pytest.mark.engine
-def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> None:
-    """Nobody there, no endpoint, one that knows everything, too many jobs for an object: before
-    anything is started."""
+def test_an_unusable_policy_server_is_refused_with_a_reason(hub: Connection) -> None:
+    """No server, no endpoint, a privileged policy and too many jobs for an object are refused
+    before anything starts.
+    """
     at = PolicyHost(servers=(hub,))
     with pytest.raises(MachineError, match="no server of policy 'counting' at unixsock"):
         remote_driver("zenoh:counting", at, times=ServerTimes(first_found_s=0.2))
@@ -478,8 +484,10 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
         inspected_driver("zenoh:counting", at)
 
 
-def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:
-    """`serve` refuses it, and no endpoint, and two, and a name that cannot stand in a key."""
+def test_a_server_beyond_this_machine_needs_tls_or_insecure() -> None:
+    """`serve` refuses open endpoints without either, no endpoint, two endpoints, and a name that
+    does not fit a key.
+    """
     with pytest.raises(
         ValueError, match="is beyond this machine and unguarded: anyone who can reach it may query"
     ):
@@ -496,9 +504,10 @@ def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() 
 
 
 @pytest.mark.engine
-def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) -> None:
-    """Two processes, one listening and one connecting to it, answer for one policy with what cosim
-    gives policies; one that is told what the simulator knows is refused."""
+def test_several_cosim_serve_processes_answer_for_one_policy(tmp_path: Path) -> None:
+    """One process listens and another connects to it; a policy with privileged knowledge is
+    refused.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     words = [
         sys.executable,
@@ -538,8 +547,8 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
             other.kill()
 
 
-def test_a_policy_that_knows_everything_is_not_served(cosim: Cosim) -> None:
-    """Nor is there an endpoint for a policy of this machine: in a line."""
+def test_a_privileged_policy_is_not_served(cosim: Cosim) -> None:
+    """`serve` refuses it, and a run refuses an endpoint for a local policy, each in one line."""
     said = cosim("serve", "route")
     assert said.returncode == 2 and "a remote one sees only observations" in said.stderr
     said = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")

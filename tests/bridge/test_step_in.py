@@ -1,5 +1,6 @@
-"""The ways to step into a live run as docs/viewing.md, `--help` and the run itself print them, on
-one scenario."""
+"""The ways to step into a live run, as docs/viewing.md, `--help` and the run itself print them, on
+one scenario.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +25,9 @@ WRITTEN = "tcp/127.0.0.1:7447"
 
 
 def examples_in(text: str, name: str, at: str) -> list[list[str]]:
-    """The words of the commands `cosim NAME` of a text, for the address `at`; those over a network
-    are left out."""
+    """Return the commands `cosim NAME` of a text with the address `at`, without those over a
+    network.
+    """
     lines = re.findall(rf"^ *(?:\.venv/bin/)?cosim ({name} .*)$", text, re.MULTILINE)
     found = [
         shlex.split(line.replace(WRITTEN, at), comments=True)
@@ -36,11 +38,10 @@ def examples_in(text: str, name: str, at: str) -> list[list[str]]:
 
 
 @pytest.mark.engine
-def test_the_examples_of_documents_and_help_step_into_the_first_scenario(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """Run, inject, listen and the Python script of the page, the examples of `cosim inject --help`,
-    and the command that the run prints: each is accepted as written, but for the address."""
+def test_the_documented_examples_work_on_the_first_scenario(tmp_path: Path, cosim: Cosim) -> None:
+    """Commands of the page, the help and the run, and the Python script of the page, are accepted
+    with only the address changed.
+    """
     assert SECTION is not None
     at = f"tcp/127.0.0.1:{free_port()}"
     (script,) = re.findall(r"```python\n(.*?)```", SECTION[1], re.DOTALL)

@@ -38,8 +38,8 @@ pytestmark = pytest.mark.engine
 
 
 @pytest.fixture(autouse=True)
-def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nodes of a test start together, and are lost soon."""
+def short_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes of a test start together, and a lost node is noticed quickly."""
     monkeypatch.setattr(ros2_policy, "JOINED_S", 0.2)
     monkeypatch.setattr(ros2_policy, "GONE_S", 0.3)
     monkeypatch.setattr(ros2_policy, "SETTLE_S", 0.1)
@@ -163,7 +163,7 @@ def test_rate_takes_the_newest_command(at: str) -> None:
 
 
 def test_rate_waits_for_a_first_command_and_notices_that_a_node_left(at: str) -> None:
-    """The first command has the start timeout; a node that left is named before the timeout."""
+    """The first command has the start timeout; a node that left is named before the timeout ends."""
 
     def slow(peer: Peer, seen: Seen) -> None:
         if seen.time_ns == 10**9 + 6 * 10**8:
@@ -191,10 +191,12 @@ def test_rate_waits_for_a_first_command_and_notices_that_a_node_left(at: str) ->
     ],
     ids=["nan", "wall clock"],
 )
-def test_what_is_no_command_is_a_crash_in_words(
+def test_an_invalid_command_crashes_with_a_description(
     at: str, sends: Any, words: str, capfd: Any
 ) -> None:
-    """The episode crashes at its timeout with what was sent, by which node, printed once."""
+    """The episode crashes at its timeout; the message says what was sent, by which node, and is
+    printed once.
+    """
     type_name = TWIST if words == "finite" else TWIST_STAMPED
     with (
         driven(at, start_s=1.5) as driver,
@@ -227,8 +229,9 @@ def test_what_is_no_command_is_a_crash_in_words(
 def test_a_node_that_cannot_drive_is_described(
     at: str, network: Network, type_name: str, words: str
 ) -> None:
-    """A wrong type, domain, namespace or distribution is in the message of the crash, and is shown
-    while the run waits."""
+    """The crash names a wrong type, domain, namespace or distribution, which is also shown while
+    the run waits.
+    """
     shown: list[str] = []
     with (
         driven(at, start_s=1.2) as driver,
@@ -241,8 +244,8 @@ def test_a_node_that_cannot_drive_is_described(
     assert len(shown) == 1 and shown[0].startswith("waits for a node: ") and words in shown[0]
 
 
-def test_without_a_node_the_crash_says_how_they_connect(at: str) -> None:
-    """No node: its endpoint, its mode and the other dialect are in the message."""
+def test_without_a_node_the_crash_says_how_nodes_connect(at: str) -> None:
+    """Without a node, the message has the endpoint, the mode and the other dialect."""
     with (
         driven(at, start_s=1.0) as driver,
         pytest.raises(
@@ -278,8 +281,9 @@ ODOM_AS_TWIST = (
 def test_a_node_without_commands_is_described(
     at: str, reads: dict[str, str], words: str, monkeypatch: Any
 ) -> None:
-    """A subscription of a wrong type, to a topic without messages, or none, is in the message of
-    the crash, and is shown while the run waits."""
+    """A subscription of a wrong type, one to a silent topic, or none is in the crash message and
+    shown while waiting.
+    """
     monkeypatch.setattr(ros2_policy, "SETTLED_S", 0.6)
     shown: list[str] = []
     with driven(at, start_s=1.6) as driver, Peer(at, reads=False) as peer:
@@ -311,8 +315,9 @@ def test_nodes_behind_the_dds_bridge_drive(at: str) -> None:
 
 
 def test_a_lost_node_is_a_crash_and_a_new_one_drives_the_next_episode(at: str) -> None:
-    """The node ends in an episode: it is named; its tokens are gone; the next episode waits for
-    another."""
+    """A node that ends in an episode is named, its tokens are gone, and the next episode waits for
+    another.
+    """
 
     def silent(peer: Peer, seen: Seen) -> None:
         if seen.time_ns == 10**9:
@@ -376,8 +381,9 @@ def test_two_nodes_behind_dds_bridges_do_not_drive(at: str, monkeypatch: Any) ->
 def test_a_restarted_node_is_not_two_nodes(
     at: str, dialect: Any, words: str, when: str, monkeypatch: Any
 ) -> None:
-    """A node that leaves and comes back in an episode is reported as such, at once also if it lacks
-    the observation; the next episode has the new one."""
+    """A node that restarts in an episode is reported at once as restarted, even without the
+    observation; the next episode uses the new one.
+    """
     monkeypatch.setattr(ros2_policy, "GONE_S", 30.0)
     network = Network(dialect=dialect)
 
@@ -414,7 +420,7 @@ def test_a_restarted_node_is_not_two_nodes(
 
 
 def test_a_kind_of_fault_is_reported_once_in_an_episode(at: str, capfd: Any) -> None:
-    """Messages with one kind of fault are one line and a count, in each episode again."""
+    """Messages with one kind of fault make one line and a count, in each episode again."""
     bad = iter(range(1000))
 
     def sends(peer: Peer, seen: Seen) -> None:
@@ -433,8 +439,9 @@ def test_a_kind_of_fault_is_reported_once_in_an_episode(at: str, capfd: Any) -> 
 
 
 def test_a_long_plan_is_recorded_and_one_too_long_is_reported(at: str, capfd: Any) -> None:
-    """A plan of 200 KiB is read. Of more than 1 MiB is said how long it is, while the node drives
-    on."""
+    """A plan of 200 KiB is read; the length of one above 1 MiB is reported while the node continues
+    to drive.
+    """
     where = types.message("geometry_msgs/msg/Point", 3.0, 0.0, 0.0)
     turn = types.message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
     pose = types.message("geometry_msgs/msg/Pose", where, turn)
@@ -486,8 +493,7 @@ def test_a_flood_of_commands_and_long_messages_does_not_stop_the_drive(at: str) 
 
 
 def test_a_late_node_gets_the_latched_topics(at: str) -> None:
-    """Constant transforms, goal and episode arrive within a second at a node that asks for the
-    history."""
+    """Constant transforms, goal and episode reach a node that requests the history within a second."""
     late: dict[str, bytes] = {}
     with driven(at) as driver, Peer(at):
         driver.reset("k1", 7)
@@ -505,8 +511,9 @@ def test_a_late_node_gets_the_latched_topics(at: str) -> None:
 
 
 def test_settings_are_checked_before_anything_opens() -> None:
-    """Options of ROS 2 without it, both ends, a domain beyond the last, and bad values are refused
-    with a remedy."""
+    """ROS 2 options without the policy, two endpoints, a domain beyond the last and bad values are
+    refused with a remedy.
+    """
     wrong: dict[str, dict[str, Any]] = {
         "--ros2-wait goes with --policy ros2:": {"policy": "orca", "ros2_wait": "rate"},
         "listens or connects, not both": {

@@ -49,7 +49,9 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Hub:
-    """A run's hub and its own process. heard: keys that reached them from outside."""
+    """A run's hub and its own process; `heard` are the keys of messages from outside that reached
+    them.
+    """
 
     def __init__(self, certs: Path, stack: ExitStack) -> None:
         self.at = f"tls/localhost:{free_port()}"
@@ -74,10 +76,10 @@ def hub(certs: Path) -> Iterator[Hub]:
         yield Hub(certs, stack)
 
 
-def test_a_node_hears_sensors_and_tells_commands_alone(certs: Path, hub: Hub) -> None:
-    """It gets every published topic, latched ones later too, and sees the run's token; its commands,
-    plans and tokens arrive, long ones too; what it publishes elsewhere, deletes or answers does
-    not."""
+def test_a_node_receives_topics_and_sends_only_commands_and_plans(certs: Path, hub: Hub) -> None:
+    """A node gets every published topic and sees the run's token; of its messages only commands,
+    plans and tokens arrive.
+    """
     with plain_zenoh(hub.at, certs, "ros2") as guest:
         got: list[str] = []
         guest.declare_subscriber("3/**", lambda sample: got.append(str(sample.key_expr)))
@@ -122,7 +124,7 @@ def test_a_node_hears_sensors_and_tells_commands_alone(certs: Path, hub: Hub) ->
 
 
 def test_nodes_do_not_reach_each_other_through_the_run(certs: Path, hub: Hub) -> None:
-    """One node's commands and topics of its own are not passed to another."""
+    """Commands and private topics of one node are not passed to another."""
     with plain_zenoh(hub.at, certs, "ros2") as one, plain_zenoh(hub.at, certs, "ros2") as other:
         got: list[str] = []
         for name in (IN["/cmd_vel"], FOREIGN[0]):
@@ -135,8 +137,10 @@ def test_nodes_do_not_reach_each_other_through_the_run(certs: Path, hub: Hub) ->
         assert got == []
 
 
-def test_without_the_certificate_of_a_node_nothing_is_heard(certs: Path, hub: Hub) -> None:
-    """No certificate: no link. Another role: a link that carries nothing."""
+def test_without_a_node_certificate_nothing_is_received(certs: Path, hub: Hub) -> None:
+    """Without a certificate there is no link; a certificate of another role gives a link that
+    carries nothing.
+    """
     with plain_zenoh(hub.at, certs, "viewer") as viewer:
         got: list[str] = []
         for name in (*OUT.values(), "**"):
@@ -153,9 +157,10 @@ def test_without_the_certificate_of_a_node_nothing_is_heard(certs: Path, hub: Hu
         open_session(Connection(role="worker", connect=hub.at.replace("tls/", "tcp/")))
 
 
-def test_the_configuration_for_nodes_is_one_that_zenoh_reads(certs: Path, hub: Hub) -> None:
-    """`session.json5` of the role opens a session to the run's machine, once its port is set. It
-    has timestamps, which publishers with a history need."""
+def test_zenoh_opens_a_session_with_the_configuration_for_nodes(certs: Path, hub: Hub) -> None:
+    """`session.json5` of the role connects to the run's machine once its port is set, with the
+    timestamps that history needs.
+    """
     path = certs / "ros2" / "session.json5"
     path.write_text(path.read_text().replace(":7447", f":{hub.at.rpartition(':')[2]}"))
     config = zenoh.Config.from_file(path)
@@ -165,9 +170,10 @@ def test_the_configuration_for_nodes_is_one_that_zenoh_reads(certs: Path, hub: H
 
 
 @pytest.mark.parametrize("host", ["fd00::7", ""])
-def test_the_configuration_for_nodes_names_a_host_in_every_case(tmp_path: Path, host: str) -> None:
-    """An IPv6 address has brackets, and without a coordinator's certificate there is a word to
-    replace."""
+def test_the_configuration_for_nodes_always_names_a_host(tmp_path: Path, host: str) -> None:
+    """An IPv6 address has brackets; without a coordinator's certificate there is a placeholder to
+    replace.
+    """
     make_authority(tmp_path / "certs", [host or "localhost"], 365)
     if not host:
         (tmp_path / "certs" / "coordinator" / "key.pem").unlink()

@@ -75,8 +75,9 @@ def seen(**more: Any) -> Observation:
 
 @pytest.mark.parametrize("store", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
 def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
-    """Each stored hash equals the one that rosbags computes from the distribution's definition, and
-    every topic has one."""
+    """Each stored hash equals that of rosbags for the distribution's definition, and every topic
+    has one.
+    """
     definitions = get_typestore(store)
     assert {name: definitions.hash_rihs01(name) for name in types.HASHES} == dict(types.HASHES)
     used = {
@@ -87,8 +88,9 @@ def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
 
 
 def test_keys_tokens_and_gids_are_those_of_the_design_document() -> None:
-    """Its examples are read and written again to the letter; qos texts, key, gid and attachment
-    have the documented form."""
+    """Its examples are read and written back to the letter; QoS texts, key, gid and attachment have
+    the documented form.
+    """
     for token in (TALKER, LISTENER):
         end = read_rmw_token(token)
         assert end is not None and rmw_token(end) == token and end.domain == 2
@@ -105,7 +107,7 @@ def test_keys_tokens_and_gids_are_those_of_the_design_document() -> None:
 
 
 def test_a_namespace_is_mangled_in_tokens() -> None:
-    """Slashes of namespaces and topics become %, and are read back; both dialects."""
+    """In both dialects, slashes of namespaces and topics become % and are read back."""
     end = Endpoint(
         "MS", 3, "ab12", "driver", (1, 4), "/env/a", "/env/a/scan",
         "sensor_msgs/msg/LaserScan", types.HASHES["sensor_msgs/msg/LaserScan"],
@@ -120,8 +122,9 @@ def test_a_namespace_is_mangled_in_tokens() -> None:
 
 
 def test_each_message_is_decoded_to_what_was_observed() -> None:
-    """All topics of an observation, as CDR and back: values, frames and stamps; the same bytes each
-    time."""
+    """All topics of an observation survive CDR with values, frames and stamps, as the same bytes
+    each time.
+    """
     one = seen()
     sent = {row.name: row.message(one, NOW_NS) for row in messages.TOPICS.values() if row.message}
     assert sent.pop("/points") is None
@@ -157,8 +160,9 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
 
 
 def test_optical_frames_look_ahead() -> None:
-    """The chain base_link -> camera_link -> optical frame of /tf_static is the calibration of the
-    picture, and camera_link has x ahead."""
+    """The chain base_link -> camera_link -> optical frame equals the calibration of the picture,
+    and camera_link has x ahead.
+    """
     one = seen()
     frames = {frame.child_frame_id: frame for frame in messages.static_tf(one, NOW_NS).transforms}
     assert list(frames) == ["odom", messages.CAMERA, messages.OPTICAL, messages.LIDAR, messages.IMU]
@@ -184,7 +188,7 @@ def _matrix(transform: Any) -> np.ndarray[Any, Any]:
 
 
 def test_a_cloud_of_rings_has_the_points_of_the_scan() -> None:
-    """Points are the distances along the rays; without a return they are infinite."""
+    """Points are the distances along the rays; rays without a return are infinite."""
     spec = ScanSpec(rays=16, rings=3, elevation_deg=(-10.0, 10.0))
     ranges = np.full((3, 16), 5.0, np.float32)
     ranges[1, 4] = np.inf
@@ -241,9 +245,10 @@ def test_a_command_is_taken_by_the_rule_of_its_stamp() -> None:
     assert early.command is None and early.fault is None
 
 
-def test_what_is_no_command_is_named_and_never_driven() -> None:
-    """NaN, too long, another type, another hash, a wall clock, no attachment, malformed bytes: each
-    with its node and a remedy."""
+def test_an_invalid_command_is_described_and_never_driven() -> None:
+    """NaN, excess length, another type or hash, a wall clock, no attachment and malformed bytes are
+    reported with node and remedy.
+    """
     good = twist(1.0, 0.5)
     faults = {
         "both must be finite": verdict(twist(math.nan, 0.0)),
@@ -264,8 +269,9 @@ def test_what_is_no_command_is_named_and_never_driven() -> None:
 
 
 def test_a_plan_is_turned_into_the_robots_frame() -> None:
-    """Points of a path in odom become metres ahead and to the left, 32 at most; another frame,
-    no points and malformed bytes are refused."""
+    """Points of a path in odom become metres ahead and left, 32 at most; other frames, empty and
+    malformed paths are refused.
+    """
     turn = types.message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
 
     def path(frame: str, points: list[tuple[float, float]]) -> bytes:
@@ -318,7 +324,7 @@ def test_an_inbox_is_bounded_in_messages_and_bytes() -> None:
 
 
 def test_remarks_are_counted_by_topic_and_kind() -> None:
-    """A kind of fault is new once in an episode, whatever its words say; repeats are counted."""
+    """A kind of fault is new once in an episode, whatever its words; repeats are counted."""
     remarks = Remarks()
     first = [remarks.add(Fault(CMD_VEL, "number", f"linear.x {x}")) for x in range(3)]
     assert first == [True, False, False]
@@ -329,7 +335,7 @@ def test_remarks_are_counted_by_topic_and_kind() -> None:
 
 
 def test_the_page_names_each_topic_and_its_type() -> None:
-    """The table of topics in docs/ros2.md has those that are sent and read, with their types."""
+    """The table of topics in docs/ros2.md lists those that are sent and read, with their types."""
     page = (ROOT / "docs" / "ros2.md").read_text()
     rows = [
         line.split("|")[1:3] for line in page.splitlines() if line.startswith(("| `/", "| in: `/"))

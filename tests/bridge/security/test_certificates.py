@@ -1,5 +1,6 @@
-"""Certificates: made once, kept to oneself, shown with their end, and refused in words when they do
-not fit."""
+"""Certificates: created once, readable by their owner alone, shown with their end, and refused with
+a reason.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +33,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def end_of(folder: Path, role: Role) -> Connection:
-    """An end of a session with what is in a folder, that nobody need be at."""
+def open_end(folder: Path, role: Role) -> Connection:
+    """Open an end of a session with the files of a folder; no peer is needed."""
     end = "listen" if role == "coordinator" else "connect"
     return Connection(role=role, tls=str(folder / role), **{end: "tls/localhost:7447"})  # type: ignore[arg-type]
 
 
-def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cosim) -> None:
-    """Keys are their owner's alone; what is there stays until --renew, which keeps the hosts; the
-    end is shown."""
+def test_the_command_creates_shows_and_never_overwrites(tmp_path: Path, cosim: Cosim) -> None:
+    """Keys are readable by their owner alone; files stay until --renew, which keeps the hosts; the
+    end is shown.
+    """
     folder = tmp_path / "certs"
     first = cosim(
         "certs", "init", str(folder), "--host", "hub.lan", "--host", "10.0.0.7", "--days", "90"
@@ -83,9 +85,10 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
     ]
 
 
-def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> None:
-    """A missing file, damage, another's key, another authority, everybody's key, another role: each
-    by its name."""
+def test_each_kind_of_unusable_file_is_named(made: Path, tmp_path: Path) -> None:
+    """A missing or damaged file, another's key, another authority, a readable key and another role
+    are each named.
+    """
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     copies = iter(range(100))
@@ -123,11 +126,12 @@ def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> Non
     assert "is of the role worker, and this needs viewer" in refused("", "viewer")
 
 
-def test_the_end_of_a_certificate_is_said_before_it_comes(made: Path) -> None:
-    """Nothing is said long before; within 30 days the day and the remedy; afterwards, and too
-    early, it is refused."""
+def test_the_end_of_a_certificate_is_announced_30_days_before(made: Path) -> None:
+    """Within 30 days the day and the remedy are shown; an expired or not yet valid certificate is
+    refused.
+    """
     for role in ("coordinator", "worker"):
-        end = end_of(made, role)  # type: ignore[arg-type]
+        end = open_end(made, role)  # type: ignore[arg-type]
         assert checked_identity(end, NOW) == ""
         assert (
             "expires on" in (said := checked_identity(end, NOW + timedelta(days=350)))
@@ -137,17 +141,18 @@ def test_the_end_of_a_certificate_is_said_before_it_comes(made: Path) -> None:
             checked_identity(end, NOW + timedelta(days=366))
         with pytest.raises(AccessError, match="is this machine's clock right"):
             checked_identity(end, NOW - timedelta(days=3))
-    assert checked_identity(end_of(made, "worker"), NOW - timedelta(hours=20)) == "", (
+    assert checked_identity(open_end(made, "worker"), NOW - timedelta(hours=20)) == "", (
         "a clock that is behind"
     )
 
 
 @pytest.mark.engine
-def test_a_hub_that_does_not_fit_is_refused_in_words(
+def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another authority there or here, another name, an expired hub, no TLS, nobody there; and one
-    that fits."""
+    """Another authority on either end, another name, an expired hub, no TLS and no hub are refused;
+    a valid hub connects.
+    """
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
@@ -219,11 +224,8 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
 
 
 @pytest.mark.engine
-def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(
-    made: Path, tmp_path: Path
-) -> None:
-    """None, one of another authority, one that signed itself a worker: no link; the same client
-    with ours: a link."""
+def test_plain_zenoh_without_our_certificate_cannot_connect(made: Path, tmp_path: Path) -> None:
+    """No, foreign and self-signed certificates give no link; the same client with ours gets one."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
@@ -244,8 +246,8 @@ def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(
             pass
 
 
-def test_a_host_that_is_none_is_refused(tmp_path: Path) -> None:
-    """Before anything is written."""
+def test_an_invalid_host_is_refused(tmp_path: Path) -> None:
+    """An invalid host is refused before any file is written."""
     with pytest.raises(UsageError, match="a name or address of a machine"):
         make_authority(tmp_path / "certs", ["hub lan"], 1)
     assert not (tmp_path / "certs").exists()

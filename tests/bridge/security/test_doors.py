@@ -1,5 +1,6 @@
-"""Every command that listens or connects: to its own machine alone, and what else it needs is said
-before it begins."""
+"""Commands that listen or connect: only this machine by default, anything else is checked before
+work begins.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +35,12 @@ DOORS = {
 
 
 @pytest.mark.parametrize("door", DOORS)
-def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path: Path) -> None:
-    """Beyond this machine: without TLS, with TLS and no files, with files and no TLS, with files
-    that are not there."""
+def test_no_endpoint_is_open_to_other_machines_by_default(
+    door: str, cosim: Cosim, tmp_path: Path
+) -> None:
+    """Beyond this machine an endpoint is refused without TLS, with TLS but no files, with files but
+    no TLS, and with missing files.
+    """
     words = DOORS[door]
     beyond = "tcp/10.0.0.7:7447"
     guarded = "tls/10.0.0.7:7447"
@@ -63,8 +67,10 @@ def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path:
 
 
 @pytest.mark.engine
-def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
-    """On standard error, of who listens and of who connects."""
+def test_insecure_explains_itself_in_one_line(cosim: Cosim) -> None:
+    """Both the listening and the connecting command print the meaning of --insecure on standard
+    error.
+    """
     port = free_port()
     said = list[str]()
     open_to_all = Connection(role="coordinator", listen=f"tcp/0.0.0.0:{port}", insecure=True)
@@ -80,8 +86,8 @@ def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
     assert tried.returncode == 3 and "none of its episodes is on the air" in tried.stderr
 
 
-def test_guards_without_a_door_are_refused(cosim: Cosim, tmp_path: Path) -> None:
-    """--tls and --insecure of a run that nobody can reach."""
+def test_security_options_without_an_endpoint_are_refused(cosim: Cosim, tmp_path: Path) -> None:
+    """--tls and --insecure are refused for a run that has no endpoint."""
     for more in (("--tls", str(tmp_path)), ("--insecure",)):
         refused = cosim("run", "no-such-suite", *more)
         assert (

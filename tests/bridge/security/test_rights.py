@@ -1,5 +1,6 @@
-"""What each role may do on a hub: plain Zenoh tries it over TLS on loopback; what is refused is
-seen to do nothing."""
+"""What each role may do on a hub: plain Zenoh tries it over TLS on loopback; a refused act has no
+effect.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +49,7 @@ MAY_ASK: dict[str, tuple[str, ...]] = {
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Certificates of all roles; of those who listen for localhost."""
+    """Certificates of all roles; those of roles that listen are for localhost."""
     folder = tmp_path_factory.mktemp("tls") / "certs"
     make_authority(folder, ["localhost"], 365)
     for role in get_args(Role):
@@ -58,7 +59,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def replies(session: zenoh.Session, key: str) -> list[str]:
-    """What a query is answered, errors included."""
+    """Return all replies to a query, errors included."""
     got = session.get(
         key, payload=OWN, timeout=PATIENCE_S, consolidation=zenoh.ConsolidationMode.NONE
     )
@@ -66,8 +67,9 @@ def replies(session: zenoh.Session, key: str) -> list[str]:
 
 
 class Air:
-    """A hub, its run's own process, and a policy server. seen: the keys of what was asked of them
-    and told to them; alive: of the tokens that were shown."""
+    """A hub, its run's own process, and a policy server; `seen` are keys of queries and messages,
+    `alive` those of tokens.
+    """
 
     def __init__(self, certs: Path | None, stack: ExitStack) -> None:
         protocol, tls = ("tcp", "") if certs is None else ("tls", str(certs / "coordinator"))
@@ -98,8 +100,9 @@ class Air:
             query.reply(query.key_expr, self._saw(str(query.key_expr)))
 
     def settle(self) -> None:
-        """Until what was routed before has arrived: what the run tells and what the hub tells goes
-        after it."""
+        """Wait until everything routed before has arrived, by sending messages of the run and of
+        the hub after it.
+        """
         for end in (self.run, self.hub):
             mark = f"{ENV}/mark{time.monotonic_ns()}"
             end.publish_lossy(mark, b"")
@@ -107,8 +110,9 @@ class Air:
 
 
 class Guest:
-    """A client that tries everything. heard: the keys of what was told or asked that was none of
-    its own doing."""
+    """A client that tries everything; `heard` are keys of queries and messages that it did not send
+    itself.
+    """
 
     def __init__(self, air: Air, role: str, stack: ExitStack) -> None:
         self.air = air
@@ -134,8 +138,7 @@ class Guest:
             self.heard.append(str(sample.key_expr))
 
     def passed(self, may_ask: tuple[str, ...]) -> None:
-        """Until all that it sent before is with the hub: what it asks, or is asked, goes after
-        that."""
+        """Wait until all that it sent before is at the hub, by sending a query after it."""
         if may_ask:
             wait_until(lambda: may_ask[0] in replies(self.session, may_ask[0]))
         else:
@@ -143,7 +146,7 @@ class Guest:
         self.air.settle()
 
     def answers(self) -> bool:
-        """Whether what it answers as a policy is heard."""
+        """Whether its replies as a policy are received."""
         try:
             return self.air.hub.query("cosim/r/policy/theirs/info", b"", timeout_s=0.5) == b"FORGED"
         except (TimeoutError, EngineError):
@@ -159,7 +162,7 @@ def air(certs: Path) -> Iterator[Air]:
 def try_all(
     air: Air, guest: Guest, may_ask: tuple[str, ...], *, watches: bool, answers: bool, shows: bool
 ) -> None:
-    """Try all acts; what is allowed works, and nothing else has any effect."""
+    """Try all acts; permitted ones work, and no other has any effect."""
     guest.passed(may_ask)
     # to ask
     air.seen.clear()
@@ -206,9 +209,10 @@ def try_all(
 
 
 @pytest.mark.parametrize("role", MAY_ASK)
-def test_a_role_may_do_its_own_and_nothing_else(air: Air, role: str) -> None:
-    """Asking, telling, listening, answering, being alive, wildcards: each tried by each role, with
-    its certificate."""
+def test_a_role_has_its_own_rights_and_no_others(air: Air, role: str) -> None:
+    """Each role, with its certificate, tries to query, publish, subscribe, reply, declare tokens
+    and use wildcards.
+    """
     with ExitStack() as stack:
         guest = Guest(air, role, stack)
         try_all(
@@ -221,9 +225,10 @@ def test_a_role_may_do_its_own_and_nothing_else(air: Air, role: str) -> None:
         )
 
 
-def test_without_certificates_nobody_tells_where_the_robot_is() -> None:
-    """On loopback everybody may do what the roles may together, but not speak for the run or its
-    hub."""
+def test_without_certificates_no_client_speaks_for_the_run() -> None:
+    """On loopback a client has the rights of all roles together, but not those of the run or its
+    hub.
+    """
     with ExitStack() as stack:
         air = Air(None, stack)
         may = tuple(key for key in ASKED if any(key in theirs for theirs in MAY_ASK.values()))
@@ -231,9 +236,10 @@ def test_without_certificates_nobody_tells_where_the_robot_is() -> None:
 
 
 @pytest.mark.parametrize(("hub", "key"), [("director", f"{ENV}/director"), ("policy", POLICY)])
-def test_who_is_asked_is_asked_by_runs_alone(certs: Path, hub: Role, key: str) -> None:
-    """At the hub of a director or a policy server, workers and coordinators ask; others do not, and
-    nobody answers."""
+def test_only_runs_may_query_directors_and_policy_servers(certs: Path, hub: Role, key: str) -> None:
+    """At the hub of a director or a policy server only workers and coordinators may query, and no
+    client may reply.
+    """
     at = f"tls/localhost:{free_port()}"
     asked: list[bytes] = []
     with ExitStack() as stack:
@@ -270,9 +276,10 @@ serve(Mine, listen=sys.argv[1], tls=sys.argv[2])
 """
 
 
-def test_the_file_that_is_copied_is_asked_by_runs_alone(certs: Path) -> None:
-    """`serve` of policy_server.py by itself: workers and coordinators ask, one server at a time;
-    else nobody."""
+def test_only_runs_may_query_the_copied_policy_server(certs: Path) -> None:
+    """At `serve` of a copied policy_server.py only workers and coordinators may query, one server
+    at a time.
+    """
     at = f"tls/localhost:{free_port()}"
     words = [sys.executable, "-c", COPIED, at, str(certs / "policy")]
     with ExitStack() as stack:
@@ -305,9 +312,10 @@ def test_the_file_that_is_copied_is_asked_by_runs_alone(certs: Path) -> None:
 @pytest.mark.parametrize(
     "written", ["application/python-serialized-object", "application/x-unheard-of"]
 )
-def test_what_would_have_to_be_unpickled_is_not_read(tmp_path: Path, written: str) -> None:
-    """A message that says it is a Python object, or something unheard of, is refused with what is
-    read here."""
+def test_pickled_and_unknown_messages_are_refused(tmp_path: Path, written: str) -> None:
+    """A message with a pickled Python object or an unknown type is refused with the types that are
+    read.
+    """
     asked: list[bytes] = []
     at = f"unixsock-stream/{tmp_path}/hub.sock"
     with listening_at(at) as hub, plain_zenoh(at, None, "") as guest:
@@ -325,7 +333,7 @@ def test_what_would_have_to_be_unpickled_is_not_read(tmp_path: Path, written: st
             assert one.ok.payload.to_bytes() == b"taken"
 
 
-def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
+def test_a_too_long_message_is_dropped(certs: Path) -> None:
     """A message longer than 64 KiB is dropped, and one of a role without rights ends no link."""
     at = f"tls/localhost:{free_port()}"
     lengths: list[int] = []
