@@ -102,8 +102,7 @@ class Blind:
 
 def frontal(scenario_id: str) -> Scenario:
     """A reactive scenario of a few seconds: a small city, few people, and a pedestrian who walks at
-    the robot.
-    """
+    the robot."""
     from scenarios.places.nets import place
     from scenarios.suites.reactive import build_reactive
 
@@ -129,8 +128,7 @@ def recorded(folder: Path, scenario_id: str) -> dict[str, Any]:
 @contextmanager
 def directing(folder: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
     """Return a function that starts `cosim direct` in a folder; the policy Killer knows the last
-    one started.
-    """
+    one started."""
     started_here: list[subprocess.Popen[str]] = []
 
     def start() -> subprocess.Popen[str]:
@@ -152,8 +150,7 @@ def at_socket(folder: Path) -> str:
 
 def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> None:
     """When the director is killed and started again, the episode has the state hash of an
-    undisturbed one.
-    """
+    undisturbed one."""
     from scenarios.episodes.run_episode import run_episode
 
     write_suite(
@@ -194,8 +191,7 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
 
 def test_a_director_that_does_not_return_is_reported(tmp_path: Path, cosim: Cosim) -> None:
     """When it is killed for good, the run says that it waits, and the episode counts as an engine
-    failure.
-    """
+    failure."""
     write_suite(
         Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json"
     )
@@ -221,8 +217,7 @@ def test_a_director_that_does_not_return_is_reported(tmp_path: Path, cosim: Cosi
 
 def test_a_faulty_director_invalidates_only_its_own_episodes(tmp_path: Path, cosim: Cosim) -> None:
     """A stale answer, too many states, noise, other code and an exception each give a record with
-    the reason.
-    """
+    the reason."""
     says = {
         "late": "it answered tick 2 of 'late'",
         "many": "it answered with 1000 states for 1 events",
@@ -312,8 +307,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
 
 def test_the_version_of_the_behaviours_covers_every_module_they_load() -> None:
     """The modules whose source is hashed include every module of the project that a fresh process
-    loads with them.
-    """
+    loads with them."""
     from scenarios.episodes.director import behaviour_version, imported_sources
 
     code = "import sys, scenarios.events; print(*sys.modules)"

@@ -196,8 +196,7 @@ def test_an_invalid_reply_is_refused_with_a_reason(
     tmp_path: Path, fields: dict[str, Any], words: str
 ) -> None:
     """Replies to another tick or episode, with too many states, unknown people or impossible places
-    are refused.
-    """
+    are refused."""
     asked = msgspec.structs.replace(query(5), events=(event(),))
     sane = EventReply(episode="t", tick=5, states=(SANE,), actors=(SHOWN,))
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
@@ -276,8 +275,7 @@ def test_a_missing_hub_is_an_error_with_the_endpoint(
 
 def test_names_that_do_not_fit_a_key_are_refused() -> None:
     """Slashes, wildcards and empty names are refused as a chunk of a key; `chunk` makes any name
-    fit.
-    """
+    fit."""
     for bad in ("", "a/b", "*", "a b", "x" * 65):
         with pytest.raises(SpecError, match="cannot name a run or environment"):
             keys.director("run", bad)
@@ -286,8 +284,7 @@ def test_names_that_do_not_fit_a_key_are_refused() -> None:
 
 def test_interleaved_queries_hold_the_events_of_their_episode() -> None:
     """Two alternating episodes and one that changes its events get their own; impossible events are
-    refused every time.
-    """
+    refused every time."""
     queries = [
         msgspec.structs.replace(query(k), events=(event(route_s_m=5.0 + k % 2),) * (k % 3))
         for k in range(12)

@@ -83,8 +83,7 @@ def anna(**fields: object) -> Injection:
 
 def test_an_injected_person_enters_at_its_tick_walks_its_path_and_leaves() -> None:
     """Accepted between ticks 2 and 3 it appears at 3, stands after 3 m at 1.5 m/s, and is gone a
-    second later.
-    """
+    second later."""
     one = injected_people()
     for tick in range(3):
         assert not one.react(query(tick)).actors
@@ -101,8 +100,7 @@ def test_an_injected_person_enters_at_its_tick_walks_its_path_and_leaves() -> No
 
 def test_a_final_posture_is_shown_only_at_the_end_of_the_path() -> None:
     """A person who is to sit at its end is shown standing as it appears, then walking, and sits
-    only at the end.
-    """
+    only at the end."""
     one = injected_people(Injected(tick=0, injection=anna(doing="sit")))
     shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
     assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
@@ -116,8 +114,7 @@ def test_an_injected_person_whose_end_the_robot_blocks_stops_near_it(
     off_m: tuple[float, float],
 ) -> None:
     """It comes within a metre, stays for its time, and leaves, instead of walking round the robot
-    for ever.
-    """
+    for ever."""
     end = (90.0 + off_m[0], 90.0 + off_m[1])
     one = injected_people(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
     shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
@@ -128,8 +125,7 @@ def test_an_injected_person_whose_end_the_robot_blocks_stops_near_it(
 
 def test_injected_people_are_replayed_from_the_log_alone() -> None:
     """A director that only has the log shows two people, injected at different ticks, at the same
-    places tick by tick.
-    """
+    places tick by tick."""
     live = injected_people()
     shown = []
     for tick in range(60):
@@ -143,8 +139,7 @@ def test_injected_people_are_replayed_from_the_log_alone() -> None:
 
 def test_points_relative_to_the_robot_are_resolved_when_the_pedestrian_enters() -> None:
     """Points ahead and left of its pose at that tick mix with map points; the log holds map points
-    only, and replays.
-    """
+    only, and replays."""
     one = injected_people()
     robot = Pose(50.0, 50.0, math.pi / 2)
     one.react(query(0))
@@ -173,8 +168,7 @@ def test_a_hanging_tick_refuses_points_relative_to_the_robot(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """While an engine hangs, map points are accepted, and clients are told to send the others
-    again.
-    """
+    again."""
     monkeypatch.setattr(injected, "TICK_TIMEOUT_S", 0.01)
     one = injected_people()
     one.react(query(0))
@@ -299,8 +293,7 @@ def test_an_invalid_message_is_refused_with_a_reason(message: bytes, reason: str
 
 def test_a_repeated_name_is_refused() -> None:
     """A name is refused the second time even after the first person left, because the log
-    identifies people by name.
-    """
+    identifies people by name."""
     one = injected_people()
     assert one.offer(anna()).status == "accepted"
     assert "of this id" in one.offer(anna()).reason
@@ -311,8 +304,7 @@ def test_a_repeated_name_is_refused() -> None:
 
 def test_a_flood_of_messages_is_bounded() -> None:
     """Of 100,000 messages as many are accepted as people may exist at once; the rest are refused
-    with the reason.
-    """
+    with the reason."""
     one = injected_people()
     acks = [one.offer(anna(id=f"p{i}")) for i in range(100_000)]
     assert sum(ack.status == "accepted" for ack in acks) == MAX_INJECTED
@@ -480,8 +472,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     tmp_path: Path, cosim: Cosim
 ) -> None:
     """`cosim inject` and `listen` each use their own certificate; `cosim replay` with the injection
-    has the same state hash.
-    """
+    has the same state hash."""
     certs = tmp_path / "certs"
     at = f"tls/localhost:{free_port()}"
     make_authority(certs, ["localhost"], 1)
@@ -549,8 +540,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
 @pytest.mark.engine
 def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosim: Cosim) -> None:
     """The script of docs/viewing.md injects, a late listener gets all topics and the log, and
-    floods are refused.
-    """
+    floods are refused."""
     (script,) = blocks("python", "docs/viewing.md")
     with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
         text = script.text.replace("tcp/127.0.0.1:7447", air.at)

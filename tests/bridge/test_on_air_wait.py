@@ -73,8 +73,7 @@ def test_a_refusal_without_or_after_a_wait_has_a_remedy(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A missing run, a run without an episode and another episode are distinguished, each with its
-    remedy.
-    """
+    remedy."""
     monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     at = f"unixsock-stream/{tmp_path}/air.sock"
     refused = cosim("listen", "--connect", at)

@@ -112,8 +112,7 @@ def test_a_batch_is_answered_in_its_order() -> None:
 
 def test_a_bad_answer_in_a_batch_crashes_only_its_episode() -> None:
     """The other episode gets its answer; numbers that raise when they are read count as bad
-    answers.
-    """
+    answers."""
 
     class Pretends(float):
         def __float__(self) -> float:
@@ -217,8 +216,7 @@ def test_an_object_serves_one_episode_at_a_time_and_a_class_many() -> None:
 
 def test_a_request_that_cannot_be_decoded_is_refused() -> None:
     """For garbage and arrays of missing or wrong sizes the policy is not queried, and other
-    requests are answered.
-    """
+    requests are answered."""
     policy = RecordsCalls()
     desk = began(policy, "a")
     garbage = read_request(b"\x91" * 100_000)

@@ -57,8 +57,7 @@ SIZES = {"most": (50_000, 2), "many": (50_001, 2), "far too many": (2_000_000, 2
 
 class Counting:
     """A policy whose speed is the number of the query in its episode, in tenths; named episodes
-    misbehave as their names say.
-    """
+    misbehave as their names say."""
 
     manifest: ClassVar = {
         "name": "counting",
@@ -179,8 +178,7 @@ def driver_at(
 @pytest.mark.engine
 def test_a_remote_policy_is_queried_like_a_local_one(hub: Connection) -> None:
     """Picture, goal and calibration arrive to the bit, exceptions and bad answers crash with the
-    same messages, and durations are reported.
-    """
+    same messages, and durations are reported."""
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver:
         assert (driver.runs, driver.manifest.camera, driver.at_once) == ("remote", SPEC, 1)
@@ -255,8 +253,7 @@ def test_a_link_cut_during_a_long_query_is_waited_for(
 @pytest.mark.engine
 def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None:
     """Eight environments share one policy with act_batch; each gets its own answers, some in one
-    batch, and ended episodes are forgotten.
-    """
+    batch, and ended episodes are forgotten."""
     policy = Together()
 
     def drive(name: str, came: list[float]) -> None:
@@ -279,8 +276,7 @@ def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None
 @pytest.mark.engine
 def test_servers_of_one_name_share_the_episodes(hub: Connection) -> None:
     """The less busy of two servers takes the next episode; runs of one seed stay separate; a server
-    of another policy is refused.
-    """
+    of another policy is refused."""
     one, other = Together(), Together()
     with served(hub, one, "together"):
         with (
@@ -352,8 +348,7 @@ def driver_after(hub: Connection) -> Iterator[RemoteDriver]:
 @pytest.mark.engine
 def test_a_wrong_reply_of_a_server_is_a_policy_crash(hub: Connection) -> None:
     """Garbage, another step, attempt or kind of reply is reported with a reason, and never taken
-    for an answer.
-    """
+    for an answer."""
     wrong: dict[str, Callable[[ActRequest], bytes]] = {
         "sent what is no answer": lambda one: b"\xc1 no message",
         "answered step 7 of 'k1' when it was asked step 0": lambda one: answer_to(one, step=7),
@@ -401,8 +396,7 @@ def liar(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Ses
 @pytest.mark.engine
 def test_foreign_messages_are_refused_and_change_nothing(hub: Connection) -> None:
     """Garbage, endless nesting, unknown episodes and wildcard queries are refused, and a run
-    continues.
-    """
+    continues."""
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver, open_session(hub) as stranger:
         driver.reset("k1", 7)
@@ -445,8 +439,7 @@ def test_pictures_come_as_jpeg_on_request(hub: Connection) -> None:
 @pytest.mark.engine
 def test_an_unusable_policy_server_is_refused_with_a_reason(hub: Connection) -> None:
     """No server, no endpoint, a privileged policy and too many jobs for an object are refused
-    before anything starts.
-    """
+    before anything starts."""
     at = PolicyHost(servers=(hub,))
     with pytest.raises(MachineError, match="no server of policy 'counting' at unixsock"):
         remote_driver("zenoh:counting", at, times=ServerTimes(first_found_s=0.2))
@@ -486,8 +479,7 @@ def test_an_unusable_policy_server_is_refused_with_a_reason(hub: Connection) -> 
 
 def test_a_server_beyond_this_machine_needs_tls_or_insecure() -> None:
     """`serve` refuses open endpoints without either, no endpoint, two endpoints, and a name that
-    does not fit a key.
-    """
+    does not fit a key."""
     with pytest.raises(
         ValueError, match="is beyond this machine and unguarded: anyone who can reach it may query"
     ):
@@ -506,8 +498,7 @@ def test_a_server_beyond_this_machine_needs_tls_or_insecure() -> None:
 @pytest.mark.engine
 def test_several_cosim_serve_processes_answer_for_one_policy(tmp_path: Path) -> None:
     """One process listens and another connects to it; a policy with privileged knowledge is
-    refused.
-    """
+    refused."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     words = [
         sys.executable,

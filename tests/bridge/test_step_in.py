@@ -1,6 +1,5 @@
 """The ways to step into a live run, as docs/viewing.md, `--help` and the run itself print them, on
-one scenario.
-"""
+one scenario."""
 
 from __future__ import annotations
 
@@ -26,8 +25,7 @@ WRITTEN = "tcp/127.0.0.1:7447"
 
 def examples_in(text: str, name: str, at: str) -> list[list[str]]:
     """Return the commands `cosim NAME` of a text with the address `at`, without those over a
-    network.
-    """
+    network."""
     lines = re.findall(rf"^ *(?:\.venv/bin/)?cosim ({name} .*)$", text, re.MULTILINE)
     found = [
         shlex.split(line.replace(WRITTEN, at), comments=True)
@@ -40,8 +38,7 @@ def examples_in(text: str, name: str, at: str) -> list[list[str]]:
 @pytest.mark.engine
 def test_the_documented_examples_work_on_the_first_scenario(tmp_path: Path, cosim: Cosim) -> None:
     """Commands of the page, the help and the run, and the Python script of the page, are accepted
-    with only the address changed.
-    """
+    with only the address changed."""
     assert SECTION is not None
     at = f"tcp/127.0.0.1:{free_port()}"
     (script,) = re.findall(r"```python\n(.*?)```", SECTION[1], re.DOTALL)

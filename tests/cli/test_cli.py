@@ -104,7 +104,7 @@ def hashes(folder: Path) -> dict[str, str]:
 
 @contextmanager
 def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """A run that is going on, and is killed in the end."""
+    """A run in progress, which is killed at the end of the block."""
     command = [sys.executable, "-m", "cosim", "run", *words]
     run = subprocess.Popen(
         command,
@@ -113,7 +113,7 @@ def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=hear_interrupts,
+        preexec_fn=accept_interrupts,
     )
     try:
         yield run
@@ -124,7 +124,7 @@ def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
 
 @contextmanager
 def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
-    """Policy Held waits before this scenario. Gives whether it does so already."""
+    """Return whether the policy Held is already waiting before this scenario."""
     hold = desk / f"hold-{scenario}"
     waits = desk / "waits"
     hold.touch()
@@ -158,7 +158,7 @@ HELD = ("tiny.json", "--policy", "mine:Held", "--episodes", "2", "--seed", SEED,
 
 @pytest.fixture(scope="module")
 def unbroken(desk: Path, cosim: Cosim) -> bytes:
-    """The table of a run of two episodes that nothing has interrupted."""
+    """The table of an uninterrupted run of two episodes."""
     done = cosim("run", *HELD, "unbroken", cwd=desk)
     assert done.returncode == 0, done.stderr
     return (desk / "unbroken/results.csv").read_bytes()
@@ -167,8 +167,8 @@ def unbroken(desk: Path, cosim: Cosim) -> bytes:
 def test_a_run_prints_its_table_and_leaves_its_folder(
     desk: Path, cosim: Cosim, whole_run: Path
 ) -> None:
-    """Rows, records, trajectories and specs are there; `show` prints the table again, `score`
-    computes it again."""
+    """The folder has rows, records, trajectories and specs; `show` prints the table again, and
+    `score` recomputes it."""
     table = rows(whole_run)
     assert list(table.index) == ["t-0", "t-1", "t-2"]
     assert set(table["status"]) == {"done"}
@@ -236,8 +236,9 @@ def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(
     assert (desk / "two/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
 
 
-def test_shards_that_are_merged_are_the_run(desk: Path, cosim: Cosim, whole_run: Path) -> None:
-    """Of three episodes in two shards, one of them from Python; each says what to do with it."""
+def test_merged_shards_equal_the_run(desk: Path, cosim: Cosim, whole_run: Path) -> None:
+    """Three episodes in two shards, one run from Python, merge to the same run; each shard says how
+    to merge it."""
     words = ("run", "tiny.json", "--policy", DRIVES, "--seed", SEED)
     said = cosim(*words, "--shard", "1/2", "--out", "shard-1", cwd=desk)
     assert said.returncode == 0 and "Shard 1/2 of the run: `cosim merge`" in said.stderr
@@ -261,7 +262,7 @@ def test_an_interrupted_run_is_finished_by_resume(
         run.send_signal(how)
         said = run.communicate(timeout=PATIENCE_S)[1]
         if how != signal.SIGKILL:
-            assert run.returncode == 130 and says_stopped(said, out.name), said
+            assert run.returncode == 130 and reports_stop(said, out.name), said
         kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
         wait_until(lambda: not alive(out))
     again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
@@ -271,7 +272,7 @@ def test_an_interrupted_run_is_finished_by_resume(
 
 
 def test_sigterm_stops_a_run_as_ctrl_c_does(desk: Path, cosim: Cosim) -> None:
-    """The same exit code and words, and no environment process is left."""
+    """SIGTERM gives the same exit code and message, and no environment process is left."""
     out = desk / "terminated"
     with held_before(desk, "t-1") as waits, ThreadPoolExecutor(1) as threads:
 
@@ -282,20 +283,20 @@ def test_sigterm_stops_a_run_as_ctrl_c_does(desk: Path, cosim: Cosim) -> None:
         sent = threads.submit(terminate)
         said = cosim("run", *HELD, out.name, cwd=desk)
         sent.result()
-        assert said.returncode == 130 and says_stopped(said.stderr, out.name), said
+        assert said.returncode == 130 and reports_stop(said.stderr, out.name), said
         wait_until(lambda: not alive(out))
 
 
-def says_stopped(said: str, out: str) -> bool:
-    """Whether a run of two episodes says that it was stopped in the second one, and the remedy."""
+def reports_stop(said: str, out: str) -> bool:
+    """Return whether the output says that a run stopped in its second episode, and the remedy."""
     return f"--out {out} --resume" in said and "1 of 2 episodes are finished and stored" in said
 
 
 def test_a_run_killed_at_its_start_leaves_no_false_crash(
     desk: Path, cosim: Cosim, unbroken: bytes
 ) -> None:
-    """A kill while the first environment process comes up, or before its first answer, loses
-    nothing. The run resumed after both gives the same table."""
+    """A kill during the start of the first environment process, or before its first answer, loses
+    nothing on resume."""
     out = desk / "killed-at-its-start"
     for when in ("its process starts", "its first episode starts"):
         more = ["--resume"] if out.exists() else []
@@ -313,8 +314,8 @@ def test_a_run_killed_at_its_start_leaves_no_false_crash(
     assert (out / "results.csv").read_bytes() == unbroken
 
 
-def hear_interrupts() -> None:
-    """A shell's background jobs are started deaf to Ctrl-C; a user's run is not one."""
+def accept_interrupts() -> None:
+    """Restore Ctrl-C, which background jobs of a shell ignore and a user's run does not."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -333,7 +334,8 @@ def children(pid: int) -> list[int]:
 def test_a_full_disk_ends_the_run_with_the_reason(
     desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """When a record cannot be written the run stops, says why, and keeps what is finished."""
+    """When a record cannot be written, the run stops, gives the reason, and leaves finished
+    episodes intact."""
     from cosim.results import run_folder
 
     def full(path: Path, data: bytes) -> None:
@@ -362,7 +364,7 @@ def test_a_full_disk_ends_the_run_with_the_reason(
 
 
 def alive(out: Path) -> bool:
-    """Whether an environment process still writes to the logs of a run."""
+    """Return whether an environment process still writes to the logs of a run."""
     logs = {str(p.resolve()) for p in out.glob("logs/*")}
     for fd in Path("/proc").glob("[0-9]*/fd/1"):
         try:
@@ -374,7 +376,7 @@ def alive(out: Path) -> bool:
 
 
 def test_a_second_run_on_the_same_folder_is_refused(desk: Path, cosim: Cosim) -> None:
-    """While a run is going on its folder is locked, and afterwards it is not overwritten."""
+    """The folder of a run in progress is locked, and that of a finished run is not overwritten."""
     with held_before(desk, "t-0") as waits, running(desk, *HELD, "held") as run:
         wait_until(waits)
         second = cosim("run", *HELD, "held", "--resume", cwd=desk)
@@ -384,11 +386,11 @@ def test_a_second_run_on_the_same_folder_is_refused(desk: Path, cosim: Cosim) ->
         assert third.returncode == 2 and "already holds a run. Add --resume" in third.stderr
 
 
-def test_names_that_do_not_exist_are_answered_with_those_that_do(
+def test_unknown_names_are_answered_with_the_valid_ones(
     desk: Path, cosim: Cosim, whole_run: Path
 ) -> None:
-    """Unknown suites, policies, scenarios, runs and episodes: exit 2, the name, and the valid
-    choices."""
+    """Unknown suites, policies, scenarios, runs and episodes give exit code 2, the name, and the
+    valid choices."""
     asked = {
         ("run", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
         ("run", "tiny.json", "--policy", "rout"): ("policy 'rout'", "social_force, stop, straight"),
@@ -419,16 +421,16 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do(
 
 
 def test_a_suite_without_scenarios_is_refused(desk: Path, cosim: Cosim) -> None:
-    """Nothing to run is an error that names the file, not a run of nothing that went well."""
+    """An empty suite is an error that names the file, not a successful run."""
     suite = json.loads((desk / "tiny.json").read_text())
     (desk / "empty.json").write_text(json.dumps(suite | {"scenarios": []}))
     said = cosim("run", "empty.json", "--out", "empty", cwd=desk)
     assert said.returncode == 2 and "empty.json: suite 'tiny' has no scenarios" in said.stderr
 
 
-def test_a_run_that_cannot_be_on_the_air_leaves_no_folder(desk: Path, cosim: Cosim) -> None:
-    """A wrong endpoint is told with the remedy, and the same command with a right one is not
-    refused."""
+def test_a_run_with_a_wrong_endpoint_leaves_no_folder(desk: Path, cosim: Cosim) -> None:
+    """A wrong endpoint is reported with the remedy, and the same command with a right one is
+    accepted."""
     said = cosim(
         "run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--insecure", "--out", "air", cwd=desk
     )
@@ -444,8 +446,8 @@ def test_a_run_that_cannot_be_on_the_air_leaves_no_folder(desk: Path, cosim: Cos
     )
 
 
-def test_ctrl_c_while_the_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stopped before any command has begun: exit code 130."""
+def test_ctrl_c_during_the_imports_gives_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that is stopped before it begins exits with code 130."""
     from cosim.__main__ import main
 
     def stopped() -> None:
@@ -482,17 +484,15 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
         assert sum(words in fault for fault in faults) == 1, (words, faults)
 
 
-def test_the_doctor_finds_every_engine_well(desk: Path, cosim: Cosim) -> None:
-    """`cosim doctor` draws a frame, walks people, asks a director, and says so."""
+def test_the_doctor_reports_every_engine_as_working(desk: Path, cosim: Cosim) -> None:
+    """`cosim doctor` draws a frame, moves pedestrians, queries a director, and reports success."""
     said = cosim("doctor", cwd=desk)
     assert said.returncode == 0, said.stdout
     assert said.stdout.count("ok") >= 6 and "failed" not in said.stdout
 
 
-def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(
-    desk: Path, cosim: Cosim
-) -> None:
-    """A drawn seed is printed and is in run.json and every row; --resume takes it and refuses
+def test_a_run_without_a_seed_draws_and_records_one(desk: Path, cosim: Cosim) -> None:
+    """The drawn seed is printed and is in run.json and every row; --resume uses it and refuses
     another."""
     words = ("run", "tiny.json", "--policy", "schedule:stand", "--episodes", "1", "--out", "one")
     run = cosim(*words, cwd=desk)
@@ -509,7 +509,7 @@ def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(
     assert f"its seed is {seed}, and this command has 3" in refused.stderr
 
 
-def test_the_record_says_what_it_was_made_with(whole_run: Path) -> None:
+def test_a_record_has_its_inputs_and_versions(whole_run: Path) -> None:
     """Suite and scenario hash, seed, policy, renderer and the version of every engine are in each
     record."""
     record = msgspec.json.decode((whole_run / "episodes/t-0/record.json").read_bytes())

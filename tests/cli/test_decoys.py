@@ -1,4 +1,4 @@
-"""Decoys on the command line: which are run, with which shards, and what their table says."""
+"""Decoys on the command line: selection, shards and tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.event_ways import event_way
 
 @pytest.fixture
 def few(tmp_path: Path) -> Path:
-    """Two scenarios in a small city that are over after a second, and their decoys at the end."""
+    """Two scenarios in a small city that end after a second, followed by their decoys."""
     events = [
         event_way(kind, f"{kind}-001", at_m=10.0, time_s=1.0) for kind in ("lateral", "overtaking")
     ]
@@ -30,8 +30,8 @@ def few(tmp_path: Path) -> Path:
 
 @pytest.mark.engine
 def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim) -> None:
-    """In each shard pairs alone, which merged have D; one alone by its id, none with --no-decoys; a
-    run is resumed with its own choice; `cosim score` and `cosim list` know decoys."""
+    """Shards hold pairs and merge to D, an id selects one, --no-decoys none, and resume, score and
+    list respect decoys."""
 
     always = ("run", few.name, "--policy", "schedule:stand", "--seed", "7")
 

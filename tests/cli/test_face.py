@@ -1,4 +1,4 @@
-"""`import cosim`: what it gives, what it costs, and what its documentation says."""
+"""The public interface of `import cosim`: names, import cost, and documentation."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ PRODUCT = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
 def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
-    """A new process that imports cosim has loaded no other package, and one file of ours: so it
-    takes no time."""
+    """A new process that imports cosim has loaded one file of the project and no other package."""
     told = subprocess.run(
         [
             sys.executable,
@@ -44,8 +43,8 @@ def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
     "name",
     [pytest.param(name, marks=[pytest.mark.engine] * (name in DRIVES)) for name in cosim.__all__],
 )
-def test_the_example_of_every_public_name_is_true(name: str) -> None:
-    """Every name of `__all__` says what it is and shows an example, which gives what it says."""
+def test_the_example_of_every_public_name_is_correct(name: str) -> None:
+    """Every name of `__all__` is documented with an example whose output is correct."""
     value = getattr(cosim, name)
     (shown,) = doctest.DocTestFinder(recurse=False).find(
         value, name, globs=vars(sys.modules[value.__module__]).copy()
@@ -57,14 +56,14 @@ def test_the_example_of_every_public_name_is_true(name: str) -> None:
     assert not runner.failures, told.getvalue()
 
 
-def test_another_name_is_refused_with_the_valid_ones() -> None:
-    """A misspelt name is an AttributeError that lists what there is."""
+def test_an_unknown_name_is_refused_with_the_valid_ones() -> None:
+    """A misspelt name is an AttributeError that lists the valid ones."""
     with pytest.raises(AttributeError, match=r"no attribute 'Epsiode'.*Episode"):
         cosim.Epsiode  # noqa: B018  the access is the test
 
 
 def test_the_crowd_is_created_in_one_file() -> None:
-    """One module connects SUMO's crowd to episodes."""
+    """Exactly one module connects SUMO's crowd to episodes."""
     files = [path for top in PRODUCT for path in (ROOT / top).rglob("*.py")]
     calls = [
         str(p.relative_to(ROOT))

@@ -1,4 +1,4 @@
-"""`cosim run` as a newcomer uses it: a policy by its file, what is printed, what to do next."""
+"""`cosim run` as a newcomer uses it: a policy from its file, the output, and the next steps."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Far:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a suite of one short scenario, and a policy in a folder of its own, beside what
-    it imports."""
+    """A folder with a suite of one short scenario, and a policy in its own folder with a module
+    that it imports."""
     folder = tmp_path_factory.mktemp("desk")
     one = msgspec.structs.replace(small_scenario(), id="n-0", time_limit_s=1.0)
     write_suite(Suite(name="one", version="1", scenarios=(one,)), folder / "one.json")
@@ -64,8 +64,8 @@ limits = {time_s = 1}
 
 @pytest.mark.engine
 def test_every_command_that_runs_a_policy_can_isolate_it(tmp_path: Path, cosim: Cosim) -> None:
-    """It cannot read beyond its folder in runs, checks and collections; --policy-data shows it
-    more."""
+    """In runs, checks and collections it cannot read beyond its folder; --policy-data adds a
+    folder."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/peeks.py").write_text(PEEKS)
     (tmp_path / "secret.txt").write_text("secret")
@@ -119,7 +119,8 @@ first one."""
 
 @pytest.mark.engine
 def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosim: Cosim) -> None:
-    """A policy that remembers does not recognize a decoy, with one process per half of the run."""
+    """A policy with memory cannot recognize a decoy, because each half of the run has its own
+    process."""
     (tmp_path / "memory.py").write_text(MEMORY)
     nobody = CrowdSpec(persons=0, vehicles=0)
     small = msgspec.structs.replace(small_scenario(), time_limit_s=0.5, crowd=nobody)
@@ -145,9 +146,9 @@ def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosi
 
 
 @pytest.mark.engine
-def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim) -> None:
-    """Also in processes that only inherit where it is: isolated ones. The run goes on by any
-    spelling, until edited."""
+def test_a_policy_by_file_equals_the_policy_by_module(desk: Path, cosim: Cosim) -> None:
+    """Isolated processes load it too, and a run resumes with either spelling until the file is
+    edited."""
     suite, out = str(desk / "one.json"), str(desk / "run")
     by_file = ("run", suite, "--policy", "deeper/far.py:Far", "--isolated", "--out", out)
     said = cosim(*by_file, cwd=desk)
@@ -182,7 +183,7 @@ def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim)
 def test_the_file_of_a_policy_is_sent_to_a_cluster(
     desk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ray is given the file that its name says, as for a module."""
+    """Ray gets the named file, as for a module."""
     from scenarios.runs.ray_workers import _own_module
 
     monkeypatch.chdir(desk)
@@ -191,8 +192,11 @@ def test_the_file_of_a_policy_is_sent_to_a_cluster(
     assert _own_module("orca") == ""
 
 
-def test_what_is_of_one_machine_is_refused_in_words(cosim: Cosim, tmp_path: Path) -> None:
-    """Before anything is loaded, listened to or written; its help does not offer it."""
+def test_options_of_a_single_machine_are_refused_with_a_reason(
+    cosim: Cosim, tmp_path: Path
+) -> None:
+    """They are refused before anything is loaded, opened or written, and the help does not offer
+    them."""
     for words in (
         ("--shared-renderer",),
         ("--real-time",),
@@ -207,8 +211,10 @@ def test_what_is_of_one_machine_is_refused_in_words(cosim: Cosim, tmp_path: Path
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_shard_of_a_coordinator_is_one_of_a_run(cosim: Cosim, tmp_path: Path) -> None:
-    """It needs the run's seed, and there are no more shards than scenarios."""
+def test_a_shard_of_a_coordinator_is_checked_like_that_of_a_run(
+    cosim: Cosim, tmp_path: Path
+) -> None:
+    """It needs the run's seed, and at most as many shards as scenarios."""
     words = (
         "coordinator",
         "reactive",

@@ -1,4 +1,4 @@
-"""From a policy's answer to a command."""
+"""Conversion of a policy's answer to a command."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ BY_HAND = {
 @pytest.mark.parametrize("name", BY_HAND)
 @pytest.mark.parametrize("rule", [WaypointRule(), ATAN2], ids=["shipped", "atan2"])
 def test_both_rules_turn_as_worked_out_by_hand(name: str, rule: WaypointRule) -> None:
-    """v is x / dt, never backwards; w is that of the rule; only behind the robot the two differ."""
+    """v is x / dt, never negative, w follows the rule, and the two rules differ only behind the
+    robot."""
     x_m, y_m, heading_rad, shipped, atan2 = BY_HAND[name]
     row = (
         [x_m, y_m]
@@ -82,16 +83,15 @@ def test_both_rules_turn_as_worked_out_by_hand(name: str, rule: WaypointRule) ->
 
 
 def test_a_waypoint_behind_the_robot_turns_it_as_the_models_were_driven() -> None:
-    """(-1, 0.5) at 0.25 s: -1.85 rad/s by the shipped rule, clipped to the courier's -0.65; by
-    atan2 to +0.65."""
+    """(-1, 0.5) at 0.25 s gives -1.85 rad/s by the shipped rule, clipped to -0.65 for the courier,
+    and +0.65 by atan2."""
     answer = [[-1.0, 0.5]] * 3
     assert of(answer, robot=QUICK).w_radps == pytest.approx(-1.85, abs=0.005)
     assert of(answer) == Command(0.0, -0.65) and of(answer, ATAN2) == Command(0.0, 0.65)
 
 
 def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> None:
-    """The third one unless it says otherwise; x and y times the unit, in the step that is
-    declared."""
+    """The default is the third one; x and y are multiplied by the unit over the declared step."""
     answer = np.array([[0.1, 0.0], [0.2, 0.1], [0.4, 0.0], [0.5, 0.5]])
     assert of(answer) == Command(1.6, 0.0)
     assert of(answer, WaypointRule(index=0)) == Command(0.4, 0.0)
@@ -104,7 +104,7 @@ def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> No
     )
 
 
-def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
+def test_a_command_carries_the_waypoints_that_it_follows() -> None:
     """A command carries its waypoints in metres and the index of the followed one."""
     rule = WaypointRule(index=1, unit_m=0.5)
     told = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
@@ -131,7 +131,7 @@ def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
 
 
 def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> None:
-    """Two waypoints, and the third is followed."""
+    """Two waypoints are refused where the third is followed."""
     with pytest.raises(PolicyError) as caught:
         of([[0.1, 0.0], [0.2, 0.0]])
     assert str(caught.value) == (
@@ -141,11 +141,11 @@ def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> No
 
 
 @given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(-math.pi, math.pi))
-def test_the_rules_agree_before_the_robot_and_never_leave_its_limits(
+def test_the_rules_agree_ahead_of_the_robot_and_respect_its_limits(
     x_m: float, y_m: float, heading: float
 ) -> None:
-    """For any waypoint: within the limits; ahead of the robot the same by both; mirrored, it turns
-    the other way."""
+    """For any waypoint commands stay within the limits, agree ahead of the robot, and mirror to the
+    other side."""
     row, mirrored = (
         (x_m, side * y_m, math.cos(heading), side * math.sin(heading)) for side in (1.0, -1.0)
     )
@@ -215,9 +215,9 @@ UNUSABLE: dict[str, tuple[object, str]] = {
 
 
 @pytest.mark.parametrize("name", UNUSABLE)
-def test_an_unusable_answer_is_refused_with_what_came(name: str) -> None:
-    """NaN, what is not real numbers, wrong shapes and other things raise PolicyError that says what
-    came."""
+def test_an_unusable_answer_is_refused_with_its_value(name: str) -> None:
+    """NaN, values that are not real numbers, wrong shapes and other objects raise PolicyError with
+    the value."""
     answer, message = UNUSABLE[name]
     with pytest.raises(PolicyError) as caught:
         of(answer)
@@ -225,7 +225,7 @@ def test_an_unusable_answer_is_refused_with_what_came(name: str) -> None:
 
 
 def test_numbers_of_every_kind_are_commands() -> None:
-    """Integers and numpy's numbers of any width are read once, as floats."""
+    """Integers and numpy numbers of any width are read once, as floats."""
     assert of(Command(1, np.float32(0.5))) == Command(1.0, 0.5)
     assert of(Command(np.int64(1), np.float16(0.5))) == Command(1.0, 0.5)
     assert of(np.array([[1, 0]] * 3, dtype=np.uint8)) == Command(2.5, 0.0)
@@ -234,7 +234,7 @@ def test_numbers_of_every_kind_are_commands() -> None:
 
 
 def test_a_clock_counts_in_whole_periods() -> None:
-    """Ticks, substeps and policy periods come from integers, and a rate that does not divide is
+    """Ticks, substeps and policy periods are whole numbers, and a rate that does not divide is
     refused."""
     clock = Clock.for_rate(4)
     assert (clock.substeps, clock.time_s(7), clock.ticks(10.0)) == (10, 0.35, 200)

@@ -1,5 +1,4 @@
-"""Latency: commands that take effect later than what they answer, given, and as measured in real
-time."""
+"""Latency: delayed commands, with a fixed delay and as measured in real time."""
 
 from __future__ import annotations
 
@@ -38,18 +37,16 @@ from tests.run_specs import changed, record_of
 
 
 def commands(answers: Floats, ticks: int) -> Floats:
-    """(ticks, 2) what the answers of an episode without a reset are as commands, tick by tick."""
+    """Return (ticks, 2) the commands of an episode's answers tick by tick, without a reset."""
     held = np.zeros((ticks, 2))
     for tick, delay, v_mps, w_radps in answers:
         held[int(tick + delay) :] = v_mps, w_radps
     return held
 
 
-def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put_elsewhere() -> (
-    None
-):
-    """By hand: asked at 0, 5, 10 with 7 ticks of delay; that of 10 is on its way when the robot is
-    put back."""
+def test_delayed_commands_keep_their_order_and_a_reset_discards_them() -> None:
+    """By hand: queries at 0, 5 and 10 with 7 ticks of delay, of which the last is pending at a
+    reset."""
     way = CommandDelay()
     told = [Command(float(v), 0.0) for v in (1, 2, 3)]
     way.add(0, 7, told[0])
@@ -68,14 +65,15 @@ def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put
 @pytest.mark.parametrize(
     "latency_ms", [-1.0, float("nan"), 10_001.0], ids=["negative", "no number", "too much"]
 )
-def test_a_latency_that_there_is_not_is_refused(latency_ms: float) -> None:
-    """In words that give the range."""
+def test_an_invalid_latency_is_refused(latency_ms: float) -> None:
+    """The message has the range."""
     with pytest.raises(UsageError, match=r"latency_ms must be from 0 to 10000 ms, not"):
         EpisodeOptions(latency_ms=latency_ms)
 
 
-def test_real_time_goes_with_one_process_and_no_latency() -> None:
-    """Who would time the others too is refused, and who asks for both."""
+def test_real_time_needs_one_process_and_no_latency() -> None:
+    """Real time is refused with several processes, which would delay each other, and with a fixed
+    latency."""
     with pytest.raises(UsageError, match="leave latency_ms out"):
         EpisodeOptions(latency_ms=50.0, real_time=True)
     for jobs, shared, named in ((2, False, "2 jobs"), (1, True, "a shared renderer")):
@@ -84,10 +82,9 @@ def test_real_time_goes_with_one_process_and_no_latency() -> None:
             check_real_time(EpisodeOptions(real_time=True), jobs, shared)
 
 
-def test_tables_tell_of_latency_where_there_is_any() -> None:
-    """A given one as a number; of a measured one, of the episodes that ended, what answers took
-    beside the whole ticks after which their commands took effect, and what it is not; of none
-    nothing."""
+def test_tables_show_latency_only_where_there_is_any() -> None:
+    """A fixed one is a number; a measured one has answer times and effective ticks of ended
+    episodes, and its limits."""
 
     def told(*records: Record) -> str:
         out, said = terminal()
@@ -122,8 +119,8 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
     ],
     ids=["a word", "both", "negative", "no number"],
 )
-def test_a_latency_that_cannot_be_had_is_refused(asked: str, real_time: bool, told: str) -> None:
-    """By name, with the remedy."""
+def test_contradictory_latency_options_are_refused(asked: str, real_time: bool, told: str) -> None:
+    """The options are named, with the remedy."""
     with pytest.raises(UsageError, match=re.escape(told)):
         RunConfig(suite="reactive", latency=asked, real_time=real_time)
 
@@ -151,8 +148,7 @@ class Slow:
 
 
 class Faster:
-    """Blind, 5 Hz; at each observation it wants to be a tenth of a metre a second faster. It is
-    slow to answer."""
+    """A blind 5 Hz policy that is slow to answer and adds 0.1 m/s to its speed at each observation."""
 
     manifest = Manifest("faster", rate_hz=5.0, camera=None)
 
@@ -161,7 +157,7 @@ class Faster:
         self._slow_s = slow_s
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Begin slowly."""
+        """Start slowly."""
         self.asked = []
 
     def act(self, observation: Observation) -> Command:
@@ -176,11 +172,11 @@ def scenario() -> Scenario:
 
 
 @pytest.mark.engine
-def test_with_latency_each_command_takes_effect_so_much_later_to_the_tick(
+def test_a_fixed_latency_delays_each_command_to_the_tick(
     scenario: Scenario,
 ) -> None:
-    """By hand: 120 ms are three ticks, so that of observations every 4 ticks the commands begin at
-    3, 7, 11, ..."""
+    """By hand: 120 ms are three ticks, so commands of observations every 4 ticks begin at 3, 7, 11,
+    ..."""
     came = run_episode(scenario, Faster(), EpisodeOptions(latency_ms=120.0))
     assert came.log is not None and (came.record.setup.latency_ms, came.record.setup.real_time) == (
         120.0,
@@ -192,11 +188,11 @@ def test_with_latency_each_command_takes_effect_so_much_later_to_the_tick(
 
 
 @pytest.mark.engine
-def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(
+def test_real_time_delays_are_recorded_and_replayed(
     scenario: Scenario,
 ) -> None:
-    """A policy that takes 0.2 s: the recorded delays are what was applied, it is not asked before
-    it has answered, and the replay of the record has the same state hash."""
+    """For a policy of 0.2 s the recorded delays were applied, queries do not overlap, and the
+    replay has the same state hash."""
     slow = Faster(slow_s=0.2)
     came = run_episode(scenario, slow, EpisodeOptions(real_time=True))
     record, log = came.record, came.log
@@ -214,11 +210,11 @@ def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(
 
 
 @pytest.mark.engine
-def test_a_measured_latency_is_that_of_every_command_of_the_run(
+def test_a_measured_latency_applies_to_every_command_of_the_run(
     scenario: Scenario, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Not less than what the policy sleeps, and fixed: the row tells it, `--resume` keeps it and
-    refuses another."""
+    """It is at least the policy's sleep, constant, in the row, and `--resume` uses it and refuses
+    another."""
     (tmp_path / "slow_one.py").write_text(SLOW_ONE)
     short = msgspec.structs.replace(scenario, time_limit_s=1.0)
     write_suite(Suite(name="brief", version="1", scenarios=(short,)), tmp_path / "brief.json")
@@ -241,11 +237,11 @@ def test_a_measured_latency_is_that_of_every_command_of_the_run(
 
 
 @pytest.mark.parametrize(("status", "ended"), [("crashed", None), ("invalid", float("nan"))])
-def test_a_latency_is_not_taken_from_an_episode_that_did_not_end(
+def test_a_latency_is_not_measured_in_an_unfinished_episode(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch, status: str, ended: float | None
 ) -> None:
-    """Whether the policy crashed or an engine failed: it is refused with the reason, and not 0
-    ms."""
+    """After a crash of the policy or an engine the measurement is refused with the reason, and is
+    not 0 ms."""
     row = {"status": status, "ended": ended, "reason": "no memory", "latency_ms": 0.0}
     monkeypatch.setattr(suite_run, "run", lambda *_, **__: pd.DataFrame([row]))
     suite = Suite(name="brief", version="1", scenarios=(scenario,))

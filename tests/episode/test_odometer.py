@@ -29,9 +29,8 @@ def straight(far_m: float, steps: int = 100) -> list[Pose]:
     ]
 
 
-def test_exact_odometry_is_where_the_robot_is_from_its_start() -> None:
-    """3 m north and 2 m west of a start that looks north, looking west: 3 m ahead, 2 m left, a
-    quarter turn; carried or driven."""
+def test_exact_odometry_is_the_pose_relative_to_the_start() -> None:
+    """3 m north and 2 m west of a start facing north is 3 m ahead and 2 m left, carried or driven."""
     told = odometer_for("exact", START, np.random.default_rng(0)).read(
         Pose(8.0, 23.0, math.pi), 1.0
     )
@@ -40,8 +39,8 @@ def test_exact_odometry_is_where_the_robot_is_from_its_start() -> None:
     assert odometer_for("none", START, np.random.default_rng(0)).read(START, 1.0) is None
 
 
-def test_wheels_without_errors_count_the_way_and_not_what_carries_the_robot() -> None:
-    """A quarter circle of 5 m to the left; then it is put elsewhere, and drives 2 m on."""
+def test_wheels_without_errors_count_driving_and_not_resets() -> None:
+    """A quarter circle of 5 m to the left and 2 m after a reset are counted, the reset is not."""
     counted = DeadReckoning(np.random.default_rng(0), DriftNoise(0.0, 0.0, 0.0, 0.0, 0.0))
     angles = np.linspace(0.0, 0.5 * math.pi, 200).tolist()
     told = driven(counted, [Pose(5 * math.sin(a), 5 - 5 * math.cos(a), a) for a in angles])
@@ -52,7 +51,7 @@ def test_wheels_without_errors_count_the_way_and_not_what_carries_the_robot() ->
 
 
 def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
-    """1 m aside is counted to a few per cent; over 30 m the heading drifts by 15 degrees."""
+    """1 m aside is counted within a few per cent, and over 30 m the heading drifts by 15 degrees."""
     aside = [
         driven(
             odometer_for("wheel", START, np.random.default_rng(seed), DOG),
@@ -72,9 +71,9 @@ def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
     assert headings.std() == pytest.approx(expected, rel=0.15)
 
 
-def test_wheels_are_as_wrong_as_declared() -> None:
-    """Over 400 episodes of 100 m: scale and noise make the length, drift and noise the heading;
-    nothing is wrong of a robot that stands."""
+def test_wheel_errors_are_as_declared() -> None:
+    """In 400 episodes of 100 m the errors of length and heading are those declared; a robot at rest
+    has none."""
     noise = DriftNoise()
     far_m = 100.0
     ends = [
@@ -93,9 +92,9 @@ def test_wheels_are_as_wrong_as_declared() -> None:
     assert driven(DeadReckoning(np.random.default_rng(1)), [START] * 100) == Odometry(0.0, 0.0, 0.0)
 
 
-def test_fixes_are_as_wrong_as_declared() -> None:
-    """Over 400 episodes each fix is off by noise and bias; from one second to the next by the noise
-    alone, nearly; a minute later the bias is another; no heading is told."""
+def test_position_fix_errors_are_as_declared() -> None:
+    """In 400 episodes fixes have the declared noise and a bias that drifts over minutes, and no
+    heading."""
     noise = GpsNoise()
     errors = []
     for seed in range(400):
@@ -117,7 +116,7 @@ def test_fixes_are_as_wrong_as_declared() -> None:
 
 @pytest.mark.parametrize("kind", ["exact", "wheel", "gps"])
 def test_odometry_is_the_same_for_the_same_seed(kind: str) -> None:
-    """And another for another, but where it has no error."""
+    """Another seed gives another odometry, unless it has no error."""
 
     def told(seed: int) -> Odometry | None:
         return driven(odometer_for(kind, START, np.random.default_rng(seed)), straight(30.0))  # type: ignore[arg-type]

@@ -1,5 +1,4 @@
-"""The small policies that ship, which were trained by `cosim train`; none of them: nothing to
-test."""
+"""The small shipped policies, trained by `cosim train`; without any there is nothing to test."""
 
 from __future__ import annotations
 
@@ -17,8 +16,8 @@ SMALL = [name for name in shipped_bundles() if name.startswith("small")]
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: str) -> None:
-    """Its folder is no larger than 8 MB; by its name it is loaded and asked without PyTorch in the
+def test_a_shipped_small_policy_is_small_and_answers_without_pytorch(name: str) -> None:
+    """Its folder is at most 8 MB, and it is loaded by name and queried without PyTorch in the
     process."""
     assert sum(path.stat().st_size for path in shipped_bundles()[name].iterdir()) < 8_000_000
     code = (
@@ -34,11 +33,8 @@ def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: st
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", SMALL)
-def test_a_small_policy_that_ships_drives_to_a_goal_by_what_it_sees(
-    name: str, tmp_path: Path, cosim: Cosim
-) -> None:
-    """By its name, as any policy: over a crosswalk of the test part, in a city that it has never
-    seen."""
+def test_a_shipped_small_policy_drives_to_a_goal(name: str, tmp_path: Path, cosim: Cosim) -> None:
+    """By its name it crosses a crosswalk of the test split, in a city that it was not trained on."""
     said = cosim(
         "run",
         "unit",

@@ -44,7 +44,8 @@ def written(path: Path, *features: dict[str, Any], frame: str | None = "local") 
 
 
 def test_local_and_wgs84_files_give_equal_areas(tmp_path: Path) -> None:
-    """Areas in degrees near the georeference are those in metres of the map, whose frame is named."""
+    """Areas in degrees near the georeference equal those in metres of the map, whose frame is
+    named."""
     degrees = np.array([[13.1955, 55.6982], [13.1957, 55.6982], [13.1957, 55.6983]])
     metres = to_local(degrees, LUND)
     assert metres[1, 0] - metres[0, 0] == pytest.approx(12.57, abs=0.02)
@@ -106,7 +107,7 @@ def test_metres_and_degrees_are_not_confused(tmp_path: Path, name: str) -> None:
 
 
 def test_areas_survive_writing_and_reading(tmp_path: Path) -> None:
-    """What is written for editing reads back as it was, holes included."""
+    """Areas written for editing read back unchanged, holes included."""
     holed = shapely.box(1, 1, 9, 9) - shapely.box(3, 3, 5, 5)
     areas = [ScanArea("sidewalk", holed), ScanArea("obstacle", shapely.box(6, 6, 7, 7))]
     (tmp_path / "areas.geojson").write_bytes(encode_areas(areas, step_m=0.01))
@@ -178,7 +179,7 @@ def test_walked_paths_of_both_formats_are_equal(tmp_path: Path) -> None:
 
 
 def test_a_corridor_covers_measured_ground_alone() -> None:
-    """It is as wide as wanted and ends where the scan has no ground."""
+    """It has the requested width and ends where the scan has no ground."""
     measured = GRID.measured.copy()
     measured[:, 121:] = False
     grid = dataclasses.replace(GRID, measured=measured)
@@ -192,7 +193,7 @@ def test_a_corridor_covers_measured_ground_alone() -> None:
         corridor(way + 100.0, 3.0, grid)
 
 
-def test_walkable_ground_is_drawn_ground_less_what_stands() -> None:
+def test_walkable_ground_is_drawn_ground_without_obstacles() -> None:
     """Obstacles, blocked cells and uncovered ground are left out."""
     blocked = STREET_GRID.blocked.copy()
     blocked[22:27, 60:65] = True  # x 10 to 11, y 0.5 to 1.5
@@ -210,7 +211,7 @@ def test_walkable_ground_is_drawn_ground_less_what_stands() -> None:
 
 
 def test_a_draft_is_the_largest_level_free_piece() -> None:
-    """Steep, blocked and unmeasured ground is left out, and so is what is behind it."""
+    """Steep, blocked and unmeasured ground is left out, and so is what lies behind it."""
     grade = np.zeros(GRID.heights.shape, dtype=np.float32)
     grade[:, 80:84] = 1.0  # a step at x = 20 to 21
     blocked = GRID.blocked.copy()
@@ -224,7 +225,8 @@ def test_a_draft_is_the_largest_level_free_piece() -> None:
 
 
 def test_areas_of_a_map_are_moved_to_free_ground() -> None:
-    """A sidewalk between two walls is found again after a shift, and the rest is told."""
+    """A sidewalk between two walls is found again after a shift, which is
+    reported."""
     blocked = np.ones(GRID.heights.shape, dtype=bool)
     blocked[32:45] = False  # y 8 to 11
     grid = dataclasses.replace(GRID, blocked=blocked)

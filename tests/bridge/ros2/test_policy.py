@@ -195,8 +195,7 @@ def test_an_invalid_command_crashes_with_a_description(
     at: str, sends: Any, words: str, capfd: Any
 ) -> None:
     """The episode crashes at its timeout; the message says what was sent, by which node, and is
-    printed once.
-    """
+    printed once."""
     type_name = TWIST if words == "finite" else TWIST_STAMPED
     with (
         driven(at, start_s=1.5) as driver,
@@ -230,8 +229,7 @@ def test_a_node_that_cannot_drive_is_described(
     at: str, network: Network, type_name: str, words: str
 ) -> None:
     """The crash names a wrong type, domain, namespace or distribution, which is also shown while
-    the run waits.
-    """
+    the run waits."""
     shown: list[str] = []
     with (
         driven(at, start_s=1.2) as driver,
@@ -282,8 +280,7 @@ def test_a_node_without_commands_is_described(
     at: str, reads: dict[str, str], words: str, monkeypatch: Any
 ) -> None:
     """A subscription of a wrong type, one to a silent topic, or none is in the crash message and
-    shown while waiting.
-    """
+    shown while waiting."""
     monkeypatch.setattr(ros2_policy, "SETTLED_S", 0.6)
     shown: list[str] = []
     with driven(at, start_s=1.6) as driver, Peer(at, reads=False) as peer:
@@ -316,8 +313,7 @@ def test_nodes_behind_the_dds_bridge_drive(at: str) -> None:
 
 def test_a_lost_node_is_a_crash_and_a_new_one_drives_the_next_episode(at: str) -> None:
     """A node that ends in an episode is named, its tokens are gone, and the next episode waits for
-    another.
-    """
+    another."""
 
     def silent(peer: Peer, seen: Seen) -> None:
         if seen.time_ns == 10**9:
@@ -382,8 +378,7 @@ def test_a_restarted_node_is_not_two_nodes(
     at: str, dialect: Any, words: str, when: str, monkeypatch: Any
 ) -> None:
     """A node that restarts in an episode is reported at once as restarted, even without the
-    observation; the next episode uses the new one.
-    """
+    observation; the next episode uses the new one."""
     monkeypatch.setattr(ros2_policy, "GONE_S", 30.0)
     network = Network(dialect=dialect)
 
@@ -440,8 +435,7 @@ def test_a_kind_of_fault_is_reported_once_in_an_episode(at: str, capfd: Any) -> 
 
 def test_a_long_plan_is_recorded_and_one_too_long_is_reported(at: str, capfd: Any) -> None:
     """A plan of 200 KiB is read; the length of one above 1 MiB is reported while the node continues
-    to drive.
-    """
+    to drive."""
     where = types.message("geometry_msgs/msg/Point", 3.0, 0.0, 0.0)
     turn = types.message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
     pose = types.message("geometry_msgs/msg/Pose", where, turn)
@@ -512,8 +506,7 @@ def test_a_late_node_gets_the_latched_topics(at: str) -> None:
 
 def test_settings_are_checked_before_anything_opens() -> None:
     """ROS 2 options without the policy, two endpoints, a domain beyond the last and bad values are
-    refused with a remedy.
-    """
+    refused with a remedy."""
     wrong: dict[str, dict[str, Any]] = {
         "--ros2-wait goes with --policy ros2:": {"policy": "orca", "ros2_wait": "rate"},
         "listens or connects, not both": {

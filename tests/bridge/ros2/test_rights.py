@@ -50,8 +50,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 class Hub:
     """A run's hub and its own process; `heard` are the keys of messages from outside that reached
-    them.
-    """
+    them."""
 
     def __init__(self, certs: Path, stack: ExitStack) -> None:
         self.at = f"tls/localhost:{free_port()}"
@@ -78,8 +77,7 @@ def hub(certs: Path) -> Iterator[Hub]:
 
 def test_a_node_receives_topics_and_sends_only_commands_and_plans(certs: Path, hub: Hub) -> None:
     """A node gets every published topic and sees the run's token; of its messages only commands,
-    plans and tokens arrive.
-    """
+    plans and tokens arrive."""
     with plain_zenoh(hub.at, certs, "ros2") as guest:
         got: list[str] = []
         guest.declare_subscriber("3/**", lambda sample: got.append(str(sample.key_expr)))
@@ -139,8 +137,7 @@ def test_nodes_do_not_reach_each_other_through_the_run(certs: Path, hub: Hub) ->
 
 def test_without_a_node_certificate_nothing_is_received(certs: Path, hub: Hub) -> None:
     """Without a certificate there is no link; a certificate of another role gives a link that
-    carries nothing.
-    """
+    carries nothing."""
     with plain_zenoh(hub.at, certs, "viewer") as viewer:
         got: list[str] = []
         for name in (*OUT.values(), "**"):
@@ -159,8 +156,7 @@ def test_without_a_node_certificate_nothing_is_received(certs: Path, hub: Hub) -
 
 def test_zenoh_opens_a_session_with_the_configuration_for_nodes(certs: Path, hub: Hub) -> None:
     """`session.json5` of the role connects to the run's machine once its port is set, with the
-    timestamps that history needs.
-    """
+    timestamps that history needs."""
     path = certs / "ros2" / "session.json5"
     path.write_text(path.read_text().replace(":7447", f":{hub.at.rpartition(':')[2]}"))
     config = zenoh.Config.from_file(path)
@@ -172,8 +168,7 @@ def test_zenoh_opens_a_session_with_the_configuration_for_nodes(certs: Path, hub
 @pytest.mark.parametrize("host", ["fd00::7", ""])
 def test_the_configuration_for_nodes_always_names_a_host(tmp_path: Path, host: str) -> None:
     """An IPv6 address has brackets; without a coordinator's certificate there is a placeholder to
-    replace.
-    """
+    replace."""
     make_authority(tmp_path / "certs", [host or "localhost"], 365)
     if not host:
         (tmp_path / "certs" / "coordinator" / "key.pem").unlink()

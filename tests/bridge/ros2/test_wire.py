@@ -76,8 +76,7 @@ def seen(**more: Any) -> Observation:
 @pytest.mark.parametrize("store", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
 def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
     """Each stored hash equals that of rosbags for the distribution's definition, and every topic
-    has one.
-    """
+    has one."""
     definitions = get_typestore(store)
     assert {name: definitions.hash_rihs01(name) for name in types.HASHES} == dict(types.HASHES)
     used = {
@@ -89,8 +88,7 @@ def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
 
 def test_keys_tokens_and_gids_are_those_of_the_design_document() -> None:
     """Its examples are read and written back to the letter; QoS texts, key, gid and attachment have
-    the documented form.
-    """
+    the documented form."""
     for token in (TALKER, LISTENER):
         end = read_rmw_token(token)
         assert end is not None and rmw_token(end) == token and end.domain == 2
@@ -123,8 +121,7 @@ def test_a_namespace_is_mangled_in_tokens() -> None:
 
 def test_each_message_is_decoded_to_what_was_observed() -> None:
     """All topics of an observation survive CDR with values, frames and stamps, as the same bytes
-    each time.
-    """
+    each time."""
     one = seen()
     sent = {row.name: row.message(one, NOW_NS) for row in messages.TOPICS.values() if row.message}
     assert sent.pop("/points") is None
@@ -161,8 +158,7 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
 
 def test_optical_frames_look_ahead() -> None:
     """The chain base_link -> camera_link -> optical frame equals the calibration of the picture,
-    and camera_link has x ahead.
-    """
+    and camera_link has x ahead."""
     one = seen()
     frames = {frame.child_frame_id: frame for frame in messages.static_tf(one, NOW_NS).transforms}
     assert list(frames) == ["odom", messages.CAMERA, messages.OPTICAL, messages.LIDAR, messages.IMU]
@@ -247,8 +243,7 @@ def test_a_command_is_taken_by_the_rule_of_its_stamp() -> None:
 
 def test_an_invalid_command_is_described_and_never_driven() -> None:
     """NaN, excess length, another type or hash, a wall clock, no attachment and malformed bytes are
-    reported with node and remedy.
-    """
+    reported with node and remedy."""
     good = twist(1.0, 0.5)
     faults = {
         "both must be finite": verdict(twist(math.nan, 0.0)),
@@ -270,8 +265,7 @@ def test_an_invalid_command_is_described_and_never_driven() -> None:
 
 def test_a_plan_is_turned_into_the_robots_frame() -> None:
     """Points of a path in odom become metres ahead and left, 32 at most; other frames, empty and
-    malformed paths are refused.
-    """
+    malformed paths are refused."""
     turn = types.message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
 
     def path(frame: str, points: list[tuple[float, float]]) -> bytes:

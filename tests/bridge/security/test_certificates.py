@@ -1,6 +1,5 @@
 """Certificates: created once, readable by their owner alone, shown with their end, and refused with
-a reason.
-"""
+a reason."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ def open_end(folder: Path, role: Role) -> Connection:
 
 def test_the_command_creates_shows_and_never_overwrites(tmp_path: Path, cosim: Cosim) -> None:
     """Keys are readable by their owner alone; files stay until --renew, which keeps the hosts; the
-    end is shown.
-    """
+    end is shown."""
     folder = tmp_path / "certs"
     first = cosim(
         "certs", "init", str(folder), "--host", "hub.lan", "--host", "10.0.0.7", "--days", "90"
@@ -87,8 +85,7 @@ def test_the_command_creates_shows_and_never_overwrites(tmp_path: Path, cosim: C
 
 def test_each_kind_of_unusable_file_is_named(made: Path, tmp_path: Path) -> None:
     """A missing or damaged file, another's key, another authority, a readable key and another role
-    are each named.
-    """
+    are each named."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     copies = iter(range(100))
@@ -128,8 +125,7 @@ def test_each_kind_of_unusable_file_is_named(made: Path, tmp_path: Path) -> None
 
 def test_the_end_of_a_certificate_is_announced_30_days_before(made: Path) -> None:
     """Within 30 days the day and the remedy are shown; an expired or not yet valid certificate is
-    refused.
-    """
+    refused."""
     for role in ("coordinator", "worker"):
         end = open_end(made, role)  # type: ignore[arg-type]
         assert checked_identity(end, NOW) == ""
@@ -151,8 +147,7 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another authority on either end, another name, an expired hub, no TLS and no hub are refused;
-    a valid hub connects.
-    """
+    a valid hub connects."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)

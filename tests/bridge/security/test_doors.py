@@ -1,6 +1,5 @@
 """Commands that listen or connect: only this machine by default, anything else is checked before
-work begins.
-"""
+work begins."""
 
 from __future__ import annotations
 
@@ -39,8 +38,7 @@ def test_no_endpoint_is_open_to_other_machines_by_default(
     door: str, cosim: Cosim, tmp_path: Path
 ) -> None:
     """Beyond this machine an endpoint is refused without TLS, with TLS but no files, with files but
-    no TLS, and with missing files.
-    """
+    no TLS, and with missing files."""
     words = DOORS[door]
     beyond = "tcp/10.0.0.7:7447"
     guarded = "tls/10.0.0.7:7447"
@@ -69,8 +67,7 @@ def test_no_endpoint_is_open_to_other_machines_by_default(
 @pytest.mark.engine
 def test_insecure_explains_itself_in_one_line(cosim: Cosim) -> None:
     """Both the listening and the connecting command print the meaning of --insecure on standard
-    error.
-    """
+    error."""
     port = free_port()
     said = list[str]()
     open_to_all = Connection(role="coordinator", listen=f"tcp/0.0.0.0:{port}", insecure=True)

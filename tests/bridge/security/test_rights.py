@@ -1,6 +1,5 @@
 """What each role may do on a hub: plain Zenoh tries it over TLS on loopback; a refused act has no
-effect.
-"""
+effect."""
 
 from __future__ import annotations
 
@@ -68,8 +67,7 @@ def replies(session: zenoh.Session, key: str) -> list[str]:
 
 class Air:
     """A hub, its run's own process, and a policy server; `seen` are keys of queries and messages,
-    `alive` those of tokens.
-    """
+    `alive` those of tokens."""
 
     def __init__(self, certs: Path | None, stack: ExitStack) -> None:
         protocol, tls = ("tcp", "") if certs is None else ("tls", str(certs / "coordinator"))
@@ -101,8 +99,7 @@ class Air:
 
     def settle(self) -> None:
         """Wait until everything routed before has arrived, by sending messages of the run and of
-        the hub after it.
-        """
+        the hub after it."""
         for end in (self.run, self.hub):
             mark = f"{ENV}/mark{time.monotonic_ns()}"
             end.publish_lossy(mark, b"")
@@ -111,8 +108,7 @@ class Air:
 
 class Guest:
     """A client that tries everything; `heard` are keys of queries and messages that it did not send
-    itself.
-    """
+    itself."""
 
     def __init__(self, air: Air, role: str, stack: ExitStack) -> None:
         self.air = air
@@ -211,8 +207,7 @@ def try_all(
 @pytest.mark.parametrize("role", MAY_ASK)
 def test_a_role_has_its_own_rights_and_no_others(air: Air, role: str) -> None:
     """Each role, with its certificate, tries to query, publish, subscribe, reply, declare tokens
-    and use wildcards.
-    """
+    and use wildcards."""
     with ExitStack() as stack:
         guest = Guest(air, role, stack)
         try_all(
@@ -227,8 +222,7 @@ def test_a_role_has_its_own_rights_and_no_others(air: Air, role: str) -> None:
 
 def test_without_certificates_no_client_speaks_for_the_run() -> None:
     """On loopback a client has the rights of all roles together, but not those of the run or its
-    hub.
-    """
+    hub."""
     with ExitStack() as stack:
         air = Air(None, stack)
         may = tuple(key for key in ASKED if any(key in theirs for theirs in MAY_ASK.values()))
@@ -238,8 +232,7 @@ def test_without_certificates_no_client_speaks_for_the_run() -> None:
 @pytest.mark.parametrize(("hub", "key"), [("director", f"{ENV}/director"), ("policy", POLICY)])
 def test_only_runs_may_query_directors_and_policy_servers(certs: Path, hub: Role, key: str) -> None:
     """At the hub of a director or a policy server only workers and coordinators may query, and no
-    client may reply.
-    """
+    client may reply."""
     at = f"tls/localhost:{free_port()}"
     asked: list[bytes] = []
     with ExitStack() as stack:
@@ -278,8 +271,7 @@ serve(Mine, listen=sys.argv[1], tls=sys.argv[2])
 
 def test_only_runs_may_query_the_copied_policy_server(certs: Path) -> None:
     """At `serve` of a copied policy_server.py only workers and coordinators may query, one server
-    at a time.
-    """
+    at a time."""
     at = f"tls/localhost:{free_port()}"
     words = [sys.executable, "-c", COPIED, at, str(certs / "policy")]
     with ExitStack() as stack:
@@ -314,8 +306,7 @@ def test_only_runs_may_query_the_copied_policy_server(certs: Path) -> None:
 )
 def test_pickled_and_unknown_messages_are_refused(tmp_path: Path, written: str) -> None:
     """A message with a pickled Python object or an unknown type is refused with the types that are
-    read.
-    """
+    read."""
     asked: list[bytes] = []
     at = f"unixsock-stream/{tmp_path}/hub.sock"
     with listening_at(at) as hub, plain_zenoh(at, None, "") as guest:

@@ -1,4 +1,4 @@
-"""`cosim bench`: which measurement, and one checkout against another."""
+"""`cosim bench`: choice of measurements, and comparison of two checkouts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Path(path).write_text(json.dumps([figure]))
 
 
 def checkout(folder: Path, value: float) -> Path:
-    """A folder whose every measurement comes to a value, and is noted in a file beside it."""
+    """A folder whose measurements all give one value, each noted in a file beside the folder."""
     bench = folder / "scenarios" / "tools" / "bench"
     bench.mkdir(parents=True)
     for package in (bench, bench.parent, bench.parents[1]):
@@ -33,8 +33,7 @@ def checkout(folder: Path, value: float) -> Path:
 
 
 def test_checkouts_take_turns(tmp_path: Path) -> None:
-    """Each measurement is taken by one checkout and then by the other, and who begins changes from
-    round to round."""
+    """Both checkouts take each measurement in turn, and the first one changes from round to round."""
     both = [checkout(tmp_path / "one", 3.0), checkout(tmp_path / "two", 6.0)]
     one, two = take_rounds(["driving"], both, 2, lambda _: None)
     assert (tmp_path / "log").read_text().split("\n")[:-1] == [
@@ -45,8 +44,8 @@ def test_checkouts_take_turns(tmp_path: Path) -> None:
 
 
 @pytest.mark.engine
-def test_a_figure_stands_beside_that_of_another_checkout(tmp_path: Path, cosim: Cosim) -> None:
-    """--compare shows both medians and their ratio for what both take."""
+def test_compare_shows_the_figures_of_both_checkouts(tmp_path: Path, cosim: Cosim) -> None:
+    """--compare shows both medians and their ratio for common measurements."""
     other = checkout(tmp_path / "other", 1e6)
     (other / "scenarios" / "tools" / "bench" / "take.py").write_text(
         "import json, sys\nfrom pathlib import Path\nfigures = {'shortest walk, ms': 1e9, "
@@ -60,8 +59,8 @@ def test_a_figure_stands_beside_that_of_another_checkout(tmp_path: Path, cosim: 
     assert "elsewhere" not in said.stdout and "point in the walkable area" not in said.stdout
 
 
-def test_what_cannot_be_measured_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """A measurement that is none, and a folder that is no checkout, are named before anything is
+def test_unknown_measurements_and_checkouts_are_refused(tmp_path: Path, cosim: Cosim) -> None:
+    """An unknown measurement and a folder that is no checkout are named before anything is
     measured."""
     said = cosim("bench", "--only", "drivin")
     assert (

@@ -37,7 +37,7 @@ def terminal(width: int = 80) -> tuple[Console, io.StringIO]:
 
 
 def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
-    """Two short episodes of two events; a collision each: 1 in the episode, 8.48 in 100 m."""
+    """Two short episodes of two events with a collision each: 1 in the episode, 8.48 in 100 m."""
     row = dict.fromkeys(METRICS, 1.0) | {"status": "done", "ended": "failure", "reason": ""}
     row |= {name: 0.25 for name, _ in (*SHOWN, *COUNTS, *WITH_PEOPLE)}  # type: ignore[dict-item]
     row |= {"collisions": 1.0, "collisions_per_100m": 8.48}  # type: ignore[dict-item]
@@ -48,8 +48,7 @@ def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
 
 
 def test_a_letter_means_one_thing_in_every_table() -> None:
-    """C, OL and F are per 100 m wherever they stand; what is counted in another way has a name in
-    words."""
+    """C, OL and F are per 100 m in every table; other counts have names in words."""
     table, kinds = pair_of_kinds()
     episodes, shares = terminal(), terminal()
     print_table(episodes[0], table, 2)
@@ -60,8 +59,8 @@ def test_a_letter_means_one_thing_in_every_table() -> None:
 
 
 def test_every_letter_and_heading_is_explained_under_its_table() -> None:
-    """Letters have their meaning in the line below, rates their unit in the heading, as the
-    documents do."""
+    """Letters are explained below the table, and rates have their unit in the heading, as in the
+    documents."""
     table, kinds = pair_of_kinds()
     out, said = terminal()
     print_table(out, table, 2)
@@ -77,9 +76,9 @@ def test_every_letter_and_heading_is_explained_under_its_table() -> None:
     assert "share of these" in " ".join(said.getvalue().split())
 
 
-def test_success_names_the_events_that_end_otherwise() -> None:
-    """Under every table that gives SR stands which events ask for a stop, and which for passing
-    round, by name."""
+def test_tables_of_success_name_events_with_their_own_ending() -> None:
+    """Below every table with SR the events that need a stop, and those that need passing round, are
+    named."""
     out, said = terminal()
     print_table(out, pair_of_kinds()[0], 2)
     assert SUCCESS_IN_WORDS in " ".join(said.getvalue().split())
@@ -92,8 +91,7 @@ def test_success_names_the_events_that_end_otherwise() -> None:
 
 
 def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
-    """Seventeen hundred scenarios are no answer to a slip of the pen: five are, and how many there
-    are."""
+    """A misspelt scenario name gets five similar ones and the total count, not all 1,700."""
     names = [scenario.id for scenario in load_suite("reactive").scenarios]
     assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))
     assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 1700" in str(
@@ -101,9 +99,9 @@ def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
     )
 
 
-def test_val_and_test_stand_apart() -> None:
-    """A run with both has a row for each, with its crashes, and counts below five episodes; a run
-    of one has none."""
+def test_val_and_test_have_separate_rows() -> None:
+    """A run with both has a row for each, with its crashes, and counts below five episodes; other
+    runs have none."""
     rows = [
         dict.fromkeys(METRICS, 1.0)
         | {
@@ -126,9 +124,9 @@ def test_val_and_test_stand_apart() -> None:
     assert "split" not in said.getvalue()
 
 
-def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() -> None:
-    """Camera, rate, goals, waypoint rule and seed below the rows; who has a camera of its own has a
-    star, and why."""
+def test_a_table_lists_the_setup_and_marks_nonstandard_policies() -> None:
+    """Camera, rate, goals, waypoint rule and seed are below the rows; a policy with its own camera
+    has a star and the reason."""
     row = {
         "scenario": "s-1",
         "status": "done",
@@ -163,11 +161,11 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         )
 
 
-def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_have(
+def test_a_table_omits_cameras_and_waypoints_that_a_policy_lacks(
     tmp_path: Path,
 ) -> None:
-    """A blind policy has no camera in its line; waypoints stand there where an answer in the run's
-    folder was some."""
+    """A blind policy has no camera in its line; the waypoint rule appears only if an answer had
+    waypoints."""
     record, log = episode_of(short_way("s-0"), "h")
     assert log is not None
     plan = {
@@ -191,7 +189,7 @@ def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_
         assert ("waypoint 2, units of 1 m" in text) is (name == "waypoints")
 
 
-def test_the_list_says_which_policies_know_more_than_a_robot() -> None:
+def test_the_list_marks_privileged_policies() -> None:
     """`orca` is the oracle; it and two other baselines are privileged, those that see are not."""
     out, said = terminal()
     print_names(out)
@@ -204,8 +202,8 @@ def test_the_list_says_which_policies_know_more_than_a_robot() -> None:
 
 
 def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
-    """A film of the failure, or of an episode where none failed, a report, one episode; without a
-    track a report."""
+    """Next are a film of the first failure, or of any episode, a report and one episode; without
+    trajectories a report."""
 
     def told(*rows: tuple[str, str | None, float]) -> list[str]:
         said = io.StringIO()
@@ -226,8 +224,8 @@ def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
 
 
 def test_few_episodes_are_counted_and_crashes_have_a_column() -> None:
-    """Of one episode there is no interval, and no rate but failures in metres; a kind with a crash
-    has a count of it, and none of the people that were hit."""
+    """One episode gives no interval and failures in metres; a kind with a crash has its count, and
+    no count of people hit."""
     ways = [short_way(f"s-{k}", structure=("straight", "curve")[k % 2]) for k in range(4)]
 
     def told(*hows: str) -> str:

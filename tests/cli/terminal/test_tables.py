@@ -34,8 +34,8 @@ LONG = "sumo-fokr-bs-demo-ped_crossing-003"
 
 
 def episodes() -> pd.DataFrame:
-    """Twelve episodes and their decoys with long names, two digits before every point, dozens of failures, and the
-    robot's cost; all succeed and touch everything."""
+    """Twelve successful episodes and their decoys with long names, large figures, dozens of
+    failures, and the robot's cost."""
     row = dict.fromkeys((*KEYS, *METRICS, *COUNTERFACTUAL), 34.56) | {
         name: 120.0 for name, _ in COUNTS
     }
@@ -141,8 +141,8 @@ TABLES: dict[str, tuple[Callable[[Console], None], Sequence[str]]] = {
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", TABLES)
 def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a narrow, a usual and a wide terminal: no line is longer than it, nothing ends in dots,
-    figures are whole."""
+    """In a narrow, a usual and a wide terminal lines fit, no cell ends in dots, and figures are
+    complete."""
     said = io.StringIO()
     out = Console(file=said, width=width)
     for module in ("scenario", "bench"):
@@ -157,8 +157,8 @@ def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_table_that_is_too_wide_is_divided() -> None:
-    """Each part has the names again and as many figures as fit; every figure is there once, in the
-    order of columns."""
+    """Each part repeats the names and holds as many figures as fit; every figure appears once, in
+    column order."""
     heads = [f"figure {k}" for k in range(9)]
     said = io.StringIO()
     row = (LONG, *(f"{k}.000000" for k in range(9)))
@@ -173,8 +173,8 @@ def test_a_table_that_is_too_wide_is_divided() -> None:
     )
 
 
-def test_a_table_that_fits_is_left_as_it_is() -> None:
-    """Heads are broken only where there is no room for them."""
+def test_a_table_that_fits_is_unchanged() -> None:
+    """Headings are broken only where they do not fit."""
     columns = [*tables.names("what"), *tables.figures("a head of several words")]
     wide, narrow = io.StringIO(), io.StringIO()
     for file, width in ((wide, 40), (narrow, 20)):
@@ -183,7 +183,7 @@ def test_a_table_that_fits_is_left_as_it_is() -> None:
 
 
 def test_cells_are_plain_text() -> None:
-    """Brackets in a name are no markup; a section is set apart; title and note are around the
+    """Brackets in a name are no markup, a section is separated, and title and note surround the
     table."""
     said = io.StringIO()
     columns = [*tables.names("what"), *tables.labels("how"), *tables.words("why")]
@@ -194,7 +194,7 @@ def test_cells_are_plain_text() -> None:
     assert ["a", "[1]", "b", "c"] in lines and ["d", "e", "f"] in lines
 
 
-def test_every_command_prints_its_tables_so() -> None:
-    """No other module of the command line makes a table of its own."""
+def test_every_command_prints_tables_through_one_module() -> None:
+    """No other module of the command line builds a table."""
     for path in sorted((ROOT / "cosim/cli").rglob("*.py")):
         assert path.name == "tables.py" or "rich.table" not in path.read_text(), path
