@@ -225,8 +225,7 @@ def test_a_draft_is_the_largest_level_free_piece() -> None:
 
 
 def test_areas_of_a_map_are_moved_to_free_ground() -> None:
-    """A sidewalk between two walls is found again after a shift, which is
-    reported."""
+    """A sidewalk between two walls is found again after a shift, which is reported."""
     blocked = np.ones(GRID.heights.shape, dtype=bool)
     blocked[32:45] = False  # y 8 to 11
     grid = dataclasses.replace(GRID, blocked=blocked)

@@ -1,4 +1,4 @@
-"""Policies by name: what cannot be loaded is wrong use, told with the policy's name, whatever its
+"""Policies by name: one that cannot be loaded is wrong use, reported with its name, whatever its
 code does."""
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ BAD = {
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder in which a policy's module can be written."""
+    """A folder for the module of a policy."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -131,7 +131,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_policy_that_cannot_be_loaded_is_named_with_the_reason(desk: Path, name: str) -> None:
-    """Whatever its module, its class or its manifest does, SystemExit included."""
+    """The reason covers faults of module, class and manifest, SystemExit included."""
     source, told = BAD[name]
     (desk / "mine.py").write_text(source)
     with pytest.raises(UsageError) as caught:
@@ -142,21 +142,21 @@ def test_a_policy_that_cannot_be_loaded_is_named_with_the_reason(desk: Path, nam
 @pytest.mark.parametrize(
     ("name", "meant"), [("ros2", "ros2:"), ("zenoh", "zenoh:NAME")], ids=["ros2", "zenoh"]
 )
-def test_a_policy_elsewhere_is_a_valid_choice(name: str, meant: str) -> None:
-    """A name without its colon gets the one that is meant, and all choices are listed."""
+def test_an_unknown_policy_is_answered_with_the_valid_choices(name: str, meant: str) -> None:
+    """A name without its colon gets the intended one, and all choices are listed."""
     with pytest.raises(UsageError, match=rf"Valid choices: cadrl, .* Did you mean {meant}\?"):
         load_policy(name)
 
 
-def test_loading_leaves_the_process_where_it_is(desk: Path) -> None:
-    """A module that changes the folder changes no relative path of the run."""
+def test_loading_keeps_the_working_folder(desk: Path) -> None:
+    """A module that changes the working folder changes no relative path of the run."""
     (desk / "mine.py").write_text("import os; os.chdir('/')" + GOOD.format(fields=""))
     assert load_policy("mine:Mine").manifest.name == "mine"
     assert Path.cwd() == desk
 
 
 def test_loading_is_timed(desk: Path) -> None:
-    """Whoever waits for it can be told."""
+    """The timer starts and stops around loading."""
     told: list[PolicyCall | None] = []
 
     class Notes:
@@ -193,9 +193,9 @@ def test_an_edited_policy_has_another_hash(desk: Path) -> None:
     assert load_policy("mine:Mine").source_hash == hash_of(child, "class Base: kept = 1")
 
 
-def lay_out(desk: Path) -> None:
-    """A policy in this folder, one in another beside what it imports, one in a package that imports
-    its own parts."""
+def write_policies(desk: Path) -> None:
+    """Write a policy in this folder, one beside its import in another, and one in a package that
+    imports its own modules."""
     (desk / "mine.py").write_text(GOOD.format(fields=""))
     (desk / "deeper").mkdir()
     (desk / "deeper/alone.py").write_text("import sibling" + GOOD.format(fields=""))
@@ -223,9 +223,8 @@ def lay_out(desk: Path) -> None:
 def test_a_policy_is_named_by_its_file_or_its_module(
     desk: Path, spelled: str, imported: str
 ) -> None:
-    """Both spellings load the same class with the same source hash; siblings and relative imports
-    work."""
-    lay_out(desk)
+    """Both spellings load the same class and source hash, and sibling and relative imports work."""
+    write_policies(desk)
     spelled = spelled.format(desk=desk)
     assert importable_name(spelled) == imported and importable_name(imported) == imported
     by_file, by_module = load_policy(spelled), load_policy(imported)
@@ -235,8 +234,8 @@ def test_a_policy_is_named_by_its_file_or_its_module(
     )
 
 
-def test_a_name_that_is_no_file_is_left_as_it_is() -> None:
-    """Shipped names, networks, served policies and modules."""
+def test_a_name_that_is_no_file_is_unchanged() -> None:
+    """Shipped policies, networks, served policies and modules are no files."""
     for name in (
         "orca",
         "onnx:my_network",
@@ -283,8 +282,8 @@ MISNAMED = {
 
 @pytest.mark.parametrize("name", MISNAMED)
 def test_a_file_that_cannot_be_loaded_is_named_with_the_remedy(desk: Path, name: str) -> None:
-    """The file, the choices there, and what to do instead."""
-    lay_out(desk)
+    """The message has the file, its valid choices, and what to do instead."""
+    write_policies(desk)
     load_policy("mine:Mine")
     spelled, told = MISNAMED[name]
     if not name.startswith("no ") and "elsewhere" not in name:
@@ -294,13 +293,12 @@ def test_a_file_that_cannot_be_loaded_is_named_with_the_remedy(desk: Path, name:
     assert told.format(desk=desk) in str(caught.value)
 
 
-def test_a_module_that_is_not_found_says_where_it_was_searched(
+def test_a_missing_module_is_reported_with_the_search_path(
     desk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All folders of the path but Python's own are listed, with the file of that name farther
-    down."""
+    """All folders of the path but Python's own are listed, with a file of that name in a subfolder."""
     monkeypatch.syspath_prepend(desk / "libraries")
-    lay_out(desk)
+    write_policies(desk)
     with pytest.raises(UsageError) as caught:
         load_policy("alone:Mine")
     said = str(caught.value)
@@ -326,16 +324,16 @@ def test_a_module_that_is_not_found_says_where_it_was_searched(
     )
 
 
-def test_every_policy_of_ours_has_its_own_hash() -> None:
-    """They are told apart by their files."""
+def test_every_shipped_policy_has_its_own_hash() -> None:
+    """The hashes of shipped policies are distinct."""
     assert all(load_policy(name).source_hash for name in POLICIES)
     assert load_policy("route").source_hash != load_policy("orca").source_hash
 
 
-def test_a_bundled_policy_has_another_hash_when_a_module_in_its_folder_is_edited(
+def test_the_hash_of_a_shipped_policy_covers_its_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not only the file of its class."""
+    """An edit of any module in the folder of its class changes the hash."""
     route = Route()
     copied = shutil.copytree(Path(inspect.getfile(type(route))).parent, tmp_path / "privileged")
     monkeypatch.setattr(inspect, "getfile", lambda _: str(copied / "route.py"))

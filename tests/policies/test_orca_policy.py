@@ -1,4 +1,4 @@
-"""The oracle: what it makes of groups and of a hand; and every event, driven."""
+"""The oracle: its treatment of groups and of a raised hand, and every event, driven."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ROUTE = Polyline([(0.0, 0.0), (30.0, 0.0)])
 
 
 def people(*rows: tuple[float, float, float, float, Doing]) -> People:
-    """Of (x, y, heading, speed, doing)."""
+    """People given as (x, y, heading, speed, doing)."""
     xy = [row[:2] for row in rows]
     ids = tuple(f"e{i}" for i in range(len(rows)))
     doing = tuple(r[4] for r in rows)
@@ -51,15 +51,16 @@ def people(*rows: tuple[float, float, float, float, Doing]) -> People:
 def known(
     others: People, x_m: float = 5.0, v_mps: float = 1.2, half_width_m: float = 1.7
 ) -> Privileged:
-    """A robot on a straight route along the x axis; the walkway is free 1.7 m to either side."""
+    """Knowledge of a robot on a straight route along x, with a walkway free for 1.7 m on either
+    side."""
     robot = RobotState(Pose(x_m, 0.0, 0.0), v_mps)
     free = box(-2.0, -half_width_m, 40.0, half_width_m)
     return Privileged(robot, ROUTE, x_m, others, NO_VEHICLES, {}, (), free)
 
 
 def test_talkers_are_one_group_and_passers_by_are_none() -> None:
-    """Two who talk 1.9 m apart and a third between whom and them the robot does not fit; one far
-    off; one walking."""
+    """Two talkers 1.9 m apart and a third too near to pass between are a group; a far one and a
+    walker are not."""
     crowd = people(
         (10.0, 0.0, 0.0, 0.0, "talk"),
         (10.0, 1.9, 0.0, 0.0, "talk"),
@@ -74,8 +75,7 @@ def test_talkers_are_one_group_and_passers_by_are_none() -> None:
 
 
 def test_a_group_is_passed_round_on_the_side_with_room() -> None:
-    """Two talkers stand 1.5 m apart across the way, nearer to its left edge: the lane leads to the
-    right of both."""
+    """Two talkers 1.5 m apart across the way, nearer to its left edge, are passed on the right."""
     crowd = people((11.0, 1.2, 0.0, 0.0, "talk"), (11.0, -0.3, 0.0, 0.0, "talk"))
     scene = known(crowd)
     here = PathState(SampledPath(ROUTE), scene.route_s_m, DistanceField(scene.free, ROUTE))
@@ -83,8 +83,8 @@ def test_a_group_is_passed_round_on_the_side_with_room() -> None:
     assert lane_m <= -0.3 - 0.3 - 0.33 - 0.1
 
 
-def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
-    """The oracle brakes for a stopping hand and rests 2 m before it."""
+def test_the_oracle_stops_before_a_raised_hand_and_stays() -> None:
+    """It brakes for a stopping hand and rests 2 m before it."""
     hand, nobody = (
         people((12.0, 0.2, math.pi, 0.0, "stop")),
         people((12.0, 0.2, math.pi, 0.0, "stand")),
@@ -105,9 +105,9 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
     assert 12.0 - x_m == pytest.approx(STOP_BEFORE_M, abs=0.15)
 
 
-def test_it_does_not_stand_long_at_a_green_that_is_too_short() -> None:
-    """14 m of crossing and 13 s of green left: it stands before it for 8 s at most when the signal
-    turns red."""
+def test_a_too_short_green_costs_the_oracle_at_most_8_s() -> None:
+    """At 14 m of crossing with 13 s of green left it waits for at most 8 s until the signal turns
+    red."""
     driver = PolicyCaller(Orca())
     x_m = 3.0
     v_mps = 1.4
@@ -125,9 +125,9 @@ def test_it_does_not_stand_long_at_a_green_that_is_too_short() -> None:
     assert 2.0 < stood_s < 8.0
 
 
-def test_it_comes_to_rest_before_whoever_of_the_crowd_is_right_ahead() -> None:
-    """The nearer they are the slower, never slower than a creep; not for who is beside, nor for
-    people of events."""
+def test_the_oracle_slows_down_for_people_right_ahead() -> None:
+    """The nearer they are the slower, never below a creep; people at its side and of events do not
+    count."""
     here = known(people((6.0, 0.2, 0.0, 0.0, "stand")))
     crowd = replace(
         here, people=dataclasses.replace(here.people, kind=np.full(1, PersonKind.CROWD.value))
@@ -153,11 +153,10 @@ def test_it_comes_to_rest_before_whoever_of_the_crowd_is_right_ahead() -> None:
     ("walk", "v_mps", "limit_mps"),
     [(False, 0.02, 0.0), (False, 1.2, math.inf), (True, 0.0, math.inf)],
 )
-def test_who_waits_at_red_does_not_start_because_it_has_crept_nearer(
+def test_the_oracle_waits_at_red_but_drives_on_when_it_cannot_stop(
     walk: bool, v_mps: float, limit_mps: float
 ) -> None:
-    """0.2 m before a crossing: at rest it waits for green; at speed it can stop no more, and drives
-    on."""
+    """0.2 m before a crossing it waits for green at rest, and at speed it drives on."""
     here = replace(
         known(people(), 5.0, v_mps),
         crossings=((":c0", 5.2, 12.0),),
@@ -176,7 +175,7 @@ def test_the_robot_waits_where_no_car_turns() -> None:
 
 
 def test_foresight_turns_no_faster_than_the_robot() -> None:
-    """Every plan keeps to the yaw rate and the speed of the robot, and to its lane in the end."""
+    """Every plan respects the yaw rate and the speed of the robot, and ends in its lane."""
     plans = Plans(
         np.array([0.0, 1.0, -1.0]),
         np.array([1.4, 1.4, 0.9]),
@@ -190,9 +189,8 @@ def test_foresight_turns_no_faster_than_the_robot() -> None:
     assert ahead.pose[-1, 1] == pytest.approx([0.0, 1.0, -1.0], abs=0.15)
 
 
-def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_half_a_metre() -> None:
-    """At 6 m/s it needs 6 m to stop: one 12 m off does not matter, one 5 m off stands in every
-    plan's way alike."""
+def test_a_braking_car_counts_where_it_stops_up_to_half_a_metre() -> None:
+    """A car at 6 m/s stops in 6 m: at 12 m it does not matter, at 5 m it blocks every plan equally."""
     plans = Plans(np.array([0.0, 1.0]), np.array([1.4, 1.4]), np.full(2, 0.9), np.zeros(2))
     ahead = roll_out(SampledPath(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     for far_m, nearness in ((12.0, 0.0), (5.0, 0.5)):
@@ -201,9 +199,9 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
         assert vehicle_violation(scene, BodyDisks.of(COURIER), ahead)[0] == pytest.approx(nearness)
 
 
-def test_it_stands_for_who_comes_straight_at_it_until_they_are_past() -> None:
-    """From 3.3 m, while they go round it, at most ten seconds in one place; not for who comes past
-    it or is far, nor for who stands longer than people's patience."""
+def test_the_oracle_waits_for_oncoming_people_until_they_are_past() -> None:
+    """From 3.3 m, and at most 10 s in one place, it waits; not for passing, far or patient standing
+    people."""
     at_it, round_it, past_it = (
         people((x_m, y_m, heading, 1.4, "walk"))
         for x_m, y_m, heading in ((8.2, 0.0, math.pi), (6.5, 0.6, 2.4), (3.5, 1.0, 2.9))
@@ -225,8 +223,8 @@ def test_it_stands_for_who_comes_straight_at_it_until_they_are_past() -> None:
         assert not Yielding().waits(known(people((x_m, 0.0, heading, 1.4, "walk"))), 1.0)
 
 
-def test_who_is_near_may_stay_and_who_waits_does_not_turn() -> None:
-    """Somebody 1.1 m ahead who is about to leave sideways counts where it is, too; 4 m off it does
+def test_near_people_count_at_their_current_place_too() -> None:
+    """A person 1.1 m ahead who is about to leave sideways counts there, too; one 4 m ahead does
     not."""
     plans = Plans(np.array([0.0, 1.5]), np.array([1.4, 0.0]), np.full(2, 0.9), np.zeros(2))
     ahead = roll_out(SampledPath(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
@@ -250,8 +248,8 @@ def test_who_is_near_may_stay_and_who_waits_does_not_turn() -> None:
     [(kind, 2 if kind == "conversing" else 1) for kind in EVENT_KINDS],
 )
 def test_the_oracle_solves_every_event(kind: str, seed: int) -> None:
-    """One scenario of each event, with real engines: triggered, seen, its rule kept, its end
-    reached."""
+    """With real engines one scenario of each event is triggered, seen, follows its rule, and
+    reaches its end."""
     from cosim.place.walk_graph import WalkGraph
     from scenarios.episodes.run_episode import run_episode
     from scenarios.places.nets import place
@@ -269,8 +267,8 @@ def test_the_oracle_solves_every_event(kind: str, seed: int) -> None:
 
 
 @pytest.mark.engine
-def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> None:
-    """Who does nothing about `frontal` collides with it."""
+def test_driving_straight_on_fails_before_an_oncoming_person() -> None:
+    """A blind policy collides in a scenario of `frontal`."""
     from cosim.core.state import Command
     from cosim.place.walk_graph import WalkGraph
     from cosim.spec.manifest import Manifest
