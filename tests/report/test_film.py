@@ -60,11 +60,11 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     return folder
 
 
-def test_a_film_shows_the_seconds_asked_for(
+def test_a_film_shows_the_requested_seconds(
     desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to
-    play. The waypoints that are planned from 1 s on are on the map and in the robot's picture."""
+    """It has 20 pictures a second of the requested size, all different, playable, with waypoints on
+    map and picture from 1 s on."""
     drawn = []
     add = Video.add
     monkeypatch.setattr(
@@ -96,7 +96,7 @@ def test_a_film_shows_the_seconds_asked_for(
 
 
 def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> None:
-    """--view puts another picture beside the same map, over the same bar."""
+    """--view selects another picture beside the same map, over the same bar."""
     seen = []
     for view in ("above", "robot"):
         words = (
@@ -123,7 +123,7 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
 
 
 def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
-    """Without an episode the first that failed is filmed, from any view; when and why is
+    """Without an episode the first failed one is filmed, from any view, and time and reason are
     printed."""
     words = (
         "film",
@@ -148,8 +148,8 @@ def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
 def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
     desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the last picture nothing is simulated, and before the first nothing is drawn; it is
-    said meanwhile."""
+    """Simulation ends with the last picture, nothing is drawn before the first, and progress is
+    reported."""
     simulated = []
     drawn = []
     add, render = Recorder.add, WorldCamera.render
@@ -178,9 +178,11 @@ def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
 
 
 @pytest.mark.parametrize("column", ["pose", "person_m", "reset_s_m"])
-def test_a_cut_that_is_not_as_recorded_is_no_film(desk: Path, cosim: Cosim, column: str) -> None:
-    """One bit of one tick of the trajectory: an error that names the moment, and no file; beyond
-    the cut it is none."""
+def test_a_cut_that_differs_from_its_record_is_not_filmed(
+    desk: Path, cosim: Cosim, column: str
+) -> None:
+    """One changed bit of a tick is an error with the time and no file; beyond the cut it does not
+    matter."""
     path = desk / "run" / "episodes" / "t-0" / "trajectory.npz"
     kept = path.read_bytes()
     with np.load(path) as arrays:
@@ -205,8 +207,8 @@ def test_a_cut_that_is_not_as_recorded_is_no_film(desk: Path, cosim: Cosim, colu
     assert "of the same versions: of other code" in beyond.stderr
 
 
-def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None:
-    """A film of another episode than the recorded one is no film of it: an error, and no file."""
+def test_a_record_that_does_not_replay_is_not_filmed(desk: Path, cosim: Cosim) -> None:
+    """A record of another episode is an error, without a file."""
     path = desk / "run" / "episodes" / "t-0" / "record.json"
     kept = path.read_bytes()
     record = json.loads(kept)
@@ -258,10 +260,10 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("look", "t-0", "--suite", "tiny.json", "-o", "nowhere/look.png"), "written"),
     ],
 )
-def test_what_cannot_be_shown_is_an_error_in_words(
+def test_invalid_film_and_look_requests_are_refused(
     desk: Path, cosim: Cosim, words: tuple[str, ...], told: str
 ) -> None:
-    """Exit code 2, or 3 where the machine does not write; one message, no traceback."""
+    """The exit code is 2, or 3 for the machine's faults, with one message and no traceback."""
     done = cosim(*words, cwd=desk)
     assert (
         done.returncode == (3 if "written" in told else 2)
@@ -272,8 +274,8 @@ def test_what_cannot_be_shown_is_an_error_in_words(
 
 
 def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
-    """From the robot or from above: a picture of the size asked for, with something in it; what is
-    done meanwhile is said."""
+    """From the robot or from above the picture has the requested size and content, and progress is
+    printed."""
     seen = {}
     for name, words in {
         "start": ("--at", "0"),
@@ -307,9 +309,8 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
     assert (seen["start"] != seen["above"]).mean() > 0.5
 
 
-def test_a_look_at_a_file_of_ones_own_needs_no_suite(desk: Path, cosim: Cosim) -> None:
-    """Of a sweep the first, or the one that is named or numbered; only that one is made, and its
-    faults are listed."""
+def test_a_look_at_a_scenario_file_needs_no_suite(desk: Path, cosim: Cosim) -> None:
+    """Of a sweep only the first, named or numbered scenario is built, and its faults are listed."""
     text = (
         'name = "mine"\nseeds = 2\n[place]\ncity = 1\nsize_m = 500\n[way]\nkind = '
         '"straight"\nlength_m = 30\n'
@@ -334,8 +335,8 @@ def test_a_look_at_a_file_of_ones_own_needs_no_suite(desk: Path, cosim: Cosim) -
 
 
 def test_the_failure_of_an_episode_is_chosen_and_cut_out(tmp_path: Path) -> None:
-    """The first that failed in the order of the run, or the named one: ten seconds before its first
-    failure, two after. What did not fail is refused with what became of it."""
+    """The run's first failed or the named episode is cut from 10 s before its failure to 2 s after;
+    others are refused with their outcome."""
     ways = [short_way(f"s-{k}", ends_on_failure=False) for k in range(3)]
     run = run_of(tmp_path / "run", ["goal", HIT, HIT], scenarios=ways)
     first = failure_to_film(run, None)
@@ -355,7 +356,7 @@ def test_the_failure_of_an_episode_is_chosen_and_cut_out(tmp_path: Path) -> None
 
 
 def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:
-    """An exception while it is made: no file, no part of one."""
+    """An exception during the encoding leaves no complete or partial file."""
     with pytest.raises(KeyError), Video(tmp_path / "film.mp4", (64, 48), 20) as video:
         video.add(np.zeros((48, 64, 3), dtype=np.uint8))
         raise KeyError
@@ -363,7 +364,7 @@ def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_a_replay_ends_with_its_record() -> None:
-    """Beyond the last recorded tick there is nothing to say."""
+    """A replay has no figures beyond the last recorded tick."""
     replay = Replay(np.array([[1.0, 0.2]]))
     assert replay.act(Observation(0, 0.0, None, 0.0, 0.0, COURIER)).w_radps == 0.2
     with pytest.raises(RunError, match="ends after 1 ticks"):

@@ -1,5 +1,4 @@
-"""Recordings for the Rerun viewer: what is in the file, read back by its own SDK, and what is
-refused."""
+"""Recordings for the Rerun viewer: their content, read back by its own SDK, and refusals."""
 
 from __future__ import annotations
 
@@ -34,26 +33,25 @@ from tests.support.blind_policy import BEND, Blind
     ],
     ids=["another ending", "no episode", "several"],
 )
-def test_a_recording_is_of_one_episode_in_a_file_of_its_kind(
+def test_a_recording_needs_one_episode_and_an_rrd_file(
     tmp_path: Path, name: str, episodes: int, told: str
 ) -> None:
-    """Anything else is refused before something runs."""
+    """Anything else is refused before a simulation starts."""
     with pytest.raises(UsageError, match=told):
         check_rerun(tmp_path / name, episodes)
 
 
-def test_without_the_package_the_remedy_is_told(
+def test_a_missing_package_is_reported_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The extra that brings it, by name."""
+    """The extra that installs it is named."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MachineError, match=r"pip install -e '\.\[rerun\]' in the checkout"):
         check_rerun(tmp_path / "e.rrd", 1)
 
 
 class Tape:
-    """A recording read back: for each entity the columns of its rows, in the order in which they
-    were written."""
+    """A recording read back: for each entity the columns of its rows, in the order of writing."""
 
     def __init__(self, path: Path) -> None:
         from rerun.chunk import RrdReader
@@ -75,16 +73,15 @@ class Tape:
 
 
 class Sensing(Blind):
-    """Drives as the blind policy, with every sensor but a camera."""
+    """A policy that drives as the blind one, with every sensor but a camera."""
 
     manifest = replace(Blind.manifest, scan=ScanSpec(rays=90), imu="noisy", people="seen")
 
 
 @pytest.mark.engine
 def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Cosim) -> None:
-    """Read back: each tick's pose, people, velocities and plots, each picture with depth and
-    labels; waypoints from where the robot was when it was asked; what it sensed then; and the ground. A record that was
-    changed leaves no file."""
+    """Ground, poses, people, velocities, plots, pictures, waypoints and sensors are read back; a
+    changed record leaves no file."""
     pytest.importorskip("rerun")
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
     suite = Suite(name="brief", version="1", scenarios=(scenario,))

@@ -1,5 +1,5 @@
-"""Failures shown again: one replay for all of an episode, held against its record, each picture
-drawn once."""
+"""Replayed failures: one replay for each episode, checked against its record, each picture drawn
+once."""
 
 from __future__ import annotations
 
@@ -29,12 +29,11 @@ def run(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     return folder / "run"
 
 
-def test_failures_that_follow_one_another_share_their_pictures(
+def test_consecutive_failures_share_their_pictures(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The failure and, as if there were one, a moment a second before it: each has its last 5 s,
-    four a second, and the moment itself; what both show is drawn once, and is the same. What is
-    done rises to what was announced."""
+    """Two moments 1 s apart have 5 s at 4 Hz each, shared pictures are drawn once, and progress
+    rises to its total."""
     drawn = []
     done = []
     render = WorldCamera.render
@@ -57,8 +56,8 @@ def test_failures_that_follow_one_another_share_their_pictures(
 
 
 @pytest.mark.parametrize("column", ["pose", "person_m"])
-def test_an_episode_that_comes_out_otherwise_is_not_shown(run: Path, column: str) -> None:
-    """One bit of one tick before the failure: an error that names the moment."""
+def test_an_episode_that_replays_differently_is_not_shown(run: Path, column: str) -> None:
+    """One changed bit of a tick before the failure is an error with the time."""
     path = run / "episodes" / NAME / "trajectory.npz"
     kept = path.read_bytes()
     with np.load(path) as arrays:

@@ -1,4 +1,4 @@
-"""Comparisons of runs: what is grouped, what flipped, what is written, and what is refused."""
+"""Comparisons of runs: groups, changed outcomes, exports, and refusals."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from tests.support.driven_runs import HIT, run_of, short_way
 GOALS = "goal"
 
 
-def several(count: int) -> tuple[Scenario, ...]:
-    """Half of them straight, half curves; every fifth in test; every fourth with somebody frontal
-    on its way."""
+def scenarios_of(count: int) -> tuple[Scenario, ...]:
+    """Scenarios, half straight, half curves; every fifth in test; every fourth with a `frontal`
+    event."""
 
     def one(i: int) -> Scenario:
         event = Event(
@@ -66,15 +66,15 @@ def several(count: int) -> tuple[Scenario, ...]:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """20 scenarios by three policies: `a` solves every second one; `b` all but one that a solves
-    and one that it does not; `c` crashes once and has one that is invalid, else it is as `a`."""
+    """20 scenarios by three policies: `a` solves half; `b` nearly all; `c` is as `a` with one crash
+    and one invalid episode."""
     folder = tmp_path_factory.mktemp("runs")
     a = [GOALS if i % 2 else HIT for i in range(20)]
     b = [GOALS if i % 2 or i < 18 else HIT for i in range(20)]
     b[19] = HIT
     c = [*a[:10], "crashed", "invalid", *a[12:]]
     for name, hows in (("a", a), ("b", b), ("c", c)):
-        run_of(folder / name, hows, name, several(20))
+        run_of(folder / name, hows, name, scenarios_of(20))
     return folder
 
 
@@ -88,9 +88,9 @@ def row(told: RunComparison, metric: str, group: str = "s", after: str = "b") ->
 
 
 def test_groups_are_suite_event_structure_and_split() -> None:
-    """Each scenario stands in every group that it belongs to; a group of the same scenarios as
-    another stands once."""
-    groups = groups_of("s", several(20))
+    """Each scenario is in every group that it belongs to, and groups of the same scenarios appear
+    once."""
+    groups = groups_of("s", scenarios_of(20))
     assert [*groups] == [
         ("suite", "s"),
         ("event", "frontal"),
@@ -101,11 +101,11 @@ def test_groups_are_suite_event_structure_and_split() -> None:
     ]
     assert groups["event", "frontal"] == {f"s-{i:03d}" for i in (0, 4, 8, 12, 16)}
     assert len(groups["split", "test"]) == 4 and len(groups["suite", "s"]) == 20
-    assert [*groups_of("s", several(1))] == [("suite", "s")]
+    assert [*groups_of("s", scenarios_of(1))] == [("suite", "s")]
 
 
 def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
-    """Nine won and one lost of twenty: by name, and in every group."""
+    """Nine won and one lost of twenty are listed by name, and in every group."""
     told = compare_runs([runs / "a", runs / "b"])
     whole = row(told, "success")
     assert (whole["value_before"], whole["value_after"], whole["n"], whole["changed"]) == (
@@ -138,11 +138,11 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
     ].values.tolist() == [["goal", "failure"]]
 
 
-def test_runs_by_other_terms_are_called_neither_better_nor_worse(
+def test_runs_under_other_conditions_get_no_verdict(
     runs: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Another goal protocol, odometry, sensor track or latency is named, and no verdict given; the
-    differences stay."""
+    """Another goal protocol, odometry, sensor track or latency is named; differences remain,
+    without a verdict."""
     run = rewritten(
         runs / "b",
         tmp_path / "b",
@@ -166,10 +166,10 @@ def test_runs_by_other_terms_are_called_neither_better_nor_worse(
 
 
 def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path: Path) -> None:
-    """Runs of one suite by two robots are paired by scenario, named by robot, and no difference is
-    called better or worse."""
-    courier = run_of(tmp_path / "c", [HIT] * 20, "p", several(20))
-    dog = run_of(tmp_path / "d", [GOALS] * 20, "p", several(20), robot="dog")
+    """Runs of two robots are paired by scenario and named by robot, and no difference is called
+    better or worse."""
+    courier = run_of(tmp_path / "c", [HIT] * 20, "p", scenarios_of(20))
+    dog = run_of(tmp_path / "d", [GOALS] * 20, "p", scenarios_of(20), robot="dog")
     told = compare_runs([courier, dog])
     assert (told.before.label, told.others[0].label) == ("p, courier", "p, dog")
     assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
@@ -185,9 +185,9 @@ def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path:
 def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     tmp_path: Path, cosim: Cosim
 ) -> None:
-    """A run in rain is named so, is no resumption of one in clear weather, and is called neither
-    better nor worse; both are in a table by weather."""
-    ways = several(20)
+    """A run in rain is named, cannot resume one in clear weather, has no verdict, and is in a table
+    by weather."""
+    ways = scenarios_of(20)
     clear = run_of(tmp_path / "c", [GOALS] * 20, "p", ways)
     rain = run_of(tmp_path / "r", [HIT] * 20, "p", ways, weather="rain")
     difference = read_spec(clear).difference_from(read_spec(rain))
@@ -212,8 +212,8 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
 def test_runs_of_other_sensor_tracks_get_no_verdict_but_blind_ones_do(
     runs: Path, tmp_path: Path, track: str
 ) -> None:
-    """A policy with a lidar, or with tracked people, is not compared with one with a camera; a
-    blind baseline is. Records without these keys are read as before."""
+    """Lidar and tracked people are not compared with a camera, a blind baseline is; older records
+    are read as before."""
     sensors: dict[str, object] = {"lidar": {}} if track == "lidar" else {"people": "seen"}
     sensing = rewritten(runs / "b", tmp_path / "sensing", **sensors)
     seeing = rewritten(runs / "b", tmp_path / "seeing", camera={"width": 64, "height": 48})
@@ -231,9 +231,8 @@ def test_runs_of_other_sensor_tracks_get_no_verdict_but_blind_ones_do(
     assert table_row(Record.decoded(json.dumps(old).encode(), path))["track"] == "blind"
 
 
-def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:
-    """A camera is the policy's own choice; a run without one is a blind baseline, of which nothing
-    is said."""
+def test_another_camera_is_noted_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:
+    """The camera is the policy's own choice; a run without one is a blind baseline without a note."""
     small, large = (
         rewritten(runs / name, tmp_path / name, camera=CameraSpec(width, 48))
         for name, width in (("a", 64), ("b", 96))
@@ -246,7 +245,7 @@ def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path
 
 
 def test_another_look_of_a_scan_is_reported(runs: Path, tmp_path: Path) -> None:
-    """Splats against mesh, other splats or another sun are named; equal looks are not."""
+    """Splats against mesh, other splats and another sun are named; equal looks are not."""
     looks = {
         "a": ScanLook(
             appearance="splats",
@@ -270,8 +269,7 @@ def test_another_look_of_a_scan_is_reported(runs: Path, tmp_path: Path) -> None:
 def test_a_run_with_injected_pedestrians_is_marked(
     runs: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """In results.csv, below the table and in a comparison; a run without them has no such
-    column."""
+    """results.csv, table and comparison mark it, and a run without them has no such column."""
     injected = rewritten(
         runs / "a", tmp_path / "a", "s-001", injections=[{"tick": 3, "injection": EVE}]
     )
@@ -291,8 +289,7 @@ EVE = {"id": "eve", "path": [[4.0, 1.0], [4.0, -1.0]]}
 
 
 def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
-    """A copy of a run whose records have other fields. of: the scenario of the record, "" for all
-    of them."""
+    """A copy of a run with changed fields in the record of scenario `of`, or in all for ""."""
     with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
         for record in read_records(run):
             other = fields if of in ("", record.scenario.id) else {}
@@ -305,8 +302,8 @@ def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
 
 
 def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
-    """In every metric and group, without a verdict below five scenarios, and nothing flipped; of a
-    name twice the second has a number."""
+    """No metric or group differs, below five scenarios there is no verdict, and a repeated name
+    gets a number."""
     told = compare_runs([runs / "a", runs / "a"])
     enough, few = (told.differences[told.differences["n"].between(*of)] for of in ((5, 99), (1, 4)))
     assert {*enough["verdict"]} == {"within noise"} and {*few["verdict"]} == {""}
@@ -318,9 +315,9 @@ def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
     assert "solved by a (2) alone, 0: none" in said.stdout
 
 
-def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> None:
-    """A crash counts as failed, and takes all else of its groups away, so that no metric with a
-    direction gains by it; an invalid episode is in no pair; both told."""
+def test_a_crashing_run_is_compared_at_its_worst_without_rates(runs: Path) -> None:
+    """A crash counts as failed and removes its groups' other metrics; an invalid episode is in no
+    pair; both are noted."""
     told = compare_runs([runs / "a", runs / "c"])
     assert (
         row(told, "success", after="c")["n"] == 19
@@ -344,11 +341,11 @@ def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> No
     )
 
 
-def test_who_crashes_in_every_episode_is_better_in_nothing(runs: Path, tmp_path: Path) -> None:
-    """Against a policy that fails everywhere: no rate and no other mean, nothing better; SR as low,
-    route completion and speed lower."""
+def test_a_run_that_always_crashes_is_better_in_nothing(runs: Path, tmp_path: Path) -> None:
+    """Against a run that always fails it has no rates, nothing better, equal SR, and lower
+    completion and speed."""
     bad, crashing = (
-        run_of(tmp_path / how, [how] * 20, how, several(20)) for how in (HIT, "crashed")
+        run_of(tmp_path / how, [how] * 20, how, scenarios_of(20)) for how in (HIT, "crashed")
     )
     told = compare_runs([bad, crashing])
     assert {*told.differences["verdict"]} <= {"worse", "within noise", "too few", "differs", ""}
@@ -359,8 +356,7 @@ def test_who_crashes_in_every_episode_is_better_in_nothing(runs: Path, tmp_path:
 
 
 def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
-    """CSV holds every metric in full; Markdown and LaTeX the tables that are printed; the same each
-    time."""
+    """CSV has every metric in full, Markdown and LaTeX have the printed tables, reproducibly."""
     files = [tmp_path / f"told{end}" for end in (".csv", ".md", ".tex")]
     words = [
         "compare",
@@ -390,8 +386,8 @@ def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: 
 
 
 def test_below_five_scenarios_a_comparison_shows_counts(runs: Path) -> None:
-    """Four scenarios of `test`: solved of all, failures in metres, neither interval nor verdict, in
-    every format; the .csv has the counts of larger groups, too."""
+    """Four scenarios of `test` have counts without interval or verdict in every format; the CSV
+    counts larger groups, too."""
     told = compare_runs([runs / "a", runs / "b"])
     of_test = row(told, "success", "test")
     assert (of_test["counts_before"], of_test["counts_after"]) == ("2/4", "4/4")
@@ -410,7 +406,7 @@ def test_below_five_scenarios_a_comparison_shows_counts(runs: Path) -> None:
 
 
 def test_names_are_escaped(runs: Path) -> None:
-    """A name of all that means something to LaTeX, Markdown or HTML ends no cell, begins no command
+    """A name of all special characters of LaTeX, Markdown and HTML ends no cell, starts no command,
     and is no tag."""
     odd = r"<script>_a&b|c$1%#{2}~^\input{x}*`d`[e](f)"
     told = compare_runs([runs / "a", runs / "b"])
@@ -509,11 +505,9 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_cannot_be_compared_is_refused_in_one_line(
-    tmp_path: Path, cosim: Cosim, name: str
-) -> None:
-    """File or folder and the remedy are named, nothing is printed or written beside that; exit code
-    2."""
+def test_unreadable_runs_are_refused_in_one_line(tmp_path: Path, cosim: Cosim, name: str) -> None:
+    """File or folder and the remedy are named, no other output is printed or written, and the exit
+    code is 2."""
     first, run = (run_of(tmp_path / which, [GOALS, HIT], which) for which in ("first", "second"))
     spoil, words = BAD[name]
     spoil(run)
@@ -524,9 +518,8 @@ def test_what_cannot_be_compared_is_refused_in_one_line(
     assert words.format(run=run, first=first) in told
 
 
-def test_a_run_that_goes_on_is_not_compared(tmp_path: Path, cosim: Cosim) -> None:
-    """The process is named; one that was stopped and lacks episodes is compared in what it has, and
-    that is told."""
+def test_a_run_in_progress_is_not_compared(tmp_path: Path, cosim: Cosim) -> None:
+    """Its process is named; a stopped run is compared in its finished episodes, with a note."""
     first, run = (
         run_of(tmp_path / which, [GOALS, HIT, GOALS], which) for which in ("first", "second")
     )
@@ -546,8 +539,8 @@ def test_a_run_that_goes_on_is_not_compared(tmp_path: Path, cosim: Cosim) -> Non
     )
 
 
-def test_wrong_words_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
-    """One run alone, a format that there is none of, a folder that cannot be written to."""
+def test_invalid_arguments_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
+    """A single run, an unknown format, and an unwritable folder are refused."""
     one, other = str(runs / "a"), str(runs / "b")
     said = cosim("compare", one)
     assert (

@@ -1,4 +1,5 @@
-"""Discerned: pairs of an event and its decoy, in tables, comparisons, reports and files."""
+"""The metric discerned (D): pairs of an event and its decoy, in tables, comparisons, reports and
+files."""
 
 from __future__ import annotations
 
@@ -54,7 +55,7 @@ FRONTAL = [GOAL, GOAL] * 3 + [GOAL, "invalid"] + [HIT, HIT]
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`a` as above; `b` solves all; `events` is of the former suite, without decoys."""
+    """Runs: `a` as above, `b` solves everything, `events` is of the former suite without decoys."""
     folder = tmp_path_factory.mktemp("runs")
     run_of(folder / "a", [*MIXED, *FRONTAL, GOAL], "a", EVERY)
     run_of(folder / "b", [GOAL] * 21, "b", EVERY)
@@ -67,8 +68,8 @@ def table(run: Path) -> pd.DataFrame:
 
 
 def test_a_pair_counts_only_if_both_are_solved(runs: Path) -> None:
-    """One of four of `lateral`, a crash is unsolved, a pair with an invalid member is left out and
-    counted; three of four of `frontal`; D of the run is over both, whatever is not paired."""
+    """Crashes count as unsolved, pairs with an invalid member are excluded and counted, and D is
+    over all pairs."""
     whole = table(runs / "a")
     for kind, mean in (("lateral", 0.25), ("frontal", 0.75)):
         part = whole[whole["structure"] == kind]
@@ -81,7 +82,7 @@ def test_a_pair_counts_only_if_both_are_solved(runs: Path) -> None:
 
 
 def test_every_other_mean_is_over_scenarios_without_decoys(runs: Path) -> None:
-    """The rows of the events alone give the same: a crash of a decoy takes no rate away."""
+    """The rows of the events alone give the same values, so that a decoy's crash removes no rate."""
     whole = table(runs / "a")
     events = whole[whole["decoy_of"] == ""]
     summary = summary_of(whole).drop("discerned")
@@ -102,7 +103,7 @@ def test_without_the_other_member_there_is_no_pair(runs: Path) -> None:
     assert summary_of(nothing).loc["discerned", "n"] == 0
 
 
-def test_files_say_whose_decoy_an_episode_is(runs: Path) -> None:
+def test_files_record_the_event_of_a_decoy(runs: Path) -> None:
     """record.json and results.csv have the column, so that no table needs the suite."""
     told = json.loads((runs / "a/episodes/lateral-000-decoy/record.json").read_bytes())
     assert told["decoy_of"] == "lateral-000"
@@ -111,8 +112,7 @@ def test_files_say_whose_decoy_an_episode_is(runs: Path) -> None:
 
 
 def test_a_run_shows_d_beside_sr(runs: Path, cosim: Cosim) -> None:
-    """Over all, per kind with the number of pairs, and what was left out; without decoys nothing
-    of it."""
+    """D is shown over all and per kind with its pairs and exclusions, and not without decoys."""
     said = cosim("show", str(runs / "a"))
     lines = [" ".join(line.replace("│", " ").split()) for line in said.stdout.splitlines()]
     text = " ".join(" ".join(lines).split())
@@ -127,8 +127,8 @@ def test_a_run_shows_d_beside_sr(runs: Path, cosim: Cosim) -> None:
 
 
 def test_a_comparison_pairs_the_pairs(runs: Path, tmp_path: Path) -> None:
-    """The difference of D is over pairs that both runs have, for the suite and each kind; SR is
-    over events; the exports have it."""
+    """D is compared over common pairs, for the suite and each kind; SR is over events; exports have
+    both."""
     told = compare_runs([runs / "a", runs / "b"])
     rows = told.differences.set_index(["metric", "group"])
     whole = rows.loc[("discerned", "reactive")]
@@ -144,8 +144,8 @@ def test_a_comparison_pairs_the_pairs(runs: Path, tmp_path: Path) -> None:
 
 
 def test_a_report_has_d_in_tables_and_a_plot(runs: Path) -> None:
-    """In the summary beside SR, in a table and a plot by event without `static`; decoys are a bar
-    of their own among the endings."""
+    """It is beside SR and in a plot by event without `static`, and decoys have their own bar of
+    endings."""
     reported = read_runs([runs / "a", runs / "b"])
     colours = colours_of(reported)
     summary = summary_table(reported, colours)
@@ -168,7 +168,7 @@ def test_a_report_has_d_in_tables_and_a_plot(runs: Path) -> None:
 
 
 def refused(runs: Sequence[Path], target: Path) -> dict[str, str]:
-    """What a comparison, a report and a merge of runs say."""
+    """Return the refusals of a comparison, a report and a merge of runs."""
     said = {}
     for name, of in (
         ("compare", lambda: compare_runs(runs)),
@@ -182,8 +182,8 @@ def refused(runs: Sequence[Path], target: Path) -> dict[str, str]:
 
 
 def test_runs_of_the_former_suite_are_refused(runs: Path, tmp_path: Path) -> None:
-    """A suite without decoys is another one: refused by comparison, report and merge, with both
-    hashes or the field that is apart."""
+    """Comparison, report and merge refuse a suite without decoys, with both hashes or the differing
+    field."""
     said = refused([runs / "b", runs / "events"], tmp_path / "merged")
     assert "run both on the same version of it (former suite, edited" in said["compare"]
     assert "are of different suites 'reactive'" in said["report"]
@@ -191,9 +191,8 @@ def test_runs_of_the_former_suite_are_refused(runs: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "merged").exists()
 
 
-def test_a_decoy_of_nothing_is_refused_in_a_whole_suite_alone(tmp_path: Path) -> None:
-    """A part of a suite, as in a run folder, may lack the event; a suite's file may not. No decoy
-    has a decoy, and one that ends at a stop has no go-on rule."""
+def test_a_decoy_without_its_event_is_refused_in_a_suite_file_only(tmp_path: Path) -> None:
+    """A part of a suite may lack the event; decoys of decoys and go-on rules at stops are refused."""
     part = Suite(name="reactive", version="1", scenarios=PAIRS[1:])
     write_suite(part, tmp_path / "s.json")
     assert len(read_suite(tmp_path / "s.json").scenarios) == 19

@@ -1,4 +1,4 @@
-"""Falls of robots with legs: when they count, and what follows from a trajectory."""
+"""Falls of legged robots: when they count, and how they follow from a trajectory."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_robot_that_is_down_for_a_tenth_of_a_second_has_fallen_once(ends: bool
 
 
 def test_a_fall_that_follows_from_a_collision_is_not_counted() -> None:
-    """The collision resets the robot, so that it has to be down for 0.1 s again."""
+    """The collision resets the robot, which then has to be down for 0.1 s again."""
     one = referee(ends_on_failure=False)
     hit = down(step(1, 20.0, contacts=[touch("bin", "object")]))
     verdicts = judge_all(one, [down(step(0, 20.0)), hit, *(down(step(t, 20.0)) for t in (2, 3))])
@@ -74,7 +74,7 @@ def test_a_robot_that_a_person_pushes_over_has_not_failed(ends: bool) -> None:
 
 
 def pushed_over(one: Referee, from_tick: int, ticks: int = 3) -> Verdict:
-    """A person walks into the standing robot, which then lies; the verdict of the last tick."""
+    """Return the last verdict after a person walks into the standing robot, which then lies."""
     who = people((20.5, 0.0), heading=math.pi, speed=1.3)
     stood(one, from_tick)
     one.judge(step(from_tick, 20.0, speed=0.0, contacts=[touch("c0")], who=who))
@@ -82,7 +82,7 @@ def pushed_over(one: Referee, from_tick: int, ticks: int = 3) -> Verdict:
     return judge_all(one, [*lying])[-1]
 
 
-def test_a_robot_that_was_put_back_was_not_pushed() -> None:
+def test_a_fall_after_a_reset_is_not_a_push() -> None:
     """A fall right after the reset that follows a push is the robot's own."""
     one = referee(ends_on_failure=False)
     assert pushed_over(one, 19).reset is not None
@@ -92,8 +92,8 @@ def test_a_robot_that_was_put_back_was_not_pushed() -> None:
 
 @pytest.mark.parametrize(("contact_ends", "kind"), [(59, "pushed"), (30, "failed")])
 def test_a_push_lasts_as_long_as_the_person_touches_the_robot(contact_ends: int, kind: str) -> None:
-    """A fall more than 1 s after the contact began is the person's while the contact continues, and
-    the robot's own 1 s after its end."""
+    """A fall during the contact, or less than 1 s after its end, is the person's, and a later one
+    the robot's own."""
     who = people((20.5, 0.0), heading=math.pi, speed=1.3)
     one = referee(ends_on_failure=False)
     stood(one, 19)
@@ -106,7 +106,7 @@ def test_a_push_lasts_as_long_as_the_person_touches_the_robot(contact_ends: int,
 
 
 def test_a_robot_that_is_down_reaches_no_goal() -> None:
-    """It slides into the goal while it falls: the fall is counted, and no goal is reached."""
+    """When it slides into the goal while it falls, the fall is counted and no goal is reached."""
     one = referee(ends_on_failure=True)
     verdicts = judge_all(one, [down(step(t, 99.8 + 0.1 * t)) for t in range(3)])
     assert [verdict.ended for verdict in verdicts] == [None, None, "failure"]
@@ -125,9 +125,9 @@ def test_a_robot_that_is_down_makes_no_stop() -> None:
 
 
 @pytest.mark.parametrize("x_m", [18.0, 23.0])
-def test_a_push_gains_no_way(x_m: float) -> None:
-    """The robot that a person pushed over continues where it fell, or behind it where the person
-    stands, also if the nearest waypoint is ahead and however often it is pushed."""
+def test_a_push_gains_no_progress(x_m: float) -> None:
+    """A pushed robot continues where it fell or behind it, even if the nearest waypoint is ahead,
+    after any number of pushes."""
     one = referee(ends_on_failure=False)
     for again in range(4):
         begin = again * 40
@@ -148,7 +148,7 @@ def test_a_push_gains_no_way(x_m: float) -> None:
 
 
 def test_a_state_hash_holds_the_attitude_of_the_trunk() -> None:
-    """Roll, pitch and lying change the hash with legs; on wheels it is as it always was."""
+    """Roll, pitch and lying change the hash with legs, and on wheels the hash is unchanged."""
 
     def hash_of(one: Step) -> str:
         found = StateHash()
@@ -174,8 +174,8 @@ def with_legs(one: Log, ticks_down: range) -> Log:
 
 
 def test_falls_follow_from_the_trajectory() -> None:
-    """A recorded fall is where the robot was down for 0.1 s; one that is left out or added
-    contradicts the trajectory."""
+    """A recorded fall is where the robot was down for 0.1 s; a missing or added one contradicts the
+    trajectory."""
     way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     walked = with_legs(driven(way, [1.0] * 100, {30: 0.0}), range(28, 31))
     fall = failure_at(walked, 30, "fall")
@@ -190,7 +190,7 @@ def test_falls_follow_from_the_trajectory() -> None:
 
 
 def test_wheels_have_no_number_of_falls() -> None:
-    """With legs falls are counted, and 0 without one; with wheels there is no number."""
+    """With legs falls are counted, from 0; with wheels there is no number."""
     walked = log([0.1 * (i + 1) for i in range(1000)])
     fall = Failure("fall", 5, 0.0, 0.0, 0.0, 0.0)
     wheels = compute_metrics(episode(walked))
@@ -213,7 +213,7 @@ def test_the_goal_of_a_robot_that_is_down_contradicts_the_trajectory() -> None:
 
 
 def test_a_reset_beyond_a_pushed_fall_contradicts_the_trajectory() -> None:
-    """A push gains no way, in a record neither."""
+    """A record whose push gains progress is refused."""
     way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     for to_m, contradicted in ((1.0, 0), (4.0, 1)):
         walked = with_legs(driven(way, [1.0] * 30 + [0.0] * 70, {65: to_m}), range(63, 66))
@@ -245,8 +245,8 @@ def pushed(way: Scenario, log: Log, contact: int, fall: int) -> Record:
 
 
 def test_a_push_follows_from_the_trajectory() -> None:
-    """Only a person near who walked into the standing robot less than 1 s before, or stayed near
-    until then, may have pushed it over."""
+    """Only a person who walked into the standing robot less than 1 s before, or stayed near until
+    then, can have pushed it."""
     way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     speeds = [1.0] * 10 + [0.0] * 90
 
@@ -264,7 +264,7 @@ def test_a_push_follows_from_the_trajectory() -> None:
 
 def test_a_fall_of_the_robot_is_not_a_push() -> None:
     """A failure that is moved to `walked_into` contradicts the trajectory, in the last tick by the
-    end that it had."""
+    episode's end."""
     way = short_way("s", robot="dog", ends_on_failure=True)
     walked = with_person(with_legs(driven(way, [0.0] * 50), range(47, 50)), range(50))
     fall = failure_at(walked, 49, "fall")
@@ -282,16 +282,16 @@ def test_a_fall_of_the_robot_is_not_a_push() -> None:
 
 
 def test_a_fall_on_wheels_contradicts_the_trajectory() -> None:
-    """A robot on wheels has none, whatever the fault."""
+    """A robot on wheels has no falls, whatever the fault."""
     way = short_way("s", ends_on_failure=False, time_limit_s=5.0)
     rolled = with_person(driven(way, [0.0] * 100, {60: 0.0}), range(100))
     found = [one.what for one in contradictions(pushed(way, rolled, 50, 60), way, rolled)]
     assert found == ["falls at tick 60"]
 
 
-def test_a_trajectory_without_the_columns_of_the_legs_is_not_of_the_robot(tmp_path: Path) -> None:
-    """A robot with legs has four columns and one per joint, a robot on wheels none; an array of
-    one dimension is no trajectory."""
+def test_a_trajectory_must_have_the_columns_of_its_robot(tmp_path: Path) -> None:
+    """Legs need four columns and one per joint, wheels none, and arrays of one dimension are
+    refused."""
     for robot, columns, contradicted in (
         ("dog", 16, []),
         ("dog", 0, ["columns of legs"]),
@@ -312,7 +312,7 @@ def test_a_trajectory_without_the_columns_of_the_legs_is_not_of_the_robot(tmp_pa
 
 
 def test_a_push_over_is_one_contact_and_is_shown_as_a_push() -> None:
-    """`walked_into` counts the contact alone; the episode is printed with both."""
+    """`walked_into` counts the contact alone, and the episode is printed with both."""
     way = short_way("s", robot="dog", ends_on_failure=False, time_limit_s=5.0)
     walked = with_legs(driven(way, [0.0] * 100, {60: 0.0}), range(58, 61))
     record = pushed(way, walked, 45, 60)

@@ -73,7 +73,7 @@ def step(
     w_radps: float = 0.0,
     command: Command = STILL,
 ) -> Step:
-    """The robot ends the tick at (x, y), which is also its place on the route."""
+    """A step that ends at (x, y), which is also the robot's place on the route."""
     robot = RobotState(Pose(x_m, y_m, 0.0), speed, w_radps)
     street = Street(tick, who or people(), cars, {name: Signal(False) for name in red})
     motion = Motion(
@@ -91,7 +91,7 @@ def touch(other: str, kind: str = "pedestrian") -> Contact:
 
 
 def test_a_collision_is_one_event_until_they_have_been_apart() -> None:
-    """A contact that lasts is counted once; after 1 s apart the same person counts again."""
+    """A lasting contact counts once, and after 1 s apart the same person counts again."""
     one = referee(ends_on_failure=False)
     far = people((50.0, 0.0))
     assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=far)).failures
@@ -105,8 +105,8 @@ def test_a_collision_is_one_event_until_they_have_been_apart() -> None:
     assert [(one.kind, one.other) for one in again] == [("collision", "c0")]
 
 
-def test_someone_still_within_ten_centimetres_has_not_parted() -> None:
-    """A person who stays near after a contact does not collide anew, however long it takes."""
+def test_a_person_within_ten_centimetres_has_not_parted() -> None:
+    """A person who stays near after a contact does not collide again, however long it takes."""
     one = referee()
     near = people((20.0 + 0.35 + 0.3 + 0.05, 0.0))
     assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=near)).failures
@@ -116,7 +116,7 @@ def test_someone_still_within_ten_centimetres_has_not_parted() -> None:
 
 
 def test_the_fault_of_a_contact_follows_who_moved() -> None:
-    """A standing person was driven into; both moving share it, and so they do where the robot has
+    """The robot has hit a standing person; both share the fault when both move or the robot has
     only just stopped."""
 
     def fault(robot_mps: float, person_mps: float) -> str | None:
@@ -134,16 +134,16 @@ def test_the_fault_of_a_contact_follows_who_moved() -> None:
 
 
 def stood(one: Referee, ticks: int, **speeds: float) -> None:
-    """The robot stands at x = 20, or turns there."""
+    """Steps of a robot that stands, or turns, at x = 20."""
     for tick in range(ticks):
         assert not one.judge(step(tick, 20.0, speed=0.0, **speeds)).failures
 
 
 @pytest.mark.parametrize("ends", [True, False])
-def test_who_walks_into_a_robot_that_stands_is_at_fault_and_the_robot_has_not_failed(
+def test_a_person_who_walks_into_a_standing_robot_is_at_fault(
     ends: bool,
 ) -> None:
-    """After 1 s of standing a contact is counted and nothing ends nor is reset; after less it is a
+    """After 1 s of standing the contact is counted without end or reset, and after less it is a
     collision."""
     who = people((20.5, 0.0), heading=math.pi, speed=1.3)
     hit = {"contacts": [touch("c0")], "who": who, "speed": 0.0}
@@ -162,11 +162,9 @@ def test_who_walks_into_a_robot_that_stands_is_at_fault_and_the_robot_has_not_fa
     assert (verdict.ended == "failure", verdict.reset is None) == (ends, ends)
 
 
-def test_beside_a_robot_that_turns_on_the_spot_the_one_who_moves_into_the_other_is_at_fault() -> (
-    None
-):
-    """A walker is at fault; the robot is if its corner swings into a standing person, or if it has
-    turned for less than 1 s."""
+def test_beside_a_turning_robot_the_one_who_moves_is_at_fault() -> None:
+    """A walker is; the robot is when its corner swings into a standing person, or before 1 s of
+    turning."""
     corner = {"contacts": [touch("c0")], "speed": 0.0}
 
     def fault(mps: float, w_radps: float, ticks: int = 19) -> str | None:
@@ -194,8 +192,9 @@ def test_beside_a_robot_that_turns_on_the_spot_the_one_who_moves_into_the_other_
     assert failure.fault == "robot_at_fault"
 
 
-def test_a_robot_that_drives_on_through_who_has_walked_into_it_collides() -> None:
-    """Standing until one is touched buys nothing; a robot that is only pushed has not driven."""
+def test_a_robot_that_drives_through_a_person_who_touched_it_collides() -> None:
+    """Standing until a touch excuses no later driving, and a robot that is only pushed has not
+    driven."""
     who = people((20.5, 0.0))
     hit = {"contacts": [touch("c0")], "who": who}
     one = referee(ends_on_failure=True)
@@ -206,9 +205,8 @@ def test_a_robot_that_drives_on_through_who_has_walked_into_it_collides() -> Non
     assert failure.fault == "robot_at_fault"
 
 
-def test_things_touched_in_one_tick_are_as_many_collisions_and_one_reset() -> None:
-    """Two people and a bin at once are three failures in the order of their contacts, one of them
-    counted once."""
+def test_several_contacts_in_one_tick_are_several_collisions_and_one_reset() -> None:
+    """Two people and a bin are three failures in the order of contacts, one of them counted once."""
     hit = [touch("c0"), touch("bin", "object"), touch("c0"), touch("c1")]
     verdict = referee().judge(step(0, 23.0, contacts=hit, who=people((23.4, 0.0), (23.4, 0.4))))
     assert [failure.other for failure in verdict.failures] == ["c0", "bin", "c1"]
@@ -218,7 +216,7 @@ def test_things_touched_in_one_tick_are_as_many_collisions_and_one_reset() -> No
 
 
 def test_waiting_is_no_failure_where_an_episode_ends_on_one() -> None:
-    """Before its goal a robot may stand until the time is up; on a long way it freezes."""
+    """Before its goal a robot may stand until the time limit, and on a long way it freezes."""
     for ends, ended in ((True, "timeout"), (False, "timeout")):
         one = referee(ends_on_failure=ends, time_limit_s=60.0)
         verdicts = judge_all(one, [step(t, 20.0, speed=0.0) for t in range(1200)])
@@ -227,8 +225,7 @@ def test_waiting_is_no_failure_where_an_episode_ends_on_one() -> None:
 
 
 def test_out_of_lane_is_the_base_centre_outside_the_walkable_area() -> None:
-    """At 1.99 m beside a 2 m half width nothing happens, at 2.01 m it does, and the robot is put
-    back on the route."""
+    """Beside a half width of 2 m, 1.99 m is inside, and 2.01 m resets the robot to the route."""
     one = referee()
     assert one.judge(step(0, 23.0, 1.99)).failures == ()
     verdict = one.judge(step(1, 23.0, 2.01))
@@ -236,9 +233,8 @@ def test_out_of_lane_is_the_base_centre_outside_the_walkable_area() -> None:
     assert verdict.reset is not None and verdict.reset.pose == (25.0, 0.0, 0.0)
 
 
-def test_out_of_lane_is_told_at_every_step_of_a_walk_to_and_fro_over_the_edge() -> None:
-    """Where the area holds the base centre nothing is told, outside it is, in every one of 800
-    steps of all lengths."""
+def test_out_of_lane_is_exact_at_every_step_across_the_edge() -> None:
+    """In 800 steps of all lengths it holds exactly where the base centre is outside."""
     rng = np.random.default_rng(6)
     one = referee()
     y_m = 0.0
@@ -260,7 +256,7 @@ def test_freezing_is_half_a_metre_in_ten_seconds() -> None:
 
 
 def test_going_to_and_fro_is_not_freezing() -> None:
-    """A robot that went away and came back to the same spot within the window has moved."""
+    """A robot that left and returned to the same spot within the window has moved."""
     track = [20.0 + 1.0 * math.sin(2 * math.pi * t / 200) for t in range(600)]
     assert not any(
         v.failures for v in judge_all(referee(), [step(t, x) for t, x in enumerate(track)])
@@ -268,8 +264,7 @@ def test_going_to_and_fro_is_not_freezing() -> None:
 
 
 def test_waiting_before_a_red_crossing_is_not_freezing() -> None:
-    """Within 4 m before a red crossing of the route time does not count; when it turns green, it
-    does."""
+    """Within 4 m of a red crossing of the route time does not count, and at green it does."""
     crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
     one = referee(crossings=(crossing,))
     waiting = judge_all(one, [step(t, 29.0, red=[":x_c0"]) for t in range(500)])
@@ -295,8 +290,7 @@ def test_entering_a_crossing_at_red_is_noted_once() -> None:
 
 
 def test_a_reset_keeps_off_obstacles() -> None:
-    """A reset moves on to the next waypoint that is free of obstacles, or to the nearest if none
-    is."""
+    """It moves on to the next waypoint free of obstacles, or to the nearest if none is."""
 
     def bin_at(x_m: float, y_m: float = 0.0) -> Obstacle:
         return Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)
@@ -313,9 +307,8 @@ def test_a_reset_keeps_off_obstacles() -> None:
     assert reset_m(*(bin_at(5.0 * k) for k in range(21))) == 20.0
 
 
-def test_who_hits_what_stands_before_the_goal_is_put_between_it_and_the_goal() -> None:
-    """Beyond the last waypoint there is room still: else it would be put before the same bin until
-    the time is up."""
+def test_a_reset_at_an_obstacle_before_the_goal_is_beyond_it() -> None:
+    """Otherwise the robot would face the same bin until the time limit."""
     for bin_m, beyond_m in ((96.0, 96.8), (97.4, 98.2)):
         one = referee(obstacles=(Obstacle(kind="bin", x_m=bin_m, y_m=0.0, heading_rad=0.0),))
         hit = [touch("bin", "object")]
@@ -326,8 +319,7 @@ def test_who_hits_what_stands_before_the_goal_is_put_between_it_and_the_goal() -
 
 
 def test_a_reset_goes_to_the_nearest_free_waypoint() -> None:
-    """Waypoints lie every 5 m; one where a person stands is passed over, and so is one on a
-    crossing."""
+    """Waypoints are 5 m apart; one with a person is skipped, and so is one on a crossing."""
     crossing = RouteCrossing(id=":x_c0", enter_s_m=28.0, leave_s_m=36.0, signalised=False)
     verdict = referee().judge(step(0, 23.0, 3.0, who=people((25.3, 0.0))))
     assert verdict.reset is not None and verdict.reset.route_s_m == 20.0
@@ -336,8 +328,8 @@ def test_a_reset_goes_to_the_nearest_free_waypoint() -> None:
 
 
 def test_three_failures_in_one_place_carry_the_robot_beyond_it() -> None:
-    """The third failure within 10 m of the route puts the robot at the first waypoint at least 1 m
-    behind them all."""
+    """The third within 10 m of the route resets the robot to the first waypoint at least 1 m beyond
+    them."""
     one = referee()
     resets = [one.judge(step(t, x, 3.0)).reset for t, x in enumerate((21.0, 24.0, 22.0, 25.0))]
     assert [r.route_s_m for r in resets if r is not None] == [20.0, 25.0, 30.0, 25.0]
@@ -349,7 +341,7 @@ def test_three_failures_in_one_place_carry_the_robot_beyond_it() -> None:
 
 
 def test_a_robot_that_never_moves_is_carried_along_the_route_but_never_to_its_goal() -> None:
-    """Frozen at every place, it is put on and on, and the episode ends by time, not at the goal."""
+    """Frozen at every place, it is reset further and further, and the episode ends by time."""
     one = referee(time_limit_s=1500.0)
     x_m = 0.0
     ended = None
@@ -362,8 +354,8 @@ def test_a_robot_that_never_moves_is_carried_along_the_route_but_never_to_its_go
     assert ended == "timeout" and 90.0 <= x_m <= 98.0
 
 
-def test_a_vehicle_collides_anew_only_after_it_has_been_away() -> None:
-    """A car that stays within 0.1 m has not parted; one that drove off and comes back has."""
+def test_a_vehicle_collides_again_only_after_it_has_been_away() -> None:
+    """A car within 0.1 m has not parted, and one that returns has."""
     one = referee()
     near = Vehicles.of(("v0",), [[20.0, 1.9]], [0.0], [0.0], [[4.5, 1.8]])
     hit = [Contact("vehicle", "v0", 0)]
@@ -377,8 +369,8 @@ def test_a_vehicle_collides_anew_only_after_it_has_been_away() -> None:
 
 
 def test_a_crossing_can_be_entered_at_red_after_it_was_left() -> None:
-    """Entered at green, left backwards by half a metre, and entered again at red: that is an entry
-    at red."""
+    """Entered at green, left backwards by half a metre, and entered again at red, it is an entry at
+    red."""
     crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
     one = referee(crossings=(crossing,))
     at = [(30.2, False), (29.9, False), (29.5, False), (29.6, True), (30.1, True)]
@@ -389,7 +381,7 @@ def test_a_crossing_can_be_entered_at_red_after_it_was_left() -> None:
 
 
 def test_time_before_and_after_a_red_signal_adds_up_to_freezing() -> None:
-    """Waiting at red pauses the count of a freezing, it does not begin it anew."""
+    """Waiting at red pauses the count of a freezing, and does not restart it."""
     crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
     one = referee(crossings=(crossing,))
     reds = [120 <= t < 400 for t in range(500)]
@@ -400,7 +392,7 @@ def test_time_before_and_after_a_red_signal_adds_up_to_freezing() -> None:
 
 
 def test_the_episode_ends_at_the_goal_or_at_its_time() -> None:
-    """Within the goal radius is the goal; the limit is a timeout; a unit scenario ends at its first
+    """The goal radius is the goal, the limit is a timeout, and a unit scenario ends at its first
     failure."""
     assert referee().judge(step(0, 98.9)).ended is None
     assert referee().judge(step(0, 99.1)).ended == "goal"
@@ -411,7 +403,7 @@ def test_the_episode_ends_at_the_goal_or_at_its_time() -> None:
 
 
 def test_a_goal_near_the_start_of_a_round_route_counts_only_at_its_end() -> None:
-    """A route that ends where it began is not over before it has been driven."""
+    """A route that ends at its start is not over before it has been driven."""
     loop = ((0.0, 0.0), (50.0, 0.0), (50.0, 1.0), (0.5, 1.0))
     one = referee(route=loop, goal=(0.5, 1.0))
     assert one.judge(step(0, 0.5, 0.4)).ended is None
@@ -450,11 +442,10 @@ HAIRPIN = {
     ],
     ids=["at it", "too far", "behind a fence", "beside a fence"],
 )
-def test_a_robot_at_the_goal_is_there_though_it_skipped_a_part_of_the_route(
+def test_a_robot_that_skipped_a_part_of_the_route_reaches_the_goal(
     y_m: float, more: dict[str, object], ended: str | None
 ) -> None:
-    """A route leads out and back along two strips that touch: whoever walks across is at the goal,
-    by no arc length."""
+    """On a route that returns along a touching strip a robot that crosses over is at the goal."""
     one = Referee(scenario(**HAIRPIN | more), AREA, (0.7, 0.55), CLOCK)
     across = step(0, 0.3, y_m)
     assert one.judge(across).ended == ended
@@ -465,7 +456,7 @@ def test_a_robot_at_the_goal_is_there_though_it_skipped_a_part_of_the_route(
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "wall", "object"])
-def test_every_kind_of_thing_can_be_collided_with(kind: str) -> None:
+def test_collisions_with_every_kind_of_obstacle_count(kind: str) -> None:
     """Walls, fences and vehicles are collisions too, without a pedestrian's fault class."""
     (failure,) = referee().judge(step(0, 20.0, contacts=[touch("b", kind)])).failures
     assert (failure.other_kind, failure.fault) == (kind, None)
@@ -481,7 +472,7 @@ def test_people_are_seen_from_the_footprint_not_from_the_centre() -> None:
 
 
 def stopping_hand(phase: str = "acting") -> tuple[Event, EventReply]:
-    """Somebody who holds out a hand at x = 12, in the middle of the sidewalk."""
+    """A person who holds out a hand at x = 12, in the middle of the sidewalk."""
     event = Event(
         id="e0",
         kind="gesturing",
@@ -499,11 +490,9 @@ def stopping_hand(phase: str = "acting") -> tuple[Event, EventReply]:
 @pytest.mark.parametrize(
     ("x_m", "speed", "ended"), [(9.2, 0.0, "stop"), (8.8, 0.0, None), (9.2, 0.06, None)]
 )
-def test_a_stop_before_the_hand_ends_the_episode_well(
-    x_m: float, speed: float, ended: str | None
-) -> None:
-    """Within 3 m in front, slower than 0.05 m/s, for two seconds and not before; farther away or
-    rolling does not."""
+def test_a_stop_before_the_hand_is_a_success(x_m: float, speed: float, ended: str | None) -> None:
+    """It needs two seconds within 3 m in front, slower than 0.05 m/s; farther away or rolling does
+    not count."""
     event, reply = stopping_hand()
     one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
     verdicts = judge_all(one, [step(t, x_m, speed=speed, events=reply) for t in range(45)])
@@ -512,8 +501,8 @@ def test_a_stop_before_the_hand_ends_the_episode_well(
     assert ended is None or first == 39
 
 
-def test_a_stop_interrupted_begins_anew_and_one_before_the_trigger_does_not_count() -> None:
-    """Two seconds in one piece, while the hand is held out."""
+def test_a_stop_must_be_uninterrupted_and_after_the_trigger() -> None:
+    """It needs two seconds in one piece, while the hand is held out."""
     event, reply = stopping_hand()
     one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
     steps = [step(t, 9.2, speed=0.5 if t == 30 else 0.0, events=reply) for t in range(60)]
@@ -526,8 +515,8 @@ def test_a_stop_interrupted_begins_anew_and_one_before_the_trigger_does_not_coun
     )
 
 
-def test_passing_the_hand_ends_the_episode_badly() -> None:
-    """Beyond the pedestrian there is nothing left to stop for, at the goal neither."""
+def test_passing_the_hand_is_a_failure() -> None:
+    """A robot beyond the pedestrian cannot stop for it any more, also at the goal."""
     event, reply = stopping_hand()
     one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
     assert one.judge(step(0, 11.9, events=reply)).ended is None

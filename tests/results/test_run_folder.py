@@ -66,8 +66,8 @@ LOG = driven(SUITE.scenarios[0], [1.0] * 3).encoded()
 """Of three ticks, as `record` has."""
 
 
-def on_disk(folder: RunFolder, kept: Record, under: str = "") -> None:
-    """Write the files of an episode, and no row. under: in the folder of another one."""
+def write_files_of(folder: RunFolder, kept: Record, under: str = "") -> None:
+    """Write the files of an episode without a row; `under` is the folder of another scenario."""
     place = folder.episode_folder(under or kept.scenario.id)
     place.mkdir(parents=True, exist_ok=True)
     (place / "trajectory.npz").write_bytes(LOG)
@@ -75,7 +75,7 @@ def on_disk(folder: RunFolder, kept: Record, under: str = "") -> None:
 
 
 def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: Path) -> None:
-    """Rows are sorted by scenario and hold no wall times, so two runs give the same bytes."""
+    """Rows are sorted by scenario without wall times, so that two runs give the same bytes."""
     for name, order in (("a", (0, 1, 2)), ("b", (2, 0, 1))):
         with RunFolder.create(tmp_path / name, SPEC, SUITE) as folder:
             for i in order:
@@ -85,8 +85,8 @@ def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: 
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
-    """A second run into a folder is refused, and so is a folder of other things; a run killed at
-    once begins anew."""
+    """A second run and a folder of other files are refused, and a run that was killed at once
+    starts again."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE):
         pass
     with pytest.raises(RunError, match=r"already holds a run\. Add --resume"):
@@ -102,7 +102,7 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
-    """While one run holds the folder a second one is told which process does."""
+    """The refusal names the process of the run that holds the folder."""
     with (
         RunFolder.create(tmp_path / "run", SPEC, SUITE),
         pytest.raises(RunError, match=r"in use by process \d+"),
@@ -111,8 +111,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_locked_before_it_is_written(tmp_path: Path) -> None:
-    """Of two runs that find the same folder empty at the same moment the second one writes
-    nothing."""
+    """Of two runs that find the same folder empty at once, the second writes nothing."""
     mine, other = (
         msgspec.structs.replace(SPEC, policy="p"),
         msgspec.structs.replace(SPEC, policy="q"),
@@ -157,8 +156,8 @@ def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.Monk
         ("odometry", "gps"),
     ],
 )
-def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
-    """Another policy, suite or version would mix two runs: the difference is named."""
+def test_resuming_with_other_settings_is_refused(tmp_path: Path, field: str, value: object) -> None:
+    """Another policy, suite or version would mix two runs, so the difference is named."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE):
         pass
     other = changed(SPEC, **{field: value})
@@ -166,8 +165,8 @@ def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, val
         RunFolder.resume(tmp_path / "run", other)
 
 
-def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
-    """Mount, size, field of view and crop of both."""
+def test_a_changed_camera_is_described(tmp_path: Path) -> None:
+    """The description has mount, size, field of view and crop of both."""
     spec = changed(SPEC, camera=CameraSpec(512, 288, 60.0))
     with RunFolder.create(tmp_path / "run", spec, SUITE):
         pass
@@ -182,8 +181,8 @@ def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
         assert again.spec.manifest.camera == spec.manifest.camera
 
 
-def test_every_row_tells_how_waypoints_were_followed(tmp_path: Path) -> None:
-    """From the record, which holds the rule itself."""
+def test_every_row_has_the_waypoint_rule(tmp_path: Path) -> None:
+    """The rule comes from the record."""
     scaled = changed(record("s-0"), waypoints=WaypointRule(index=4, unit_m=0.25))
     scaled.save(tmp_path / "record.json")
     kept = Record.load(tmp_path / "record.json")
@@ -192,7 +191,7 @@ def test_every_row_tells_how_waypoints_were_followed(tmp_path: Path) -> None:
 
 
 def test_resuming_with_an_edited_policy_is_refused(tmp_path: Path) -> None:
-    """Also when its version was left as it was: the policy is named."""
+    """The policy is named, also when its version is unchanged."""
     spec = changed(SPEC, policy_source="1111")
     with RunFolder.create(tmp_path / "run", spec, SUITE):
         pass
@@ -247,9 +246,9 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: str) -> None:
-    """Whatever happened to results.sqlite: showing it says the remedy, and resuming finds every
-    record on disk."""
+def test_a_damaged_database_is_rebuilt_from_the_records(tmp_path: Path, name: str) -> None:
+    """After any damage to results.sqlite, showing it gives the remedy, and resuming finds every
+    record."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         for i in (2, 0):
             folder.write_episode(record(f"s-{i}"), LOG)
@@ -266,7 +265,7 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
 
 
 def test_a_database_of_an_earlier_version_is_read_and_added_to(tmp_path: Path) -> None:
-    """It has a column `row` with the table's row of each record, which is not read any more."""
+    """Its column `row`, which held the table's row of each record, is no longer read."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         folder.write_episode(record("s-0"), LOG)
     with closing(sqlite3.connect(tmp_path / "run/results.sqlite")) as database, database:
@@ -279,11 +278,10 @@ def test_a_database_of_an_earlier_version_is_read_and_added_to(tmp_path: Path) -
         assert again.notes == [] and [*again.finish()["scenario"]] == ["s-0", "s-1"]
 
 
-def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write(
+def test_run_json_and_record_json_are_flat_and_tolerate_missing_keys(
     tmp_path: Path,
 ) -> None:
-    """Every fact of scenario, set-up and manifest is a key of the file; both are read back as they
-    were, and from a file of an earlier version without the later keys."""
+    """Facts are top-level keys and read back unchanged, also from an earlier version's file."""
     spec = changed(
         SPEC,
         camera=CameraSpec(64, 48),
@@ -340,9 +338,8 @@ def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write
         Record.load(path)
 
 
-def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
-    """A run that was killed leaves a write-ahead log; when it is deleted, or everything is, the
-    records count."""
+def test_a_database_without_its_write_ahead_log_is_rebuilt(tmp_path: Path) -> None:
+    """When a killed run's write-ahead log, or everything, is deleted, the records count."""
     for lost in ("results.sqlite-wal", "results.sqlite"):
         path = tmp_path / lost
         code = (
@@ -397,7 +394,7 @@ HARM = {
 def test_a_run_folder_that_is_damaged_during_a_run_loses_no_row(
     tmp_path: Path, damage: str
 ) -> None:
-    """Its rows, records and spec are written again, and it can be resumed."""
+    """Rows, records and spec are written again, and the run can be resumed."""
     run = tmp_path / "run"
     with RunFolder.create(run, SPEC, SUITE) as folder:
         folder.write_episode(record("s-0"), LOG)
@@ -414,8 +411,8 @@ def test_a_run_folder_that_is_damaged_during_a_run_loses_no_row(
         assert again.finished_ids() >= ({"s-0", "s-1"} if damage != "deleted" else set())
 
 
-def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> None:
-    """`show` says the remedy."""
+def test_records_without_a_database_are_reported_with_the_remedy(tmp_path: Path) -> None:
+    """`show` does not print an empty table."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         folder.episode_folder("s-0").mkdir()
         record("s-0").save(folder.episode_folder("s-0") / "record.json")
@@ -425,14 +422,13 @@ def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> 
 
 
 def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
-    """Neither a broken record nor one of another scenario counts as finished; which it was is
-    said."""
+    """A broken record and one of another scenario do not count as finished, and are named."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         for i in range(3):
             folder.episode_folder(f"s-{i}").mkdir()
         (folder.episode_folder("s-0") / "record.json").write_text("{")
-        on_disk(folder, record("s-2"), "s-1")
-        on_disk(folder, record("s-2"))
+        write_files_of(folder, record("s-2"), "s-1")
+        write_files_of(folder, record("s-2"))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert again.finished_ids() == {"s-2"}
         assert len(again.notes) == 2 and all(
@@ -440,9 +436,8 @@ def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
         )
 
 
-def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> None:
-    """A run killed after it wrote a trajectory and before the record: the next attempt begins with
-    an empty folder."""
+def test_a_new_attempt_starts_with_an_empty_folder(tmp_path: Path) -> None:
+    """The trajectory of a run killed before its record is removed."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         folder.write_frame("s-0", 4, b"png")
         for name in ("trajectory.npz", "trajectory.npz.part", "record.json.part"):
@@ -453,14 +448,13 @@ def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> N
         assert [path.name for path in again.episode_folder("s-0").iterdir()] == ["record.json"]
 
 
-def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> None:
-    """A record on disk without a row counts as finished when the run is resumed; one that is not
-    its row's does not."""
+def test_an_episode_whose_row_was_lost_is_recovered_on_resume(tmp_path: Path) -> None:
+    """A record without a row counts as finished, and a record that contradicts its row does not."""
     folder = RunFolder.create(tmp_path / "run", SPEC, SUITE)
     with folder:
         folder.add_row(record("s-0", success=1.0))
         for name in ("s-0", "s-1"):
-            on_disk(folder, record(name, success=0.0))
+            write_files_of(folder, record(name, success=0.0))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert (
             again.finished_ids() == {"s-1"}
@@ -472,8 +466,7 @@ def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> 
 
 
 def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
-    """Crashed episodes stay in SR, RC, SPL and V as 0; whom they would have hit is unknown, and so
-    is every other mean with a direction."""
+    """Crashes count as 0 in SR, RC, SPL and V, and make every other mean with a direction unknown."""
     crashed = msgspec.structs.replace(record("s-1", status="crashed"), measures={}, reason="boom")
     table = table_of([record("s-0"), crashed])
     summary = summary_of(table)
@@ -485,8 +478,8 @@ def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
-    """What is no run folder is answered with what it lacks and the runs that lie in it and beside
-    it; a file with what a run is."""
+    """The message lists what it lacks and the runs in and beside it; for a file it says what a run
+    is."""
     for name in ("mine", "runs/theirs"):
         with RunFolder.create(tmp_path / name, SPEC, SUITE):
             pass
@@ -507,8 +500,10 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("below", ["run", "runs/run"])
-def test_a_run_below_a_file_is_told_which_file_and_where_else(tmp_path: Path, below: str) -> None:
-    """The path leads through a file: that file is named, and a place beside it."""
+def test_a_run_path_through_a_file_is_refused_with_an_alternative(
+    tmp_path: Path, below: str
+) -> None:
+    """That file is named, and a place beside it."""
     (tmp_path / "file").touch()
     path = tmp_path / "file" / below
     told = (
@@ -532,8 +527,8 @@ def test_a_damaged_record_is_named(tmp_path: Path, content: bytes) -> None:
         Record.load(path)
 
 
-def test_a_log_survives_the_disk(tmp_path: Path) -> None:
-    """A saved trajectory reads back the same; a broken file is named."""
+def test_a_saved_trajectory_reads_back_the_same(tmp_path: Path) -> None:
+    """A broken file is named."""
     log = log_with(2, pose=np.ones((2, 3)), event_tracks=np.ones((1, 5)))
     (tmp_path / "t.npz").write_bytes(log.encoded())
     again = Log.load(tmp_path / "t.npz")
@@ -546,8 +541,8 @@ def test_a_log_survives_the_disk(tmp_path: Path) -> None:
 
 
 def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
-    """Asked for one, `cosim show` refuses in words; without, it tells what became of the
-    episode."""
+    """`cosim show` refuses the picture with the reason, and without one prints the episode's
+    outcome."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as held:
         held.write_episode(record("s-0", status="crashed"))
     said = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
@@ -559,7 +554,7 @@ def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
 
 
 def test_records_differ_if_only_one_has_a_scan() -> None:
-    """The difference is described in both orders, also if the first record has the scan."""
+    """The difference is described in both orders."""
     plain = record("s-0")
     scanned = msgspec.structs.replace(plain, scan=ScanLook(appearance="splats"))
     assert record_difference(plain, scanned).startswith("scan is None, there {'appearance'")

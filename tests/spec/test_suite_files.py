@@ -1,5 +1,4 @@
-"""What a suite file may hold: everything else is refused in words, every fault at once, before
-anything runs."""
+"""Valid content of a suite file: everything else is refused with every fault before anything runs."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|n
 """How a refusal says where in the file something is wrong."""
 
 
-def sound() -> dict[str, Any]:
+def valid_suite() -> dict[str, Any]:
     """The file of a suite of three: a long way with barriers, crossings and events, and two short
     ones with groups."""
     chosen = [s for s in load_suite("long-horizon").scenarios if s.id == "lh-037-00"]
@@ -39,7 +38,7 @@ def sound() -> dict[str, Any]:
 
 
 def refusal(path: Path, data: bytes | str) -> str:
-    """What is said of a file with this content, the file's name taken away."""
+    """Return the refusal of a file with this content, without the file's name."""
     path.write_bytes(data if isinstance(data, bytes) else data.encode())
     with pytest.raises(SpecError) as told:
         read_suite(path, EVENT_KINDS)
@@ -48,10 +47,9 @@ def refusal(path: Path, data: bytes | str) -> str:
     return message.removeprefix(f"{path}: ")
 
 
-def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) -> None:
-    """Whatever a file holds: a suite, or a short refusal of printable lines, each of which names
-    its place."""
-    whole = sound()
+def test_a_thousand_mutated_suites_are_read_or_refused_with_reasons(tmp_path: Path) -> None:
+    """Any file is a suite, or has a short refusal of printable lines that each name their place."""
+    whole = valid_suite()
     path = tmp_path / "mutated.json"
     accepted = 0
     for seed in range(1000):
@@ -72,8 +70,8 @@ def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) 
 
 @pytest.mark.engine
 def test_mutated_suites_that_are_accepted_can_be_driven(tmp_path: Path) -> None:
-    """Of those that the reader and the map let through eight are driven for two seconds: none
-    crashes. (`python -m tests.support.mutate_suites` drives 200.)"""
+    """Eight that reader and map accept are driven for 2 s without a crash (`python -m
+    tests.support.mutate_suites`: 200)."""
     driven = []
     for fate in fates(small_suite(City(seed=1, size_m=500.0)), tmp_path, count(0)):
         if fate.what == "does not fit its place":
@@ -184,9 +182,8 @@ OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
 def test_a_value_out_of_its_range_is_named(
     tmp_path: Path, where: tuple[str | int, ...], value: object, told: str
 ) -> None:
-    """The field, its range and what was found; numbers that JSON does not know, such as NaN, are
-    told as any other."""
-    whole: Any = sound()
+    """The message has field, range and value, also for numbers that JSON lacks, such as NaN."""
+    whole: Any = valid_suite()
     *holders, key = where
     holder = whole
     for step in holders:
@@ -195,10 +192,9 @@ def test_a_value_out_of_its_range_is_named(
     assert told in refusal(tmp_path / "s.json", json.dumps(whole))
 
 
-def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
-    """One on a line, the first five of many; wrong types, unknown fields and contradictions
-    alike."""
-    whole = sound()
+def test_several_faults_are_reported_at_once(tmp_path: Path) -> None:
+    """Wrong types, unknown fields and contradictions have one line each, at most five."""
+    whole = valid_suite()
     first, second, third = whole["scenarios"]
     first |= {"seed": "x", "gaol": 1, "crowd": {"persons": -1, "groups": 2.0}, "goal_radius_m": 1e9}
     second["goal"] = [0.0, 0.0]
@@ -220,9 +216,9 @@ def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> None:
-    """Cut off, not UTF-8, nested without end: the line and the byte, or what is wrong with the
-    whole."""
-    text = json.dumps(sound(), indent=1).encode()
+    """A file that is cut off, not UTF-8, or nested endlessly is refused with line and byte, or the
+    general fault."""
+    text = json.dumps(valid_suite(), indent=1).encode()
     told = {
         text[: text.index(b'"version"')]: "JSON ends too early, line 3, byte 1 of it",
         text.replace(
@@ -239,9 +235,8 @@ def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> Non
     assert read_suite(tmp_path / "s.json").name == "sound"
 
 
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
-    """A folder, a pipe that nobody writes to, and a file that is not there: no waiting, no reading
-    without end."""
+def test_a_path_that_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    """A folder, a pipe without a writer and a missing file cause no wait and no endless read."""
     os.mkfifo(tmp_path / "pipe.json")
     (tmp_path / "folder.json").mkdir()
     for name, words in (
@@ -253,11 +248,10 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
             read_suite(tmp_path / name)
 
 
-def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_each(
+def test_a_repeated_scenario_is_found_in_linear_time(
     tmp_path: Path,
 ) -> None:
-    """The ids are counted: of 300 hardly any two are compared, and so 48,000 take no longer than
-    their reading."""
+    """Of 300 ids hardly any two are compared, so that 48,000 take no longer than their reading."""
 
     class Counting(str):
         compared = 0
@@ -279,5 +273,5 @@ def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_ea
 
 @pytest.mark.parametrize("name", SUITES)
 def test_the_shipped_suites_keep_their_ranges(name: str) -> None:
-    """They are read without a word."""
+    """They are read without a fault."""
     assert load_suite(name).scenarios
