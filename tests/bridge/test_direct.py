@@ -272,13 +272,13 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
         robot_width_m=0.55,
         events=(),
     )
-    told: list[str] = []
+    notes: list[str] = []
     with (
         pytest.raises(
             DirectorLost,
             match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct",
         ),
-        remote_director(DirectorAddress(connection=there, run="r", wait_s=0.5), told.append, "e"),
+        remote_director(DirectorAddress(connection=there, run="r", wait_s=0.5), notes.append, "e"),
     ):
         pass
     directors: list[subprocess.Popen[str]] = []
@@ -288,7 +288,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     late.start()
     try:
         with remote_director(
-            DirectorAddress(connection=there, run="r", wait_s=PATIENCE_S), told.append, "e"
+            DirectorAddress(connection=there, run="r", wait_s=PATIENCE_S), notes.append, "e"
         ) as director:
             assert director.react(query).tick == 0
         late.join()

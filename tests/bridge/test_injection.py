@@ -372,17 +372,17 @@ with zenoh.open(config) as session:
     def ask(key, payload=b""):
         replies = session.get(key, payload=payload, timeout=PATIENCE_S)
         return next(((r.ok or r.err).payload.to_bytes() for r in replies), b"")
-    def said(message, key=f"{below}/inject"):
+    def reply_to(message, key=f"{below}/inject"):
         return ask(key, message).decode(errors="replace")
     bad = {
-        "10 MB": said(b'{"id":"' + b"x" * 10_000_000 + b'"}'),
-        "10 MB of nothing": said(bytes(10_000_000)),
-        "NaN": said(b'{"id":"a","path":[[1,NaN]]}'),
-        "outside": said(b'{"id":"a","path":[[1e6,0]]}'),
-        "too fast": said(json.dumps({"id": "a", "path": [[x, y]], "speed_mps": 30}).encode()),
-        "twice": said(json.dumps({"id": "bob", "path": [[x, y]]}).encode()),
-        "every run": said(b"{}", "cosim/*/env/*/inject"),
-        "wrong run": said(b"{}", "cosim/other/env/t-0/inject"),
+        "10 MB": reply_to(b'{"id":"' + b"x" * 10_000_000 + b'"}'),
+        "10 MB of nothing": reply_to(bytes(10_000_000)),
+        "NaN": reply_to(b'{"id":"a","path":[[1,NaN]]}'),
+        "outside": reply_to(b'{"id":"a","path":[[1e6,0]]}'),
+        "too fast": reply_to(json.dumps({"id": "a", "path": [[x, y]], "speed_mps": 30}).encode()),
+        "twice": reply_to(json.dumps({"id": "bob", "path": [[x, y]]}).encode()),
+        "every run": reply_to(b"{}", "cosim/*/env/*/inject"),
+        "wrong run": reply_to(b"{}", "cosim/other/env/t-0/inject"),
     }
     many = 2000
     for i in range(many):
@@ -483,9 +483,9 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
         there = ("--connect", air.at, "--wait", str(PATIENCE_S))
 
         def log_on_air() -> dict[str, Any]:
-            told = cosim("listen", "events", *there, *viewer, "--seconds", "0")
-            assert told.returncode == 0, told
-            return dict(json.loads(told.stdout.splitlines()[0]))
+            result = cosim("listen", "events", *there, *viewer, "--seconds", "0")
+            assert result.returncode == 0, result
+            return dict(json.loads(result.stdout.splitlines()[0]))
 
         wait_for(lambda: log_on_air()["tick"] > 0)
         message = json.dumps(
@@ -503,8 +503,8 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
         elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9", *injector)
         wait_for(
             lambda: (
-                "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr
-                and said.returncode == 2
+                "Valid choices: run/t-0" in (result := cosim(*elsewhere)).stderr
+                and result.returncode == 2
             )
         )
         wait_for(lambda: [one["injection"]["id"] for one in log_on_air()["injections"]] == ["anna"])
@@ -562,7 +562,7 @@ def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosi
             record = air.record()
             heard = json.loads(listener.stdout.read())
     assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
-    said = json.loads(vandal.stdout)
+    replies = json.loads(vandal.stdout)
     for name, words in {
         "10 MB": f"at most {MAX_MESSAGE_B}",
         "10 MB of nothing": f"at most {MAX_MESSAGE_B}",
@@ -572,15 +572,15 @@ def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosi
         "twice": "of this id",
         "every run": "ask for exactly 'cosim/run/env/t-0/inject'",
     }.items():
-        assert words in said[name], said[name]
-    assert said["wrong run"] == "" and said["camera"] == b"\x89PNG\r\n\x1a\n".hex()
+        assert words in replies[name], replies[name]
+    assert replies["wrong run"] == "" and replies["camera"] == b"\x89PNG\r\n\x1a\n".hex()
     taken_in = [one["injection"]["id"] for one in record["injections"]]
-    for ack in said["flood"]:
+    for ack in replies["flood"]:
         assert (ack["id"] in taken_in) is (ack["status"] == "accepted"), ack
         assert ack["status"] == "accepted" or "are here already" in ack["reason"]
-    assert len(said["flood"]) <= 2000 and taken_in[0] == "bob"
+    assert len(replies["flood"]) <= 2000 and taken_in[0] == "bob"
     assert len(taken_in) == len(set(taken_in)) >= MAX_INJECTED
-    assert [one["injection"]["id"] for one in said["log"]["injections"]] == taken_in
+    assert [one["injection"]["id"] for one in replies["log"]["injections"]] == taken_in
     injected_people = [sum(one["kind"] == "injected" for one in crowd) for crowd in heard["crowd"]]
     assert MAX_INJECTED // 2 < max(injected_people) <= MAX_INJECTED
     assert (

@@ -198,7 +198,7 @@ def test_a_remote_policy_is_queried_like_a_local_one(hub: Connection) -> None:
             and policy.seen.robot.v_max_mps == COURIER.v_max_mps
         )
         assert driver.clock.keys() == {"answer_median_ms", "answer_p95_ms"}
-        told = {
+        expected = {
             "raises": r"'counting' raised KeyError: 'no such weight' in test_policy_server\.py:\d+ \(act at 0\.25 s\)",
             "nan": "answered Command.v_mps=nan, w_radps=0.0.: both must be finite",
             "words": "answered 'left': neither a Command nor waypoints",
@@ -209,7 +209,7 @@ def test_a_remote_policy_is_queried_like_a_local_one(hub: Connection) -> None:
         driver.reset("most", 7)
         assert driver.act(seen_at(5, "most")).v_mps == 0.0
         driver.ended()
-        for name, words in told.items():
+        for name, words in expected.items():
             driver.reset(name, 7)
             with pytest.raises(PolicyError, match=words):
                 driver.act(seen_at(5, name))
@@ -540,12 +540,12 @@ def test_several_cosim_serve_processes_answer_for_one_policy(tmp_path: Path) -> 
 
 def test_a_privileged_policy_is_not_served(cosim: Cosim) -> None:
     """`serve` refuses it, and a run refuses an endpoint for a local policy, each in one line."""
-    said = cosim("serve", "route")
-    assert said.returncode == 2 and "a remote one sees only observations" in said.stderr
-    said = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
+    result = cosim("serve", "route")
+    assert result.returncode == 2 and "a remote one sees only observations" in result.stderr
+    result = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
     assert (
-        said.returncode == 2
-        and "--policy-at goes with --policy zenoh:NAME, not with 'stop'" in said.stderr
+        result.returncode == 2
+        and "--policy-at goes with --policy zenoh:NAME, not with 'stop'" in result.stderr
     )
-    said = cosim("serve", "stop", "--listen", "tcp/0.0.0.0:7449")
-    assert said.returncode == 2 and "is beyond this machine and unguarded" in said.stderr
+    result = cosim("serve", "stop", "--listen", "tcp/0.0.0.0:7449")
+    assert result.returncode == 2 and "is beyond this machine and unguarded" in result.stderr

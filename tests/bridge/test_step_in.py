@@ -46,20 +46,20 @@ def test_the_documented_examples_work_on_the_first_scenario(tmp_path: Path, cosi
     (tmp_path / "pedestrian.json").write_text('{"id": "emil", "path": [{"ahead": 8}]}')
     (run,) = (words for words in examples_in(SECTION[1], "run", at) if "--live" in words)
     accepted = []
-    said = ""
+    stderr = ""
     with subprocess.Popen(
         [sys.executable, "-m", "cosim", *run], cwd=tmp_path, stderr=subprocess.PIPE, text=True
     ) as running:
         try:
             assert running.stderr is not None
-            while "cosim inject" not in said:
-                said += (line := running.stderr.readline())
-                assert line, said
+            while "cosim inject" not in stderr:
+                stderr += (line := running.stderr.readline())
+                assert line, stderr
             waits = cosim(
                 "listen", "events", "--connect", at, "--wait", str(PATIENCE_S), "--seconds", "0"
             )
             assert waits.returncode == 0, waits.stderr
-            texts = SECTION[1], cosim("inject", "--help").stdout, said
+            texts = SECTION[1], cosim("inject", "--help").stdout, stderr
             examples = [words for text in texts for words in examples_in(text, "inject", at)]
             assert len(examples) >= 5
             for example in examples:
@@ -85,15 +85,15 @@ def test_the_documented_examples_work_on_the_first_scenario(tmp_path: Path, cosi
                     listening.stdout.readline()
                 )
                 listening.kill()
-            told = cosim("listen", "events", "--connect", at, "--seconds", "0").stdout
+            result = cosim("listen", "events", "--connect", at, "--seconds", "0").stdout
         finally:
             running.kill()
-    injected = [one["injection"] for one in json.loads(told.splitlines()[0])["injections"]]
+    injected = [one["injection"] for one in json.loads(result.splitlines()[0])["injections"]]
     assert {one["id"] for one in injected} == {*accepted, "bob"}
     assert all(
         isinstance(number, float) for one in injected for point in one["path"] for number in point
     )
-    assert "held to 1 x real time" in said and f"On the air at {at}" in said
+    assert "held to 1 x real time" in stderr and f"On the air at {at}" in stderr
 
 
 @pytest.mark.parametrize(

@@ -44,9 +44,9 @@ def test_a_name_that_is_too_long_is_refused_in_one_line(
     (tmp_path / "mine.toml").write_text(
         'name = "mine"\n[place]\ncity = 1\n[way]\nkind = "straight"\n'
     )
-    said = cosim(*words, cwd=tmp_path)
-    assert said.returncode == 2, said
-    assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
+    result = cosim(*words, cwd=tmp_path)
+    assert result.returncode == 2, result
+    assert result.stderr.strip().splitlines()[-1].startswith("error: "), result
     assert {path.name for path in tmp_path.iterdir()} == {"mine.toml"}
 
 
@@ -66,9 +66,9 @@ def test_a_file_in_the_place_of_a_folder_is_refused_in_one_line(
 ) -> None:
     """A file in place of a folder of certificates, of a run or of data stays as it was."""
     (tmp_path / "file").write_text("mine")
-    said = cosim(*words, cwd=tmp_path)
-    assert said.returncode in (2, 3), said
-    assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
+    result = cosim(*words, cwd=tmp_path)
+    assert result.returncode in (2, 3), result
+    assert result.stderr.strip().splitlines()[-1].startswith("error: "), result
     assert {path.name for path in tmp_path.iterdir()} == {"file"} and (
         tmp_path / "file"
     ).read_text() == "mine"

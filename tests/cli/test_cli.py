@@ -240,8 +240,8 @@ def test_merged_shards_equal_the_run(desk: Path, cosim: Cosim, whole_run: Path) 
     """Three episodes in two shards, one run from Python, merge to the same run; each shard says how
     to merge it."""
     words = ("run", "tiny.json", "--policy", DRIVES, "--seed", SEED)
-    said = cosim(*words, "--shard", "1/2", "--out", "shard-1", cwd=desk)
-    assert said.returncode == 0 and "Shard 1/2 of the run: `cosim merge`" in said.stderr
+    result = cosim(*words, "--shard", "1/2", "--out", "shard-1", cwd=desk)
+    assert result.returncode == 0 and "Shard 1/2 of the run: `cosim merge`" in result.stderr
     options = EpisodeOptions(seed=int(SEED))
     run(str(desk / "tiny.json"), DRIVES, shard="2/2", out=desk / "shard-2", options=options)
     assert [*hashes(desk / "shard-2")] == ["t-1"]
@@ -260,9 +260,9 @@ def test_an_interrupted_run_is_finished_by_resume(
     with held_before(desk, "t-1") as waits, running(desk, *HELD, out.name) as run:
         wait_until(waits)
         run.send_signal(how)
-        said = run.communicate(timeout=PATIENCE_S)[1]
+        stderr = run.communicate(timeout=PATIENCE_S)[1]
         if how != signal.SIGKILL:
-            assert run.returncode == 130 and reports_stop(said, out.name), said
+            assert run.returncode == 130 and reports_stop(stderr, out.name), stderr
         kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
         wait_until(lambda: not alive(out))
     again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
@@ -281,15 +281,15 @@ def test_sigterm_stops_a_run_as_ctrl_c_does(desk: Path, cosim: Cosim) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
 
         sent = threads.submit(terminate)
-        said = cosim("run", *HELD, out.name, cwd=desk)
+        result = cosim("run", *HELD, out.name, cwd=desk)
         sent.result()
-        assert said.returncode == 130 and reports_stop(said.stderr, out.name), said
+        assert result.returncode == 130 and reports_stop(result.stderr, out.name), result
         wait_until(lambda: not alive(out))
 
 
-def reports_stop(said: str, out: str) -> bool:
+def reports_stop(stderr: str, out: str) -> bool:
     """Return whether the output says that a run stopped in its second episode, and the remedy."""
-    return f"--out {out} --resume" in said and "1 of 2 episodes are finished and stored" in said
+    return f"--out {out} --resume" in stderr and "1 of 2 episodes are finished and stored" in stderr
 
 
 def test_a_run_killed_at_its_start_leaves_no_false_crash(
@@ -414,30 +414,30 @@ def test_unknown_names_are_answered_with_the_valid_ones(
         ("list", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
     }
     for words, (name, choices) in asked.items():
-        said = cosim(*words, cwd=desk)
-        assert said.returncode == 2, (words, said.stderr)
-        assert name in said.stderr and choices in said.stderr, (words, said.stderr)
-        assert "Traceback" not in said.stderr
+        result = cosim(*words, cwd=desk)
+        assert result.returncode == 2, (words, result.stderr)
+        assert name in result.stderr and choices in result.stderr, (words, result.stderr)
+        assert "Traceback" not in result.stderr
 
 
 def test_a_suite_without_scenarios_is_refused(desk: Path, cosim: Cosim) -> None:
     """An empty suite is an error that names the file, not a successful run."""
     suite = json.loads((desk / "tiny.json").read_text())
     (desk / "empty.json").write_text(json.dumps(suite | {"scenarios": []}))
-    said = cosim("run", "empty.json", "--out", "empty", cwd=desk)
-    assert said.returncode == 2 and "empty.json: suite 'tiny' has no scenarios" in said.stderr
+    result = cosim("run", "empty.json", "--out", "empty", cwd=desk)
+    assert result.returncode == 2 and "empty.json: suite 'tiny' has no scenarios" in result.stderr
 
 
 def test_a_run_with_a_wrong_endpoint_leaves_no_folder(desk: Path, cosim: Cosim) -> None:
     """A wrong endpoint is reported with the remedy, and the same command with a right one is
     accepted."""
-    said = cosim(
+    result = cosim(
         "run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--insecure", "--out", "air", cwd=desk
     )
-    assert said.returncode == 3 and not (desk / "air").exists()
+    assert result.returncode == 3 and not (desk / "air").exists()
     assert (
-        "cannot listen at tcp/192.0.2.1:7447" in said.stderr
-        and "Choose an address of this" in said.stderr
+        "cannot listen at tcp/192.0.2.1:7447" in result.stderr
+        and "Choose an address of this" in result.stderr
     )
     heard = cosim("listen", "--connect", "7447", cwd=desk)
     assert (
@@ -469,9 +469,9 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
     robot["robot"] = "tank"
     unknown["place"] = {"kind": "map", "map": "atlantis"}
     (desk / "odd.json").write_text(json.dumps(suite))
-    said = cosim("run", "odd.json", "--policy", "stop", "--out", "odd", cwd=desk)
-    assert said.returncode == 2 and not (desk / "odd").exists()
-    head, *faults = said.stderr[said.stderr.index("error: ") :].splitlines()
+    result = cosim("run", "odd.json", "--policy", "stop", "--out", "odd", cwd=desk)
+    assert result.returncode == 2 and not (desk / "odd").exists()
+    head, *faults = result.stderr[result.stderr.index("error: ") :].splitlines()
     assert head == "error: suite 'four': 5 faults:" and len(faults) == 5
     for words in (
         "scenario 't-0': start is off the walkable area at (-50.00, -50.00)",
@@ -486,9 +486,9 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
 
 def test_the_doctor_reports_every_engine_as_working(desk: Path, cosim: Cosim) -> None:
     """`cosim doctor` draws a frame, moves pedestrians, queries a director, and reports success."""
-    said = cosim("doctor", cwd=desk)
-    assert said.returncode == 0, said.stdout
-    assert said.stdout.count("ok") >= 6 and "failed" not in said.stdout
+    result = cosim("doctor", cwd=desk)
+    assert result.returncode == 0, result.stdout
+    assert result.stdout.count("ok") >= 6 and "failed" not in result.stdout
 
 
 def test_a_run_without_a_seed_draws_and_records_one(desk: Path, cosim: Cosim) -> None:
@@ -501,8 +501,8 @@ def test_a_run_without_a_seed_draws_and_records_one(desk: Path, cosim: Cosim) ->
     assert list(rows(desk / "one")["run_seed"]) == [seed]
     record = json.loads((desk / "one/episodes/t-0/record.json").read_text())
     (scenario,) = read_suite(desk / "one/scenarios.json").scenarios
-    told = (seed, episode_id_of(seed, scenario).episode)
-    assert (record["run_seed"], record["episode"]) == told
+    drawn = (seed, episode_id_of(seed, scenario).episode)
+    assert (record["run_seed"], record["episode"]) == drawn
     assert f"Seed {seed}: " in cosim(*words, "--resume", cwd=desk).stderr
     refused = cosim(*words, "--resume", "--seed", "3", cwd=desk)
     assert refused.returncode == 2

@@ -36,19 +36,21 @@ def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim
     always = ("run", few.name, "--policy", "schedule:stand", "--seed", "7")
 
     def run(name: str, *words: str) -> set[str]:
-        said = cosim(*always, "--out", name, *words, cwd=tmp_path)
-        assert said.returncode == 0, said
+        result = cosim(*always, "--out", name, *words, cwd=tmp_path)
+        assert result.returncode == 0, result
         return {*pd.read_csv(tmp_path / name / "results.csv")["scenario"]}
 
     assert run("1", "--shard", "1/2") == {"lateral-001", "lateral-001-decoy"}
     assert run("2", "--shard", "2/2") == {"overtaking-001", "overtaking-001-decoy"}
-    said = cosim("merge", "1", "2", "--out", "both", cwd=tmp_path)
-    assert said.returncode == 0 and "decoys count in D alone, over 2 pairs" in said.stdout, said
+    result = cosim("merge", "1", "2", "--out", "both", cwd=tmp_path)
+    assert result.returncode == 0 and "decoys count in D alone, over 2 pairs" in result.stdout, (
+        result
+    )
     assert cosim("score", "both", cwd=tmp_path).returncode == 0
     assert run("events", "--no-decoys") == {"lateral-001", "overtaking-001"}
     assert run("one", "--scenario", "lateral-001-decoy") == {"lateral-001-decoy"}
     assert run("one", "--scenario", "lateral-001-decoy", "--resume") == {"lateral-001-decoy"}
-    said = cosim(*always, "--out", "events", "--resume", cwd=tmp_path)
-    assert "2 of 4 (--no-decoys), and this command has 4 of 4 (all)" in said.stderr, said
-    said = cosim("list", few.name, cwd=tmp_path)
-    assert "decoy of" in said.stdout and "lateral-001-decoy" in said.stdout
+    result = cosim(*always, "--out", "events", "--resume", cwd=tmp_path)
+    assert "2 of 4 (--no-decoys), and this command has 4 of 4 (all)" in result.stderr, result
+    result = cosim("list", few.name, cwd=tmp_path)
+    assert "decoy of" in result.stdout and "lateral-001-decoy" in result.stdout

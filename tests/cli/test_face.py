@@ -21,7 +21,7 @@ PRODUCT = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
     """A new process that imports cosim has loaded one file of the project and no other package."""
-    told = subprocess.run(
+    result = subprocess.run(
         [
             sys.executable,
             "-c",
@@ -32,8 +32,8 @@ def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
         check=True,
         cwd=ROOT,
     ).stdout.split()
-    strangers = {name.split(".")[0] for name in told} - set(sys.stdlib_module_names) - {"cosim"}
-    assert not strangers and {n for n in told if n.startswith("cosim")} == {
+    strangers = {name.split(".")[0] for name in result} - set(sys.stdlib_module_names) - {"cosim"}
+    assert not strangers and {n for n in result if n.startswith("cosim")} == {
         "cosim",
         "cosim.rounding",
     }
@@ -51,9 +51,9 @@ def test_the_example_of_every_public_name_is_correct(name: str) -> None:
     )
     assert shown.examples
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
-    told = io.StringIO()
-    runner.run(shown, out=told.write)
-    assert not runner.failures, told.getvalue()
+    output = io.StringIO()
+    runner.run(shown, out=output.write)
+    assert not runner.failures, output.getvalue()
 
 
 def test_an_unknown_name_is_refused_with_the_valid_ones() -> None:

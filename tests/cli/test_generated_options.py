@@ -65,7 +65,7 @@ def test_typed_options_become_the_config() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "told"),
+    ("fields", "expected"),
     [
         ({"resume": True}, "--resume needs --out"),
         ({"shard": "1/2", "latency": "measured"}, "--shard with --latency measured"),
@@ -73,14 +73,14 @@ def test_typed_options_become_the_config() -> None:
     ],
     ids=["resume", "shard", "roughness"],
 )
-def test_contradictory_values_are_refused(fields: dict[str, object], told: str) -> None:
+def test_contradictory_values_are_refused(fields: dict[str, object], expected: str) -> None:
     """The options are named before anything is loaded."""
-    with pytest.raises(UsageError, match=told):
+    with pytest.raises(UsageError, match=expected):
         RunConfig(suite="unit", **fields)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "expected"),
     [
         ((), "used already holds a run. Add --resume to finish it"),
         (("--resume",), "used is of another run: its suite is s, and this command has reactive"),
@@ -89,11 +89,15 @@ def test_contradictory_values_are_refused(fields: dict[str, object], told: str) 
     ids=["new", "resumed", "on a map"],
 )
 def test_a_folder_of_another_run_is_refused_before_a_city_is_built(
-    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...], told: str
+    tmp_path: Path,
+    cosim: Cosim,
+    monkeypatch: pytest.MonkeyPatch,
+    more: tuple[str, ...],
+    expected: str,
 ) -> None:
     """The refusal comes while the cache in which cities are built is still empty."""
     run_of(tmp_path / "used", ["goal"])
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     refused = cosim("run", "reactive", "--policy", "straight", "--out", "used", *more, cwd=tmp_path)
-    assert refused.returncode == 2 and told in refused.stderr, refused
+    assert refused.returncode == 2 and expected in refused.stderr, refused
     assert not [*(tmp_path / "cache").glob("**/*.net.xml*")]

@@ -78,15 +78,15 @@ def test_every_command_that_runs_a_policy_can_isolate_it(tmp_path: Path, cosim: 
         "collect": ("collect", "s.json", "--policy", name, "--unsolved", "--out", "demos"),
     }
     for command in commands.values():
-        said = cosim(*command, "--isolated", cwd=tmp_path)
-        assert said.returncode == 2 and "--policy-data" in said.stderr, (command, said.stderr)
+        result = cosim(*command, "--isolated", cwd=tmp_path)
+        assert result.returncode == 2 and "--policy-data" in result.stderr, (command, result.stderr)
     shown = ("--isolated", "--policy-data", "secret.txt")
-    said = cosim(*commands["own"], *shown, cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim(*commands["own"], *shown, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     spec = json.loads((tmp_path / "own/run.json").read_text())
     assert spec["policy_runs"] in ("isolated: namespaces", "isolated: landlock")
-    said = cosim(*commands["check"], *shown, cwd=tmp_path)
-    assert said.returncode in (0, 1) and "peeks" in said.stdout, said.stderr
+    result = cosim(*commands["check"], *shown, cwd=tmp_path)
+    assert result.returncode in (0, 1) and "peeks" in result.stdout, result.stderr
 
 
 MEMORY = """
@@ -136,8 +136,8 @@ def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosi
         halves = [{one.id: drives_second(seed, one) for one in those} for those in (events, decoys)]
         assert all(halves[0][one.decoy_of] != halves[1][one.id] for one in decoys)
     words = ("--policy", "memory.py:Memory", "--seed", "1", "--jobs", "1", "--out", "run")
-    said = cosim("run", "pairs.json", *words, cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim("run", "pairs.json", *words, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     rows = [line.split() for line in (tmp_path / "seen.txt").read_text().splitlines()]
     places = Counter(place for place, _, _ in rows)
     assert sorted(places.values()) == [2, 2, 2]
@@ -151,17 +151,17 @@ def test_a_policy_by_file_equals_the_policy_by_module(desk: Path, cosim: Cosim) 
     edited."""
     suite, out = str(desk / "one.json"), str(desk / "run")
     by_file = ("run", suite, "--policy", "deeper/far.py:Far", "--isolated", "--out", out)
-    said = cosim(*by_file, cwd=desk)
-    assert said.returncode == 0, said.stderr
+    result = cosim(*by_file, cwd=desk)
+    assert result.returncode == 0, result.stderr
     assert (
         f"Next:\n  cosim film {out} --failure -o film.mp4\n  cosim report {out} -o report.html\n"
-        in said.stderr
+        in result.stderr
     )
     spec = json.loads((desk / "run/run.json").read_text())
     kind = spec["policy_runs"]
     assert kind in ("isolated: namespaces", "isolated: landlock") and spec["policy"] == "far:Far"
     row = f"policy far; sensor track blind; at 4 Hz; goal route_point; odometry wheel; policy {kind}; seed"
-    assert row in said.stdout
+    assert row in result.stdout
     weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=desk)
     assert (
         weak.returncode == 2
@@ -204,10 +204,12 @@ def test_options_of_a_single_machine_are_refused_with_a_reason(
         ("--live", "tcp/127.0.0.1:7448"),
         ("--director", "x"),
     ):
-        said = cosim("coordinator", "reactive", *words, cwd=tmp_path)
-        assert said.returncode == 2 and f"{words[0]} is of one machine" in said.stderr, said.stderr
-        assert "leave it out, or use `cosim run`" in said.stderr
-    assert "--live" not in (told := cosim("coordinator", "--help").stdout) and "--shard" in told
+        result = cosim("coordinator", "reactive", *words, cwd=tmp_path)
+        assert result.returncode == 2 and f"{words[0]} is of one machine" in result.stderr, (
+            result.stderr
+        )
+        assert "leave it out, or use `cosim run`" in result.stderr
+    assert "--live" not in (result := cosim("coordinator", "--help").stdout) and "--shard" in result
     assert not [*tmp_path.iterdir()]
 
 

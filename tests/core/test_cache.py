@@ -115,8 +115,8 @@ def test_concurrent_use_and_eviction_are_safe(cache: Path) -> None:
         for word in words
     ]
     for process in processes:
-        said = process.communicate(timeout=PATIENCE_S)[1]
-        assert process.returncode == 0, said
+        output = process.communicate(timeout=PATIENCE_S)[1]
+        assert process.returncode == 0, output
     clean_up(limit_bytes=0)
     assert left(cache) == {"maps/town"}
     assert {path.name for path in cache.iterdir()} <= {
@@ -173,13 +173,13 @@ def test_unfinished_entries_of_killed_processes_are_removed(cache: Path) -> None
 def test_the_cache_command_lists_and_prunes_entries(cache: Path, cosim: Cosim) -> None:
     """It prints a size for each kind, the sum and the limit; --prune removes entries unused for a
     month, some days, or all."""
-    said = cosim("cache")
-    assert said.returncode == 0 and said.stdout == cosim("cache", "--size").stdout
-    rows = {line.split()[0]: line for line in said.stdout.splitlines() if line.split()}
+    result = cosim("cache")
+    assert result.returncode == 0 and result.stdout == cosim("cache", "--size").stdout
+    rows = {line.split()[0]: line for line in result.stdout.splitlines() if line.split()}
     assert (
         "1 MB" in rows["cities"] and "6 h ago" in rows["cities"] and "never removed" in rows["maps"]
     )
-    assert f"{cache}: 5" in said.stdout and "of at most 4 GB (COSIM_CACHE_LIMIT)" in said.stdout
+    assert f"{cache}: 5" in result.stdout and "of at most 4 GB (COSIM_CACHE_LIMIT)" in result.stdout
     assert "Removed: 0 entries" in cosim("cache", "--prune").stdout
     os.utime(cache / "read/a.map", (0.0, 0.0))
     assert "Removed: 1 entry, 1 MB" in cosim(
@@ -200,10 +200,10 @@ def test_an_invalid_limit_is_refused(
 ) -> None:
     """The variable is named, with its value and the valid form."""
     monkeypatch.setenv("COSIM_CACHE_LIMIT", limit)
-    said = cosim("list")
+    result = cosim("list")
     assert (
-        said.returncode == 2
-        and f"COSIM_CACHE_LIMIT is '{limit}': give a number of GB from 0 on" in said.stderr
+        result.returncode == 2
+        and f"COSIM_CACHE_LIMIT is '{limit}': give a number of GB from 0 on" in result.stderr
     )
     monkeypatch.setenv("COSIM_CACHE_LIMIT", "0.5")
     assert "of at most 0.5 GB" in cosim("cache").stdout

@@ -160,8 +160,10 @@ def test_a_cache_that_cannot_be_written_is_reported_once(
     cache.write_text("a file where a folder should be")
     make = Maker()
     assert same(get("a", "0_0", make)) and same(get("a", "0_0", make)) and make.times == 2
-    said = capsys.readouterr().err
-    assert said.startswith("note: ") and "not cached" in said and len(said.splitlines()) == 1
+    message = capsys.readouterr().err
+    assert (
+        message.startswith("note: ") and "not cached" in message and len(message.splitlines()) == 1
+    )
 
 
 @both

@@ -68,11 +68,11 @@ class FakeMachine(Machine):
 def test_each_missing_library_is_named_with_its_package() -> None:
     """A refusal names every missing library, its package, and one command that installs them
     all."""
-    said = refusal(FakeMachine("libx11-6", "libatomic1", "libegl1"))
-    assert "libX11.so.6 (package libx11-6), libatomic.so.1 (package libatomic1)" in said
+    message = refusal(FakeMachine("libx11-6", "libatomic1", "libegl1"))
+    assert "libX11.so.6 (package libx11-6), libatomic.so.1 (package libatomic1)" in message
     assert (
-        said.endswith("install -y --no-install-recommends libx11-6 libatomic1 libegl1")
-        and "\n" not in said
+        message.endswith("install -y --no-install-recommends libx11-6 libatomic1 libegl1")
+        and "\n" not in message
     )
     assert refusal(FakeMachine()) == ""
 
@@ -85,12 +85,12 @@ def test_without_root_the_check_reports_and_stops(capsys: pytest.CaptureFixture[
         check_machine(["--install", "--python", "python3.11"], machine) == EXIT_CODE
         and machine.installed == []
     )
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert (
         "lacks Python 3.11 with venv (there is no 'python3.11') and libX11.so.6 (package libx11-6)."
-        in said
+        in message
     )
-    assert "python3.11 python3.11-venv libx11-6\n" in said and "make PYTHON=" in said
+    assert "python3.11 python3.11-venv libx11-6\n" in message and "make PYTHON=" in message
 
 
 def test_root_installs_exactly_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,8 +117,8 @@ def test_a_package_missing_from_the_archive_stops_root_too(
 def test_a_missing_egl_is_no_error(capsys: pytest.CaptureFixture[str]) -> None:
     """Only pictures need EGL, so its absence is reported in one line."""
     assert check_machine([], FakeMachine("libegl1")) == 0
-    said = capsys.readouterr().err
-    assert said.startswith("note: no libEGL.so.1") and said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.startswith("note: no libEGL.so.1") and message.count("\n") == 1
     assert refusal(FakeMachine("libegl1")) == ""
 
 

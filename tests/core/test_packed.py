@@ -48,10 +48,10 @@ def test_a_packed_file_is_read_with_numpy_alone(tmp_path: Path) -> None:
         "print(len(read_packed(Path(sys.argv[1]))), sorted({m.partition('.')[0] for m in "
         "sys.modules} & {'msgspec', 'pyarrow', 'pandas', 'av', 'scipy'}))"
     )
-    said = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
     )
-    assert said.stdout.strip() == "5 []"
+    assert result.stdout.strip() == "5 []"
 
 
 def test_a_history_does_not_reach_into_the_previous_episode() -> None:

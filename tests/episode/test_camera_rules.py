@@ -42,7 +42,7 @@ SHORT = Scenario(
 
 
 @pytest.mark.parametrize(
-    ("camera", "rate_hz", "told"),
+    ("camera", "rate_hz", "expected"),
     [
         (None, 20.0, ""),
         (CameraSpec(), 4.0, ""),
@@ -77,11 +77,11 @@ SHORT = Scenario(
     ],
 )
 def test_a_camera_beyond_its_mount_is_reported(
-    camera: CameraSpec | None, rate_hz: float, told: str
+    camera: CameraSpec | None, rate_hz: float, expected: str
 ) -> None:
     """Place, size, field of view and rate are checked against the mount, and a crop does not reduce
     the size."""
-    assert nonstandard(Manifest("mine", rate_hz=rate_hz, camera=camera), COURIER) == told
+    assert nonstandard(Manifest("mine", rate_hz=rate_hz, camera=camera), COURIER) == expected
 
 
 def test_an_unknown_camera_is_refused_with_the_valid_ones(

@@ -19,7 +19,7 @@ from cosim.spec.robot import COURIER, Robot
 
 ATAN2 = WaypointRule(rule="atan2")
 QUICK = dataclasses.replace(COURIER, w_max_radps=100.0)
-"""Turns as fast as it is told."""
+"""A courier with practically no limit on turning."""
 
 
 def of(answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER) -> Command:
@@ -107,21 +107,23 @@ def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> No
 def test_a_command_carries_the_waypoints_that_it_follows() -> None:
     """A command carries its waypoints in metres and the index of the followed one."""
     rule = WaypointRule(index=1, unit_m=0.5)
-    told = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
+    command = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
     assert (
-        isinstance(told, WaypointCommand) and told.index == 1 and told.waypoints.dtype == np.float32
+        isinstance(command, WaypointCommand)
+        and command.index == 1
+        and command.waypoints.dtype == np.float32
     )
     assert np.array_equal(
-        told.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]])
+        command.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]])
     )
-    again = command_of(told, rule=rule, robot=COURIER)
+    again = command_of(command, rule=rule, robot=COURIER)
     assert (
         isinstance(again, WaypointCommand)
-        and again == told
-        and np.array_equal(again.waypoints, told.waypoints)
+        and again == command
+        and np.array_equal(again.waypoints, command.waypoints)
     )
     with pytest.raises(PolicyError, match=r"shape \(3,\)"):
-        of(dataclasses.replace(told, waypoints=np.zeros(3, np.float32)))
+        of(dataclasses.replace(command, waypoints=np.zeros(3, np.float32)))
     many = command_of([[1e300, 0.0]] * 1000, rule=WaypointRule(), robot=COURIER)
     assert (
         isinstance(many, WaypointCommand)

@@ -85,7 +85,7 @@ def deaf() -> object:
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "expected"),
     [
         (KeyError("no such weight"), "raised KeyError: 'no such weight' (act at 0.10 s)"),
         (SystemExit(3), "raised SystemExit: 3 (act at 0.10 s)"),
@@ -99,13 +99,13 @@ def deaf() -> object:
     ids=["error", "exit", "ctrl-c", "generator", "memory", "mute", "odd-text", "long-text"],
 )
 def test_any_exception_of_a_policy_is_its_crash(
-    deaf: None, error: BaseException, told: str
+    deaf: None, error: BaseException, expected: str
 ) -> None:
     """Also BaseExceptions and unprintable errors give one message with the policy's name and the
     time."""
     with pytest.raises(PolicyError) as caught:
         PolicyCaller(FakePolicy(raising(error))).act(seen(tick=2))
-    assert str(caught.value).startswith("policy 'mine' raised ") and told in without_lines(
+    assert str(caught.value).startswith("policy 'mine' raised ") and expected in without_lines(
         str(caught.value)
     )
     str(caught.value).encode()
@@ -252,14 +252,14 @@ def test_a_forked_child_of_a_policy_does_not_continue_the_episode() -> None:
 
 def test_a_policy_at_work_is_timed() -> None:
     """Every query of a policy is timed, also one that fails; the first is marked."""
-    told: list[tuple[str, int] | None] = []
+    calls: list[tuple[str, int] | None] = []
 
     class Notes:
         def starts(self, doing: PolicyCall, tick: int) -> None:
-            told.append((doing, tick))
+            calls.append((doing, tick))
 
         def stops(self) -> None:
-            told.append(None)
+            calls.append(None)
 
     driver = PolicyCaller(FakePolicy(lambda _: STILL), timer=Notes())
     driver.reset("a", 0)
@@ -267,7 +267,7 @@ def test_a_policy_at_work_is_timed() -> None:
     driver.act(seen(5))
     with pytest.raises(PolicyError):
         driver.reset("bad", 0)
-    assert told == [
+    assert calls == [
         ("reset", 0),
         None,
         ("first act", 0),
@@ -334,10 +334,10 @@ class RecordsCalls(FakePolicy):
 
     def __init__(self) -> None:
         super().__init__(lambda observation: self.noted("act"))
-        self.told: list[object] = []
+        self.calls: list[object] = []
 
     def noted(self, what: object) -> Command:
-        self.told.append(what)
+        self.calls.append(what)
         return STILL
 
     def on_reset(self) -> None:
@@ -364,7 +364,7 @@ def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
     for observation in (seen(0), after_reset("", 5), seen(10)):
         driver.act(observation)
     driver.ended()
-    assert policy.told == ["act", "on_reset", "act", "act"]
+    assert policy.calls == ["act", "on_reset", "act", "act"]
     assert PolicyCaller(FakePolicy(lambda one: Command(float(one.reset), 0.0))).act(
         after_reset("", 5)
     ) == Command(1.0, 0.0)
@@ -384,7 +384,7 @@ def test_a_policy_for_many_episodes_gets_each_reset_and_end() -> None:
     driver.act(after_reset("a", 5))
     driver.ended()
     driver.ended()
-    assert policy.told == [("on_reset", "a"), "act", ("ended", "a")]
+    assert policy.calls == [("on_reset", "a"), "act", ("ended", "a")]
     assert driver.batches and not PolicyCaller(RecordsCalls()).batches
 
 

@@ -109,19 +109,22 @@ def test_the_observation_after_a_teleport_has_reset_set() -> None:
 def test_a_policy_gets_an_opaque_episode_name_and_a_seed(scenario: Scenario) -> None:
     """Both follow from the run's seed, are in every observation and the record, and do not change
     the street."""
-    told: list[tuple[str, int]] = []
+    resets: list[tuple[str, int]] = []
 
     class Noting(Ahead):
         def reset(self, episode_id: str, seed: int) -> None:
-            told.append((episode_id, seed))
+            resets.append((episode_id, seed))
 
         def act(self, observation: Observation) -> Command:
-            assert observation.episode == told[-1][0]
+            assert observation.episode == resets[-1][0]
             return AHEAD
 
     records = [run_episode(scenario, Noting(), EpisodeOptions(seed=seed)).record for seed in (1, 2)]
-    assert told == [episode_id_of(seed, scenario) for seed in (1, 2)] and told[0] != told[1]
-    assert [(one.setup.seed, one.episode) for one in records] == [(1, told[0][0]), (2, told[1][0])]
+    assert resets == [episode_id_of(seed, scenario) for seed in (1, 2)] and resets[0] != resets[1]
+    assert [(one.setup.seed, one.episode) for one in records] == [
+        (1, resets[0][0]),
+        (2, resets[1][0]),
+    ]
     assert records[0].state_hash == records[1].state_hash
 
 

@@ -69,27 +69,30 @@ def point(goal: Goal | None) -> tuple[float, float]:
 def test_the_point_of_the_route_lies_5_to_20_m_along_it() -> None:
     """The goal is set 20 m along the route and again at 5 m or after a reset; near the end it is
     the end."""
-    told = goals("route_point")
-    assert point(told.at(Pose(0.0, 0.0, 0.0), 0.0)) == (20.0, 0.0)
-    assert point(told.at(Pose(15.0, 1.0, 0.0), 15.0)) == (5.0, -1.0)
-    assert point(told.at(Pose(15.5, 1.0, NORTH), 15.5)) == (-1.0, -20.0)  # 35.5 m along: (35.5, 0)
-    assert point(told.at(Pose(31.0, 0.0, 0.0), 31.0)) == (9.0, 11.0)  # 51 m along: (40, 11)
-    told.on_reset()
-    assert point(told.at(Pose(25.0, 0.0, 0.0), 25.0)) == (
+    protocol = goals("route_point")
+    assert point(protocol.at(Pose(0.0, 0.0, 0.0), 0.0)) == (20.0, 0.0)
+    assert point(protocol.at(Pose(15.0, 1.0, 0.0), 15.0)) == (5.0, -1.0)
+    assert point(protocol.at(Pose(15.5, 1.0, NORTH), 15.5)) == (
+        -1.0,
+        -20.0,
+    )  # 35.5 m along: (35.5, 0)
+    assert point(protocol.at(Pose(31.0, 0.0, 0.0), 31.0)) == (9.0, 11.0)  # 51 m along: (40, 11)
+    protocol.on_reset()
+    assert point(protocol.at(Pose(25.0, 0.0, 0.0), 25.0)) == (
         15.0,
         5.0,
     )  # 26 m were too many: 45 m along, (40, 5)
-    assert point(told.at(Pose(40.0, 58.0, NORTH), 98.0)) == (2.0, 0.0)
+    assert point(protocol.at(Pose(40.0, 58.0, NORTH), 98.0)) == (2.0, 0.0)
 
 
 @pytest.mark.parametrize("s_m", [0.0, 7.3, 14.999, 15.001, 33.0, 61.2, 79.9])
 def test_every_point_of_the_route_is_5_to_20_m_along_it(s_m: float) -> None:
     """Its arc length is in [5, 20] m for every robot that drives along the route, in steps of 0.4
     m."""
-    told = goals("route_point")
+    protocol = goals("route_point")
     line = Polyline(CORNER)
     for here in np.arange(s_m, 80.0, 0.4).tolist():
-        goal = told.at(Pose(0.0, 0.0, 0.0), here)
+        goal = protocol.at(Pose(0.0, 0.0, 0.0), here)
         assert isinstance(goal, PointGoal)
         ahead = line.project(goal.x_m, goal.y_m)[0] - here
         assert 5.0 - 1e-6 <= ahead <= 20.0 + 1e-6
@@ -113,22 +116,22 @@ def test_random_points_are_drawn_ahead_and_fixed_until_reached_or_passed() -> No
     assert ahead.min() < 5.5 and ahead.max() > 19.5 and aside.min() < -4.5 and aside.max() > 4.5
     assert abs(ahead.mean() - 12.5) < 0.8 and abs(aside.mean()) < 0.6
 
-    told = goals("random_point", 4)
-    x_m, y_m = point(told.at(Pose(0.0, 0.0, 0.0), 0.0))
-    assert point(told.at(Pose(1.0, 0.0, 0.0), 1.0)) == pytest.approx((x_m - 1.0, y_m))
-    assert point(told.at(Pose(x_m - 2.0, y_m, 0.3), 9.0)) == pytest.approx(
+    protocol = goals("random_point", 4)
+    x_m, y_m = point(protocol.at(Pose(0.0, 0.0, 0.0), 0.0))
+    assert point(protocol.at(Pose(1.0, 0.0, 0.0), 1.0)) == pytest.approx((x_m - 1.0, y_m))
+    assert point(protocol.at(Pose(x_m - 2.0, y_m, 0.3), 9.0)) == pytest.approx(
         (2 * math.cos(0.3), -2 * math.sin(0.3))
     )
-    assert told.at(Pose(x_m - 1.1, y_m, 0.0), 9.0) == PointGoal(
+    assert protocol.at(Pose(x_m - 1.1, y_m, 0.0), 9.0) == PointGoal(
         pytest.approx(1.1), pytest.approx(0.0, abs=1e-9)
     )
-    second = point(told.at(Pose(x_m - 0.9, y_m, 0.0), 9.0))
+    second = point(protocol.at(Pose(x_m - 0.9, y_m, 0.0), 9.0))
     assert 5.0 <= second[0] <= 20.0
-    assert point(told.at(Pose(x_m - 0.9, y_m, 0.0), 9.0)) == second
-    third = point(told.at(Pose(x_m - 0.9, y_m, math.pi), 9.0))
+    assert point(protocol.at(Pose(x_m - 0.9, y_m, 0.0), 9.0)) == second
+    third = point(protocol.at(Pose(x_m - 0.9, y_m, math.pi), 9.0))
     assert 5.0 <= third[0] <= 20.0 and third != second
-    told.on_reset()
-    assert point(told.at(Pose(x_m - 0.9, y_m, math.pi), 9.0)) != third
+    protocol.on_reset()
+    assert point(protocol.at(Pose(x_m - 0.9, y_m, math.pi), 9.0)) != third
 
 
 def test_an_image_goal_is_taken_once_for_each_sub_goal() -> None:
@@ -139,8 +142,8 @@ def test_an_image_goal_is_taken_once_for_each_sub_goal() -> None:
         looked.append(pose)
         return np.full((2, 2, 3), len(looked), np.uint8)
 
-    told = goals("image", take_picture=look)
-    seen = [told.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 5.0, 15.0, 16.0, 30.0, 32.0)]
+    protocol = goals("image", take_picture=look)
+    seen = [protocol.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 5.0, 15.0, 16.0, 30.0, 32.0)]
     assert [one.rgb[0, 0, 0] for one in seen if isinstance(one, ImageGoal)] == [1, 1, 1, 2, 2, 3]
     assert [tuple(round(v, 9) for v in pose) for pose in looked] == [
         (20.0, 0.0, 0.0),
@@ -152,8 +155,8 @@ def test_an_image_goal_is_taken_once_for_each_sub_goal() -> None:
 def test_a_random_image_is_constant_noise_of_the_cameras_size() -> None:
     """All values are equally frequent; it is the same throughout an episode and differs with
     another seed."""
-    told = goals("random_image", 1, size=(64, 48))
-    first, later = (told.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 50.0))
+    protocol = goals("random_image", 1, size=(64, 48))
+    first, later = (protocol.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 50.0))
     other = goals("random_image", 2, size=(64, 48)).at(Pose(0.0, 0.0, 0.0), 0.0)
     assert (
         isinstance(first, ImageGoal)
@@ -169,10 +172,10 @@ def test_an_instruction_announces_turns_and_crosswalks() -> None:
     """A left turn at 40 m and a crosswalk from 70 to 80 m are announced to 5 m; otherwise it says
     to follow the sidewalk."""
     crossing = RouteCrossing(id="x", enter_s_m=70.0, leave_s_m=80.0, signalised=True)
-    told = goals_for("instruction", scenario(crossings=(crossing,)), np.random.default_rng(0))
+    protocol = goals_for("instruction", scenario(crossings=(crossing,)), np.random.default_rng(0))
     words = {}
     for s_m in np.arange(0.0, 100.0, 0.5).tolist():
-        goal = told.at(Pose(0.0, 0.0, 0.0), s_m)
+        goal = protocol.at(Pose(0.0, 0.0, 0.0), s_m)
         assert isinstance(goal, Instruction)
         words[s_m] = goal.text
     assert (
@@ -196,7 +199,7 @@ def test_instructions_mention_only_turns_and_crosswalks() -> None:
     """On every metre of long ways the only number is the distance, to 5 m and at most 20; no
     people, events or goal."""
     what = r"((turn|bear) (left|right)|cross the street at the crosswalk)"
-    told = re.compile(
+    allowed = re.compile(
         rf"(Follow the sidewalk\.|{what}\.( {what}\.)*)( In (5|10|15|20) m, {what}\.)?",
         re.IGNORECASE,
     )
@@ -206,11 +209,11 @@ def test_instructions_mention_only_turns_and_crosswalks() -> None:
         heard |= {
             instruction_at(s_m, ways) for s_m in np.arange(0.0, one.route_line.length_m).tolist()
         }
-    assert [text for text in heard if not told.fullmatch(text)] == [] and len(heard) > 8
+    assert [text for text in heard if not allowed.fullmatch(text)] == [] and len(heard) > 8
 
 
 @pytest.mark.parametrize(
-    ("route", "told"),
+    ("route", "expected"),
     [
         ([(0, 0), (60, 0)], []),
         ([(0, 0), (30, 0), (30, -30)], ["turn right"]),
@@ -222,10 +225,10 @@ def test_instructions_mention_only_turns_and_crosswalks() -> None:
     ids=["straight", "right", "half", "slight", "two", "curve"],
 )
 def test_the_angle_of_a_turn_decides_its_instruction(
-    route: list[tuple[float, float]], told: list[str]
+    route: list[tuple[float, float]], expected: list[str]
 ) -> None:
     """Of 45 degrees one bears, of 27 one follows the sidewalk, as round a long curve."""
-    assert [one.words for one in manoeuvres(Polyline(route))] == told
+    assert [one.words for one in manoeuvres(Polyline(route))] == expected
     assert instruction_at(0.0, ()) == "Follow the sidewalk."
 
 
@@ -274,13 +277,15 @@ def test_goals_are_the_same_for_the_same_seed(protocol: GoalProtocol) -> None:
     """A repeated drive has the same goals; where they are drawn, another seed gives others."""
 
     def drive(seed: int) -> list[bytes]:
-        told = goals(
+        goal_source = goals(
             protocol,
             seed,
             size=(8, 6),
             take_picture=lambda pose: np.full((6, 8, 3), int(pose.x_m), np.uint8),
         )
-        along = [told.at(Pose(s_m, 0.5, 0.1), s_m) for s_m in np.arange(0.0, 40.0, 0.5).tolist()]
+        along = [
+            goal_source.at(Pose(s_m, 0.5, 0.1), s_m) for s_m in np.arange(0.0, 40.0, 0.5).tolist()
+        ]
         return [
             msgspec.msgpack.encode(one, enc_hook=lambda array: array.tobytes()) for one in along
         ]

@@ -48,18 +48,18 @@ def test_delayed_commands_keep_their_order_and_a_reset_discards_them() -> None:
     """By hand: queries at 0, 5 and 10 with 7 ticks of delay, of which the last is pending at a
     reset."""
     way = CommandDelay()
-    told = [Command(float(v), 0.0) for v in (1, 2, 3)]
-    way.add(0, 7, told[0])
+    commands_sent = [Command(float(v), 0.0) for v in (1, 2, 3)]
+    way.add(0, 7, commands_sent[0])
     assert [way.at(tick) for tick in (0, 4)] == [STILL, STILL]
-    way.add(5, 7, told[1])
-    assert [way.at(tick) for tick in (6, 7, 9)] == [STILL, told[0], told[0]]
-    way.add(10, 7, told[2])
-    assert [way.at(tick) for tick in (11, 12)] == [told[0], told[1]]
+    way.add(5, 7, commands_sent[1])
+    assert [way.at(tick) for tick in (6, 7, 9)] == [STILL, commands_sent[0], commands_sent[0]]
+    way.add(10, 7, commands_sent[2])
+    assert [way.at(tick) for tick in (11, 12)] == [commands_sent[0], commands_sent[1]]
     way.on_reset()
     assert (way.at(13), way.at(17)) == (STILL, STILL)
     assert way.answers.tolist() == [[0, 7, 1, 0], [5, 7, 2, 0], [10, 7, 3, 0]]
-    way.add(20, 0, told[0])
-    assert way.at(20) == told[0]
+    way.add(20, 0, commands_sent[0])
+    assert way.at(20) == commands_sent[0]
 
 
 @pytest.mark.parametrize(
@@ -86,10 +86,10 @@ def test_tables_show_latency_only_where_there_is_any() -> None:
     """A fixed one is a number; a measured one has answer times and effective ticks of ended
     episodes, and its limits."""
 
-    def told(*records: Record) -> str:
-        out, said = terminal()
+    def printed_table(*records: Record) -> str:
+        out, output = terminal()
         print_terms(out, table_of(records))
-        return " ".join(said.getvalue().split())
+        return " ".join(output.getvalue().split())
 
     none = record_of(load_suite("reactive").scenarios[0], Manifest("m", camera=None))
     given = changed(none, latency_ms=200.0)
@@ -98,19 +98,19 @@ def test_tables_show_latency_only_where_there_is_any() -> None:
         changed(crashed, latency_ms=ms, ended="goal", clock={"answer_ms": took_ms})
         for ms, took_ms in ((50.0, 3.124), (50.0, 4.0), (400.0, 391.6))
     ]
-    assert "latency" not in told(none)
-    assert "latency 200 ms: commands take effect so much later" in told(given)
+    assert "latency" not in printed_table(none)
+    assert "latency 200 ms: commands take effect so much later" in printed_table(given)
     assert (
         "in real time: the median answer took 4 ms (3.12 to 392 ms); commands took effect 50 "
         "ms (50 to 400 ms) "
-        "after what they answer, at whole ticks of 50 ms" in told(*real, crashed, crashed)
+        "after what they answer, at whole ticks of 50 ms" in printed_table(*real, crashed, crashed)
     )
-    assert "no episode came to its end" in told(crashed)
-    assert "not to be had again from the seed" in told(*real)
+    assert "no episode came to its end" in printed_table(crashed)
+    assert "not to be had again from the seed" in printed_table(*real)
 
 
 @pytest.mark.parametrize(
-    "asked, real_time, told",
+    "asked, real_time, expected",
     [
         ("soon", False, "--latency 'soon': give milliseconds, like 200, or 'measured'"),
         ("200", True, "--real-time measures the latency of every answer: leave --latency out"),
@@ -119,9 +119,11 @@ def test_tables_show_latency_only_where_there_is_any() -> None:
     ],
     ids=["a word", "both", "negative", "no number"],
 )
-def test_contradictory_latency_options_are_refused(asked: str, real_time: bool, told: str) -> None:
+def test_contradictory_latency_options_are_refused(
+    asked: str, real_time: bool, expected: str
+) -> None:
     """The options are named, with the remedy."""
-    with pytest.raises(UsageError, match=re.escape(told)):
+    with pytest.raises(UsageError, match=re.escape(expected)):
         RunConfig(suite="reactive", latency=asked, real_time=real_time)
 
 
@@ -219,13 +221,13 @@ def test_a_measured_latency_applies_to_every_command_of_the_run(
     short = msgspec.structs.replace(scenario, time_limit_s=1.0)
     write_suite(Suite(name="brief", version="1", scenarios=(short,)), tmp_path / "brief.json")
     words = ("run", "brief.json", "--policy", "slow_one:Slow", "--out", "mine")
-    said = cosim(*words, "--latency", "measured", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim(*words, "--latency", "measured", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     latency_ms = read_spec(tmp_path / "mine").setup.latency_ms
     (record,) = read_records(tmp_path / "mine")
     assert latency_ms == record.setup.latency_ms >= 300.0 and not record.setup.real_time
-    assert f"latency {latency_ms:g} ms: commands take effect" in said.stdout
-    assert "longer than its period of 250 ms" in said.stderr
+    assert f"latency {latency_ms:g} ms: commands take effect" in result.stdout
+    assert "longer than its period of 250 ms" in result.stderr
     log = Log.load(tmp_path / "mine" / "episodes" / short.id / "trajectory.npz")
     assert (log.answers[:, 1] * 50.0 == latency_ms).all()
     assert cosim(*words, "--latency", "measured", "--resume", cwd=tmp_path).returncode == 0

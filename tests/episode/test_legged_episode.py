@@ -80,14 +80,14 @@ def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_continues(
 ) -> None:
     """A push of 30 N s fells the robot, which is reset upright and walks within 2 s; trajectory and
     record agree."""
-    told, record, log, *_ = walked(scenario, robot, 30.0)
+    pushed_scenario, record, log, *_ = walked(scenario, robot, 30.0)
     assert [failure.kind for failure in record.failures] == ["fall"]
     assert (record.measures["falls"], record.measures["failures"]) == (1.0, 1.0)
     (reset,) = np.flatnonzero(np.isfinite(log.reset_s_m)).tolist()
     assert PUSH_TICK < reset == record.failures[0].tick < PUSH_TICK + 40
     assert log.legs.shape == (record.ticks, 16) and log.legs[reset - 2 : reset + 1, 0].all()
     assert log.speed[reset + 40, 0] > 0.4 and not log.legs[reset + 1 :, 0].any()
-    assert [*contradictions(record, told, log)] == []
+    assert [*contradictions(record, pushed_scenario, log)] == []
 
 
 def test_a_walk_replays_to_the_same_state_hash(scenario: Scenario, robot: str) -> None:

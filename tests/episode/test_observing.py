@@ -202,17 +202,17 @@ def test_the_sweep_finds_every_kind_of_leak(what: str) -> None:
 
 def test_privileged_policies_get_the_simulators_knowledge() -> None:
     """They get it in addition to their goal."""
-    told: list[Moment] = []
+    moments: list[Moment] = []
     nothing = cast(Privileged, object())
 
     def known(now: Moment) -> Privileged:
-        told.append(now)
+        moments.append(now)
         return nothing
 
     seen = observed(
         Manifest("knows", camera=None, privileged=True, goal="final_point"), known=known
     )
-    assert seen.privileged is nothing and len(told) == 1 and isinstance(seen.goal, PointGoal)
+    assert seen.privileged is nothing and len(moments) == 1 and isinstance(seen.goal, PointGoal)
 
 
 def test_goals_and_errors_are_drawn_independently_from_the_runs_seed() -> None:

@@ -31,11 +31,11 @@ def straight(far_m: float, steps: int = 100) -> list[Pose]:
 
 def test_exact_odometry_is_the_pose_relative_to_the_start() -> None:
     """3 m north and 2 m west of a start facing north is 3 m ahead and 2 m left, carried or driven."""
-    told = odometer_for("exact", START, np.random.default_rng(0)).read(
+    reading = odometer_for("exact", START, np.random.default_rng(0)).read(
         Pose(8.0, 23.0, math.pi), 1.0
     )
-    assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
-    assert (told.x_m, told.y_m) == pytest.approx((3.0, 2.0))
+    assert reading is not None and reading.heading_rad == pytest.approx(0.5 * math.pi)
+    assert (reading.x_m, reading.y_m) == pytest.approx((3.0, 2.0))
     assert odometer_for("none", START, np.random.default_rng(0)).read(START, 1.0) is None
 
 
@@ -43,11 +43,11 @@ def test_wheels_without_errors_count_driving_and_not_resets() -> None:
     """A quarter circle of 5 m to the left and 2 m after a reset are counted, the reset is not."""
     counted = DeadReckoning(np.random.default_rng(0), DriftNoise(0.0, 0.0, 0.0, 0.0, 0.0))
     angles = np.linspace(0.0, 0.5 * math.pi, 200).tolist()
-    told = driven(counted, [Pose(5 * math.sin(a), 5 - 5 * math.cos(a), a) for a in angles])
-    assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
-    assert (told.x_m, told.y_m) == pytest.approx((5.0, 5.0), abs=1e-3)
-    told = driven(counted, straight(2.0))
-    assert told is not None and (told.x_m, told.y_m) == pytest.approx((5.0, 7.0), abs=1e-3)
+    reading = driven(counted, [Pose(5 * math.sin(a), 5 - 5 * math.cos(a), a) for a in angles])
+    assert reading is not None and reading.heading_rad == pytest.approx(0.5 * math.pi)
+    assert (reading.x_m, reading.y_m) == pytest.approx((5.0, 5.0), abs=1e-3)
+    reading = driven(counted, straight(2.0))
+    assert reading is not None and (reading.x_m, reading.y_m) == pytest.approx((5.0, 7.0), abs=1e-3)
 
 
 def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
@@ -99,9 +99,9 @@ def test_position_fix_errors_are_as_declared() -> None:
     errors = []
     for seed in range(400):
         gps = Gps(START, np.random.default_rng(seed))
-        told = [gps.read(Pose(10.0, 23.0, 0.0), time_s) for time_s in (0.0, 1.0, 61.0)]
-        assert {one.heading_rad for one in told} == {None}
-        errors.append([(one.x_m - 3.0, one.y_m) for one in told])
+        fixes = [gps.read(Pose(10.0, 23.0, 0.0), time_s) for time_s in (0.0, 1.0, 61.0)]
+        assert {one.heading_rad for one in fixes} == {None}
+        errors.append([(one.x_m - 3.0, one.y_m) for one in fixes])
     off = np.array(errors)
     assert off.std(axis=0) == pytest.approx(
         np.full((3, 2), math.hypot(noise.noise_m, noise.bias_m)), rel=0.12
@@ -118,7 +118,7 @@ def test_position_fix_errors_are_as_declared() -> None:
 def test_odometry_is_the_same_for_the_same_seed(kind: str) -> None:
     """Another seed gives another odometry, unless it has no error."""
 
-    def told(seed: int) -> Odometry | None:
+    def reading(seed: int) -> Odometry | None:
         return driven(odometer_for(kind, START, np.random.default_rng(seed)), straight(30.0))  # type: ignore[arg-type]
 
-    assert told(3) == told(3) and (told(3) == told(4)) == (kind == "exact")
+    assert reading(3) == reading(3) and (reading(3) == reading(4)) == (kind == "exact")

@@ -25,17 +25,17 @@ def test_a_shipped_small_policy_is_small_and_answers_without_pytorch(name: str) 
         "policy = cosim.load_policy(sys.argv[1]); policy.reset('one', 1); "
         "print(policy.act(example_observation(policy.manifest)).v_mps >= 0.0, 'torch' in sys.modules)"
     )
-    said = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code, name], capture_output=True, text=True, check=True
     )
-    assert said.stdout.split() == ["True", "False"]
+    assert result.stdout.split() == ["True", "False"]
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", SMALL)
 def test_a_shipped_small_policy_drives_to_a_goal(name: str, tmp_path: Path, cosim: Cosim) -> None:
     """By its name it crosses a crosswalk of the test split, in a city that it was not trained on."""
-    said = cosim(
+    result = cosim(
         "run",
         "unit",
         "--policy",
@@ -47,6 +47,6 @@ def test_a_shipped_small_policy_drives_to_a_goal(name: str, tmp_path: Path, cosi
         cwd=tmp_path,
     )
     (record,) = read_records(tmp_path / "run")
-    assert said.returncode == 0 and record.ended == "goal" and not record.manifest.privileged, (
-        said.stderr
+    assert result.returncode == 0 and record.ended == "goal" and not record.manifest.privileged, (
+        result.stderr
     )

@@ -131,9 +131,9 @@ def test_the_bundle_is_accepted_by_runs(learned: Path) -> None:
     expected answers."""
     manifest = msgspec.json.decode((learned / "manifest.json").read_bytes(), type=BundleManifest)
     graph = (learned / "model.onnx").read_bytes()
-    told = manifest.files["model.onnx"]
+    facts = manifest.files["model.onnx"]
     digest = hashlib.blake2b(graph, digest_size=32).hexdigest()
-    assert (told.bytes, told.blake2b) == (len(graph), digest) and len(graph) < 8_000_000
+    assert (facts.bytes, facts.blake2b) == (len(graph), digest) and len(graph) < 8_000_000
     assert (manifest.goal, manifest.rate_hz, manifest.camera.spec.size) == (
         "route_point",
         5.0,
@@ -156,7 +156,7 @@ def test_the_bundles_camera_equals_that_of_the_demonstrations() -> None:
         "depth": False,
     }
     manifest = msgspec.convert(
-        manifest_of("small", street().meta | {"camera": camera}, "told", SMALL.inputs),
+        manifest_of("small", street().meta | {"camera": camera}, "small policy", SMALL.inputs),
         BundleManifest,
     )
     assert manifest.camera.spec == CameraSpec(160, 120, 60.0, crop=(0, 30, 160, 120))
@@ -275,7 +275,7 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
     packed.save(tmp_path / "street.npz")
     trained_on = Examples([tmp_path / "street.npz"], 0, CPU).rows(np.arange(12))
     manifest = msgspec.convert(
-        manifest_of("small", packed.meta, "told", SMALL.inputs), BundleManifest
+        manifest_of("small", packed.meta, "small policy", SMALL.inputs), BundleManifest
     )
     ports = {name: TensorPort(name, np.dtype(np.float32), shape) for name, shape in INPUTS.items()}
     feeder = Feeder(manifest.inputs, ports, 0)
@@ -303,12 +303,12 @@ def test_a_bundle_records_its_experts_and_drivers(
     )
     meta = Examples([data, tmp_path / "again.npz"], 0, CPU).meta
     assert source_of(street().meta, 0) == "cosim train, seed 0, on what orca drove"
-    told = (
+    expected = (
         "cosim train, seed 1, on what orca, orca-disturbed drove, and would have done where "
         "first drove"
     )
-    assert source_of(meta, 1) == told
-    assert source_of(meta, 1, bundle_facts(learned)) == f"{told}; begun with small"
+    assert source_of(meta, 1) == expected
+    assert source_of(meta, 1, bundle_facts(learned)) == f"{expected}; begun with small"
 
 
 def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
@@ -350,7 +350,7 @@ def test_held_out_episodes_are_whole_and_never_trained_on(data: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         (
             "size",
@@ -371,7 +371,7 @@ def test_held_out_episodes_are_whole_and_never_trained_on(data: Path) -> None:
     ],
 )
 def test_unusable_training_data_is_refused(
-    learned: Path, data: Path, tmp_path: Path, wrong: str, told: str
+    learned: Path, data: Path, tmp_path: Path, wrong: str, expected: str
 ) -> None:
     """One line names file and field, what was found and what is required, and nothing is written."""
     packed = street(episodes=2)
@@ -396,7 +396,7 @@ def test_unusable_training_data_is_refused(
     before = sorted(out.rglob("*"))
     files = [data, other] if wrong in ("size", "goal", "turn", "rate", "file") else [data]
     files = [other] if wrong == "other data" else files
-    with pytest.raises(CosimError, match=told):
+    with pytest.raises(CosimError, match=expected):
         training = replace(
             BRISK,
             begin=tmp_path
@@ -425,5 +425,7 @@ def test_training_needs_only_pytorch_numpy_and_onnx() -> None:
         "sys.modules} & {'msgspec', 'shapely', 'pandas', 'scipy', 'cv2', 'av', 'typer', 'rich', "
         "'onnxruntime', 'libsumo'}))"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == "[]"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

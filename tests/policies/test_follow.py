@@ -141,9 +141,9 @@ def test_a_file_that_is_not_the_weights_is_refused_in_one_line(tmp_path: Path) -
         "-o",
         tmp_path / "out",
     ]
-    told = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert told.returncode == 1 and told.stderr.count("\n") == 1
-    assert "w.pth: 11 bytes, BLAKE2b" in told.stderr and "1107690 bytes" in told.stderr
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 1 and result.stderr.count("\n") == 1
+    assert "w.pth: 11 bytes, BLAKE2b" in result.stderr and "1107690 bytes" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -160,12 +160,12 @@ def test_a_file_of_weights_cannot_run_code() -> None:
 def test_boxes_are_decoded_from_the_networks_answer() -> None:
     """A planted answer in the grid of 16 pixels, and its duplicate beside it, become one box in
     picture pixels."""
-    told = np.zeros((3549, 85), np.float32)
+    answer = np.zeros((3549, 85), np.float32)
     row = 52 * 52 + 10 * 26 + 5  # of the second grid, the row 10 and the column 5
-    told[row, :6] = 0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.9
-    told[row + 1, :6] = -0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.6
-    told[7, :6] = 0.0, 0.0, 0.0, 0.0, 0.9, 0.2
-    (box,) = decode_boxes(told, scale=416 / 512)
+    answer[row, :6] = 0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.9
+    answer[row + 1, :6] = -0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.6
+    answer[7, :6] = 0.0, 0.0, 0.0, 0.0, 0.9, 0.2
+    (box,) = decode_boxes(answer, scale=416 / 512)
     middle = np.array([5.5, 10.25]) * 16
     size = np.array([32.0, 64.0])
     assert np.allclose(

@@ -132,11 +132,11 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.mark.parametrize("name", BAD)
 def test_a_policy_that_cannot_be_loaded_is_named_with_the_reason(desk: Path, name: str) -> None:
     """The reason covers faults of module, class and manifest, SystemExit included."""
-    source, told = BAD[name]
+    source, expected = BAD[name]
     (desk / "mine.py").write_text(source)
     with pytest.raises(UsageError) as caught:
         load_policy("mine:Mine")
-    assert "'mine:Mine'" in str(caught.value) and told in str(caught.value)
+    assert "'mine:Mine'" in str(caught.value) and expected in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -157,18 +157,18 @@ def test_loading_keeps_the_working_folder(desk: Path) -> None:
 
 def test_loading_is_timed(desk: Path) -> None:
     """The timer starts and stops around loading."""
-    told: list[PolicyCall | None] = []
+    calls: list[PolicyCall | None] = []
 
     class Notes:
         def starts(self, doing: PolicyCall, tick: int) -> None:
-            told.append(doing)
+            calls.append(doing)
 
         def stops(self) -> None:
-            told.append(None)
+            calls.append(None)
 
     (desk / "mine.py").write_text(GOOD.format(fields=""))
     load_policy("mine:Mine", Notes()).reset("a", 0)
-    assert told == ["loading", None, "reset", None]
+    assert calls == ["loading", None, "reset", None]
 
 
 def test_an_edited_policy_has_another_hash(desk: Path) -> None:
@@ -285,12 +285,12 @@ def test_a_file_that_cannot_be_loaded_is_named_with_the_remedy(desk: Path, name:
     """The message has the file, its valid choices, and what to do instead."""
     write_policies(desk)
     load_policy("mine:Mine")
-    spelled, told = MISNAMED[name]
+    spelled, expected = MISNAMED[name]
     if not name.startswith("no ") and "elsewhere" not in name:
         (desk / spelled.partition(":")[0]).write_text(GOOD.format(fields=""))
     with pytest.raises(UsageError) as caught:
         load_policy(spelled)
-    assert told.format(desk=desk) in str(caught.value)
+    assert expected.format(desk=desk) in str(caught.value)
 
 
 def test_a_missing_module_is_reported_with_the_search_path(
@@ -301,12 +301,12 @@ def test_a_missing_module_is_reported_with_the_search_path(
     write_policies(desk)
     with pytest.raises(UsageError) as caught:
         load_policy("alone:Mine")
-    said = str(caught.value)
+    message = str(caught.value)
     assert (
-        f"{desk / 'libraries'}, {desk}" in said.partition("Searched: ")[2]
-        and "lib-dynload" not in said
+        f"{desk / 'libraries'}, {desk}" in message.partition("Searched: ")[2]
+        and "lib-dynload" not in message
     )
-    assert said.endswith(
+    assert message.endswith(
         "Run the command in the folder that holds alone.py, add that folder to PYTHONPATH, or "
         "name the file: deeper/alone.py:Mine"
     )

@@ -47,13 +47,15 @@ def test_missing_weights_are_reported_with_their_source(
     facts = bundle.files[bundle.model]
     with pytest.raises(UsageError) as caught:
         load_policy(name)
-    said = str(caught.value)
+    message = str(caught.value)
     assert (
         f"{bundle.model} is missing, {facts.bytes} bytes, BLAKE2b {facts.blake2b}: from "
-        f"{bundle.source}" in said
+        f"{bundle.source}" in message
     )
-    assert f"`python -m cosim.policies.published.{name} " in said and "pip install onnx" in said
-    assert str(tmp_path) in said and "\n" not in said
+    assert (
+        f"`python -m cosim.policies.published.{name} " in message and "pip install onnx" in message
+    )
+    assert str(tmp_path) in message and "\n" not in message
     assert f"weights missing ({bundle.model})" in bundle_in_words(shipped_bundles()[name])
 
 

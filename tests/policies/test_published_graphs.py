@@ -62,11 +62,11 @@ def test_the_command_makes_the_graph_that_runs_accept(
 ) -> None:
     """It is the manifest's file byte for byte, and the policy loads and reproduces its example."""
     command = [sys.executable, "-m", network.module, upstream_file(network), "-o", tmp_path]
-    told = subprocess.run(command, capture_output=True, text=True, check=True)
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
     folder = shipped_bundles()[name_of(network)]
     bundle = read_bundle_manifest(folder)
     made = tmp_path / bundle.model
-    assert told.stdout == f"{made}: {bundle.files[bundle.model].bytes} bytes\n"
+    assert result.stdout == f"{made}: {bundle.files[bundle.model].bytes} bytes\n"
     assert file_facts(made.read_bytes()).blake2b == bundle.files[bundle.model].blake2b
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     assert load_policy(name_of(network)).manifest.name == name_of(network)
@@ -80,13 +80,13 @@ def test_another_file_makes_no_graph(
 ) -> None:
     """One line has its size, hash and origin and the required ones, and nothing is written."""
     (tmp_path / "other").write_bytes(b"not weights")
-    for path, said in (
+    for path, expected in (
         (tmp_path / "other", "other: 11 bytes, BLAKE2b"),
         (tmp_path / "none", "none: cannot be read"),
     ):
         with pytest.raises(SystemExit) as ended:
             network.command([str(path), "-o", str(tmp_path / "out")])
-        assert str(ended.value).startswith(f"error: {tmp_path / said}")
+        assert str(ended.value).startswith(f"error: {tmp_path / expected}")
         assert network.weights.source in str(ended.value) and "\n" not in str(ended.value)
     assert not (tmp_path / "out").exists() and not capsys.readouterr().out
 

@@ -310,12 +310,12 @@ def test_a_checkpoint_is_read_without_tensorflow() -> None:
     found = read_checkpoint(index, numbers)
     assert found.keys() == arrays.keys()
     assert all((found[name] == array).all() for name, array in arrays.items())
-    for wrong, told in (
+    for wrong, expected in (
         (index[:-1], "it ends otherwise"),
         (index.replace(b"\x00crc ", b"\x01crc "), "compressed index"),
         (b"\xff" * 20 + index[20:], "TensorFlow checkpoint"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=expected):
             read_checkpoint(wrong, numbers)
     with pytest.raises(ValueError, match="not in the checkpoint's first data file"):
         read_checkpoint(index, numbers[:-4])

@@ -153,9 +153,11 @@ def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
     simulated = []
     drawn = []
     add, render = Recorder.add, WorldCamera.render
-    monkeypatch.setattr(Recorder, "add", lambda self, *told: simulated.append(add(self, *told)))
     monkeypatch.setattr(
-        WorldCamera, "render", lambda self, *told: drawn.append(0) or render(self, *told)
+        Recorder, "add", lambda self, *arguments: simulated.append(add(self, *arguments))
+    )
+    monkeypatch.setattr(
+        WorldCamera, "render", lambda self, *arguments: drawn.append(0) or render(self, *arguments)
     )
     done = cosim(
         "film",
@@ -225,7 +227,7 @@ def test_a_record_that_does_not_replay_is_not_filmed(desk: Path, cosim: Cosim) -
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("film", "run", "t-9"), "unknown finished episode"),
         (("film", "run"), "name one of its episodes, or give --failure: t-0"),
@@ -261,13 +263,13 @@ def test_a_record_that_does_not_replay_is_not_filmed(desk: Path, cosim: Cosim) -
     ],
 )
 def test_invalid_film_and_look_requests_are_refused(
-    desk: Path, cosim: Cosim, words: tuple[str, ...], told: str
+    desk: Path, cosim: Cosim, words: tuple[str, ...], expected: str
 ) -> None:
     """The exit code is 2, or 3 for the machine's faults, with one message and no traceback."""
     done = cosim(*words, cwd=desk)
     assert (
-        done.returncode == (3 if "written" in told else 2)
-        and told in done.stderr
+        done.returncode == (3 if "written" in expected else 2)
+        and expected in done.stderr
         and "Traceback" not in done.stderr
     )
     assert "starting" not in done.stderr or words[0] == "film"
@@ -302,8 +304,8 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
             *driven,
             "drawing",
         ]
-        said = done.stderr.splitlines()
-        assert len(said) == len(stages) and all(map(str.startswith, said, stages))
+        lines = done.stderr.splitlines()
+        assert len(lines) == len(stages) and all(map(str.startswith, lines, stages))
         seen[name] = cv2.imread(str(desk / f"{name}.png"))
         assert seen[name].shape == (90, 160, 3) and seen[name].std() > 10
     assert (seen["start"] != seen["above"]).mean() > 0.5
@@ -317,13 +319,13 @@ def test_a_look_at_a_scenario_file_needs_no_suite(desk: Path, cosim: Cosim) -> N
     )
     text += '[[events]]\nkind = "frontal"\nat_m = [25, 2]\n'
     (desk / "mine.toml").write_text(text)
-    for words, told in {
+    for words, expected in {
         (): "mine-at_m25-s0 at 0.00 s, robot; 1 of 4 scenarios: --scenario chooses another)",
         ("--scenario", "2"): "mine-at_m25-s1 at",
         ("--scenario", "mine-at_m25-s1"): "mine-at_m25-s1 at",
     }.items():
         done = cosim("look", "mine.toml", *words, "--size", "160x90", "-o", "mine.png", cwd=desk)
-        assert done.returncode == 0 and told in done.stdout, done.stderr
+        assert done.returncode == 0 and expected in done.stdout, done.stderr
         assert cv2.imread(str(desk / "mine.png")).std() > 10
     done = cosim("look", "mine.toml", "--scenario", "3", "-o", "none.png", cwd=desk)
     assert done.returncode == 2 and "mine.toml: events[0]: at_m 2 does not do" in done.stderr

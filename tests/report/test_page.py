@@ -72,13 +72,13 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     with its suites."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])
     spec = msgspec.structs.replace(own.spec, suite="unit")
-    told = ReportedRun("mine", own.whole._replace(spec=spec))
-    mean, low, high = summary_of(told.table, ["success"]).iloc[0][["mean", "low", "high"]]
-    ours = next(table for table in tables_of([told]) if table.title == "Unit tests")
+    reported = ReportedRun("mine", own.whole._replace(spec=spec))
+    mean, low, high = summary_of(reported.table, ["success"]).iloc[0][["mean", "low", "high"]]
+    ours = next(table for table in tables_of([reported]) if table.title == "Unit tests")
     (row,) = ours.rows
     assert row.name == "mine" and row.cells[0][:4] == (mean, low, high, 5) and mean == 0.6
     assert ours.paper is UNIT_OF_PAPER
-    text = render_page([told], [], [], Maps([], {}, {}), "").decode()
+    text = render_page([reported], [], [], Maps([], {}, {}), "").decode()
     assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in text
     assert text.index("models, in another engine") < text.index("OpenPilot")
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
@@ -175,16 +175,16 @@ def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Pat
 def test_blind_schedules_are_a_row_of_the_tables_of_success(tmp_path: Path) -> None:
     """Only the runs of that suite get the row, with the share of each kind that was searched."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT], "mine")])
-    told = ReportedRun(
+    reported = ReportedRun(
         "mine", own.whole._replace(spec=msgspec.structs.replace(own.spec, suite="unit"))
     )
     share = Estimate(0.95, 0.76, 0.99, 20, 19.0)
     blind = {"unit": {"straight": share}}
-    ours = next(table for table in tables_of([told], blind) if table.title == "Unit tests")
+    ours = next(table for table in tables_of([reported], blind) if table.title == "Unit tests")
     mine, row = ours.rows
     assert row.name == BEST_BLIND and row.cells[0] == share and len(row.cells) == len(mine.cells)
     assert sum(cell.n > 0 for cell in row.cells) == 1
-    text = render_page([told], [], [], Maps([], {}, {}), "", blind).decode()
+    text = render_page([reported], [], [], Maps([], {}, {}), "", blind).decode()
     assert text.index(BEST_BLIND) < text.index("models, in another engine")
     assert BEST_BLIND not in render_page([own], [], [], Maps([], {}, {}), "", blind).decode()
 
@@ -259,8 +259,8 @@ def test_rates_exclude_the_metres_of_invalid_episodes(tmp_path: Path) -> None:
         n: msgspec.structs.replace(r, status="invalid") if n == "s-001" else r
         for n, r in run.whole.records.items()
     }
-    told = ReportedRun("mine", run.whole._replace(records=records))
-    assert [record.scenario.id for record, _ in told.tracks()] == ["s-000", "s-002"]
+    reported = ReportedRun("mine", run.whole._replace(records=records))
+    assert [record.scenario.id for record, _ in reported.tracks()] == ["s-000", "s-002"]
 
 
 def test_a_run_without_failures_is_plotted_at_0_beside_one_with(
@@ -433,9 +433,9 @@ def test_a_damaged_run_is_refused_by_the_name_of_its_file(
     """One line has the file and the remedy, the exit code is 2, and there is no page."""
     run = run_of(tmp_path / "run", [HIT, "goal"])
     file = damage(run)
-    said = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
-    (line,) = [line for line in said.stderr.splitlines() if line.startswith("error:")]
-    assert said.returncode == 2 and file in line and "again" in line
+    result = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("error:")]
+    assert result.returncode == 2 and file in line and "again" in line
     assert not list(tmp_path.glob("*.html*"))
 
 
@@ -457,8 +457,8 @@ def test_no_run_a_run_twice_and_a_run_without_an_episode_are_refused(
         ("empty",): "no episode of it has ended",
     }
     for folders, expected in words.items():
-        said = cosim("report", *folders, "-o", "r.html", cwd=tmp_path)
-        assert said.returncode == 2 and expected in said.stderr, said.stderr
+        result = cosim("report", *folders, "-o", "r.html", cwd=tmp_path)
+        assert result.returncode == 2 and expected in result.stderr, result.stderr
     assert not list(tmp_path.glob("*.html*"))
 
 
@@ -466,9 +466,9 @@ def test_two_suites_of_one_name_are_not_put_in_one_table(tmp_path: Path, cosim: 
     """The refusal names both folders and both hashes."""
     run_of(tmp_path / "one", [HIT], "mine")
     run_of(tmp_path / "two", [HIT], "mine", [short_way("s-000", time_limit_s=20.0)])
-    said = cosim("report", "one", "two", "-o", "r.html", cwd=tmp_path)
-    assert said.returncode == 2 and re.search(
-        r"two and one are of different suites 's' \(\w{16}, \w{16}\)", said.stderr
+    result = cosim("report", "one", "two", "-o", "r.html", cwd=tmp_path)
+    assert result.returncode == 2 and re.search(
+        r"two and one are of different suites 's' \(\w{16}, \w{16}\)", result.stderr
     )
 
 
@@ -484,7 +484,9 @@ def test_a_full_disk_leaves_nothing_half_written(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    said = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
-    assert said.returncode == 3 and "report.html: cannot be written: No space left" in said.stderr
+    result = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
+    assert (
+        result.returncode == 3 and "report.html: cannot be written: No space left" in result.stderr
+    )
     assert [path.name for path in tmp_path.glob("report*")] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "the page before"

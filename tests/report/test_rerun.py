@@ -25,7 +25,7 @@ from tests.support.blind_policy import BEND, Blind
 
 
 @pytest.mark.parametrize(
-    "name, episodes, told",
+    "name, episodes, expected",
     [
         ("e.mp4", 1, "use a name that ends in .rrd"),
         ("e.rrd", 0, "and none are asked"),
@@ -34,10 +34,10 @@ from tests.support.blind_policy import BEND, Blind
     ids=["another ending", "no episode", "several"],
 )
 def test_a_recording_needs_one_episode_and_an_rrd_file(
-    tmp_path: Path, name: str, episodes: int, told: str
+    tmp_path: Path, name: str, episodes: int, expected: str
 ) -> None:
     """Anything else is refused before a simulation starts."""
-    with pytest.raises(UsageError, match=told):
+    with pytest.raises(UsageError, match=expected):
         check_rerun(tmp_path / name, episodes)
 
 
@@ -86,8 +86,8 @@ def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Co
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
     suite = Suite(name="brief", version="1", scenarios=(scenario,))
     product.run(suite, Sensing(), out=tmp_path / "run")
-    said = cosim("show", "run", "--episode", scenario.id, "--rerun", "e.rrd", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim("show", "run", "--episode", scenario.id, "--rerun", "e.rrd", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     tape = Tape(tmp_path / "e.rrd")
     log = Log.load(tmp_path / "run" / "episodes" / scenario.id / "trajectory.npz")
     moving = ("robot", "robot/plan", "people", "people/velocity", "vehicles", "signals")

@@ -37,7 +37,9 @@ def test_consecutive_failures_share_their_pictures(
     drawn = []
     done = []
     render = WorldCamera.render
-    monkeypatch.setattr(WorldCamera, "render", lambda *told: drawn.append(0) or render(*told))
+    monkeypatch.setattr(
+        WorldCamera, "render", lambda *arguments: drawn.append(0) or render(*arguments)
+    )
     (last,) = mishaps_of(load_recorded(run, NAME).record)
     before = last._replace(tick=last.tick - 20, failure=None)
     shown = show_again(run, NAME, [last, before], "auto", done.append)
@@ -74,12 +76,12 @@ def test_an_episode_that_replays_differently_is_not_shown(run: Path, column: str
 
 def test_a_replay_without_measures_has_no_result(run: Path) -> None:
     """It ends when the recorded one did, and its result raises UsageError."""
-    told = load_recorded(run, NAME)
-    episode, policy = replay_episode(told, without_measures=True)
+    recorded = load_recorded(run, NAME)
+    episode, policy = replay_episode(recorded, without_measures=True)
     with episode:
         observation = episode.reset()
         while not episode.over:
             observation = episode.advance(policy.act(observation))
-        assert episode.moment.tick == told.record.ticks
+        assert episode.moment.tick == recorded.record.ticks
     with pytest.raises(UsageError, match="no measures"):
         episode.result()

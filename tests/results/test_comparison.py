@@ -78,8 +78,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def row(told: RunComparison, metric: str, group: str = "s", after: str = "b") -> pd.Series[float]:
-    table = told.differences
+def row(
+    comparison: RunComparison, metric: str, group: str = "s", after: str = "b"
+) -> pd.Series[float]:
+    table = comparison.differences
     (one,) = table.index[
         (table["metric"] == metric) & (table["group"] == group) & (table["after"] == after)
     ]
@@ -106,8 +108,8 @@ def test_groups_are_suite_event_structure_and_split() -> None:
 
 def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
     """Nine won and one lost of twenty are listed by name, and in every group."""
-    told = compare_runs([runs / "a", runs / "b"])
-    whole = row(told, "success")
+    comparison = compare_runs([runs / "a", runs / "b"])
+    whole = row(comparison, "success")
     assert (whole["value_before"], whole["value_after"], whole["n"], whole["changed"]) == (
         0.5,
         0.9,
@@ -115,14 +117,14 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
         10,
     )
     assert whole["low"] > 0.0 and whole["verdict"] == "better"
-    assert row(told, "failures")["verdict"] == "better" and row(told, "failures")[
+    assert row(comparison, "failures")["verdict"] == "better" and row(comparison, "failures")[
         "difference"
     ] == pytest.approx(-0.4)
     assert (
-        row(told, "success", "curve")["difference"] == 0.9
-        and row(told, "success", "straight")["changed"] == 1
+        row(comparison, "success", "curve")["difference"] == 0.9
+        and row(comparison, "success", "straight")["changed"] == 1
     )
-    rate = row(told, "failures_per_100m")
+    rate = row(comparison, "failures_per_100m")
     metres = [
         compare_runs([runs / "a", runs / name]).others[0].table["path_length_m"].sum()
         for name in ("a", "b")
@@ -130,11 +132,11 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
     assert (rate["value_before"], rate["value_after"]) == pytest.approx(
         (1000.0 / metres[0], 200.0 / metres[1])
     )
-    won, lost = flips_in_words(told, told.others[0])
+    won, lost = flips_in_words(comparison, comparison.others[0])
     assert won == "solved by b alone, 9: " + ", ".join(f"s-{i:03d}" for i in range(0, 18, 2))
     assert lost == "solved by a alone, 1: s-019"
-    assert told.flipped.loc[
-        told.flipped["flip"] == "lost", ["ended_before", "ended_after"]
+    assert comparison.flipped.loc[
+        comparison.flipped["flip"] == "lost", ["ended_before", "ended_after"]
     ].values.tolist() == [["goal", "failure"]]
 
 
@@ -151,18 +153,21 @@ def test_runs_under_other_conditions_get_no_verdict(
         privileged=True,
         latency_ms=200.0,
     )
-    told = compare_runs([runs / "a", run])
-    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
-    assert row(told, "success")["verdict"] == "differs" and row(told, "success")["low"] > 0.0
-    (note,) = told.notes
+    comparison = compare_runs([runs / "a", run])
+    assert {*comparison.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    assert (
+        row(comparison, "success")["verdict"] == "differs"
+        and row(comparison, "success")["low"] > 0.0
+    )
+    (note,) = comparison.notes
     assert note == (
         "No verdict of b against a: they drove by other terms, goal none (a) and route_point (b); "
         "odometry none (a) and exact (b); sensor track blind (a) and privileged (b); "
         "latency 0 ms (a) and 200 ms (b). What differs is called neither better nor worse"
     )
-    said = cosim("compare", str(runs / "a"), str(run))
-    assert said.returncode == 0 and note in said.stdout
-    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", said.stdout)
+    result = cosim("compare", str(runs / "a"), str(run))
+    assert result.returncode == 0 and note in result.stdout
+    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", result.stdout)
 
 
 def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path: Path) -> None:
@@ -170,15 +175,15 @@ def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path:
     better or worse."""
     courier = run_of(tmp_path / "c", [HIT] * 20, "p", scenarios_of(20))
     dog = run_of(tmp_path / "d", [GOALS] * 20, "p", scenarios_of(20), robot="dog")
-    told = compare_runs([courier, dog])
-    assert (told.before.label, told.others[0].label) == ("p, courier", "p, dog")
-    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
-    success = row(told, "success", after="p, dog")
+    comparison = compare_runs([courier, dog])
+    assert (comparison.before.label, comparison.others[0].label) == ("p, courier", "p, dog")
+    assert {*comparison.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    success = row(comparison, "success", after="p, dog")
     assert (success["n"], success["difference"], success["verdict"]) == (20, 1.0, "differs")
     assert any(
         "No verdict of p, dog against p, courier" in note
         and "robot courier (p, courier) and dog (p, dog)" in note
-        for note in told.notes
+        for note in comparison.notes
     )
 
 
@@ -192,16 +197,18 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     rain = run_of(tmp_path / "r", [HIT] * 20, "p", ways, weather="rain")
     difference = read_spec(clear).difference_from(read_spec(rain))
     assert difference is not None and difference[:3] == ("weather", "", "rain")
-    told = compare_runs([clear, rain])
-    assert (told.before.label, told.others[0].label) == ("p, own weather", "p, rain")
-    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
-    assert any("weather clear (p, own weather) and rain (p, rain)" in n for n in told.notes)
-    said = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "weather.png"))
-    assert said.returncode == 0, said.stderr
-    assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", said.stdout)
+    comparison = compare_runs([clear, rain])
+    assert (comparison.before.label, comparison.others[0].label) == ("p, own weather", "p, rain")
+    assert {*comparison.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    assert any("weather clear (p, own weather) and rain (p, rain)" in n for n in comparison.notes)
+    result = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "weather.png"))
+    assert result.returncode == 0, result.stderr
+    assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", result.stdout)
     assert (tmp_path / "weather.png").read_bytes().startswith(b"\x89PNG")
-    said = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "p.png"), "--by", "policy")
-    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG"), said.stderr
+    result = cosim(
+        "compare", str(clear), str(rain), "-o", str(tmp_path / "p.png"), "--by", "policy"
+    )
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG"), result.stderr
     printed = io.StringIO()
     table = table_of(read_verified_run(rain).records.values())
     print_table(Console(file=printed, width=200), table, 20, rain)
@@ -237,10 +244,10 @@ def test_another_camera_is_noted_and_the_verdict_stays(runs: Path, tmp_path: Pat
         rewritten(runs / name, tmp_path / name, camera=CameraSpec(width, 48))
         for name, width in (("a", 64), ("b", 96))
     )
-    told = compare_runs([small, large])
-    assert row(told, "success")["verdict"] == "better"
+    comparison = compare_runs([small, large])
+    assert row(comparison, "success")["verdict"] == "better"
     a, b = (f"front, {width} x 48 px, 75 deg, at 4 Hz" for width in (64, 96))
-    assert f"a sees by {a}; b by {b}: a difference may be the camera's" in told.notes
+    assert f"a sees by {a}; b by {b}: a difference may be the camera's" in comparison.notes
     assert not any("sees by" in note for note in compare_runs([runs / "a", large]).notes)
 
 
@@ -304,40 +311,47 @@ def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
 def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
     """No metric or group differs, below five scenarios there is no verdict, and a repeated name
     gets a number."""
-    told = compare_runs([runs / "a", runs / "a"])
-    enough, few = (told.differences[told.differences["n"].between(*of)] for of in ((5, 99), (1, 4)))
+    comparison = compare_runs([runs / "a", runs / "a"])
+    enough, few = (
+        comparison.differences[comparison.differences["n"].between(*of)] for of in ((5, 99), (1, 4))
+    )
     assert {*enough["verdict"]} == {"within noise"} and {*few["verdict"]} == {""}
     assert (enough[["difference", "low", "high"]] == 0.0).all(axis=None)
     assert few[["low", "high"]].isna().all(axis=None) and {*few["group"]} == {"test"}
-    assert not len(told.flipped) and told.notes == () and told.others[0].label == "a (2)"
-    said = cosim("compare", str(runs / "a"), str(runs / "a"))
-    assert said.returncode == 0 and "better" not in said.stdout and "worse" not in said.stdout
-    assert "solved by a (2) alone, 0: none" in said.stdout
+    assert (
+        not len(comparison.flipped)
+        and comparison.notes == ()
+        and comparison.others[0].label == "a (2)"
+    )
+    result = cosim("compare", str(runs / "a"), str(runs / "a"))
+    assert result.returncode == 0 and "better" not in result.stdout and "worse" not in result.stdout
+    assert "solved by a (2) alone, 0: none" in result.stdout
 
 
 def test_a_crashing_run_is_compared_at_its_worst_without_rates(runs: Path) -> None:
     """A crash counts as failed and removes its groups' other metrics; an invalid episode is in no
     pair; both are noted."""
-    told = compare_runs([runs / "a", runs / "c"])
+    comparison = compare_runs([runs / "a", runs / "c"])
     assert (
-        row(told, "success", after="c")["n"] == 19
-        and row(told, "success", after="c")["value_after"] == 9 / 19
+        row(comparison, "success", after="c")["n"] == 19
+        and row(comparison, "success", after="c")["value_after"] == 9 / 19
     )
     assert (
-        row(told, "failures_per_100m", after="c")["n"] == 0
-        and row(told, "failures_per_100m", "straight", "c")["n"] == 9
+        row(comparison, "failures_per_100m", after="c")["n"] == 0
+        and row(comparison, "failures_per_100m", "straight", "c")["n"] == 9
     )
-    assert not len(told.flipped)
-    whole = told.differences[told.differences["group"] == "s"].set_index("metric")
+    assert not len(comparison.flipped)
+    whole = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
     ranked = [name for name, metric in METRICS.items() if metric.higher_is_better is not None]
     assert {*whole.index[whole["n"] > 0].intersection(ranked)} == {*WORST}
-    assert "better" not in {*told.differences["verdict"]}
+    assert "better" not in {*comparison.differences["verdict"]}
     assert (
         "c: 1 crashed, counted as failed, with SR, RC, SPL and V of 0; groups with them have "
-        "neither rates nor other means" in told.notes
+        "neither rates nor other means" in comparison.notes
     )
     assert (
-        "c is not to be quoted: 1 of 20 scheduled episodes are invalid, more than 2 %" in told.notes
+        "c is not to be quoted: 1 of 20 scheduled episodes are invalid, more than 2 %"
+        in comparison.notes
     )
 
 
@@ -347,76 +361,87 @@ def test_a_run_that_always_crashes_is_better_in_nothing(runs: Path, tmp_path: Pa
     bad, crashing = (
         run_of(tmp_path / how, [how] * 20, how, scenarios_of(20)) for how in (HIT, "crashed")
     )
-    told = compare_runs([bad, crashing])
-    assert {*told.differences["verdict"]} <= {"worse", "within noise", "too few", "differs", ""}
-    whole = told.differences[told.differences["group"] == "s"].set_index("metric")
+    comparison = compare_runs([bad, crashing])
+    assert {*comparison.differences["verdict"]} <= {
+        "worse",
+        "within noise",
+        "too few",
+        "differs",
+        "",
+    }
+    whole = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
     assert whole.loc[["route_completion", "velocity_mean_mps"], "verdict"].eq("worse").all()
     assert whole.loc["success", ["value_after", "verdict"]].tolist() == [0.0, "within noise"]
-    assert not len(told.flipped)
+    assert not len(comparison.flipped)
 
 
 def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
     """CSV has every metric in full, Markdown and LaTeX have the printed tables, reproducibly."""
-    files = [tmp_path / f"told{end}" for end in (".csv", ".md", ".tex")]
+    files = [tmp_path / f"comparison{end}" for end in (".csv", ".md", ".tex")]
     words = [
         "compare",
         *(str(runs / name) for name in "abc"),
         *(w for file in files for w in ("-o", str(file))),
     ]
-    said = cosim(*words)
-    assert said.returncode == 0, said.stderr
+    result = cosim(*words)
+    assert result.returncode == 0, result.stderr
     assert (
-        "b (B) against a (A), suite s" in said.stdout
-        and "c (B) against a (A), suite s, by" in said.stdout
+        "b (B) against a (A), suite s" in result.stdout
+        and "c (B) against a (A), suite s, by" in result.stdout
     )
     assert re.search(
-        r"success +0\.50 +0\.90 +\+0\.400 +\+\d\.\d{3} to \+\d\.\d{3} +20 +better", said.stdout
+        r"success +0\.50 +0\.90 +\+0\.400 +\+\d\.\d{3} to \+\d\.\d{3} +20 +better", result.stdout
     )
     read = pd.read_csv(files[0], keep_default_na=False, na_values=[""])
-    told = compare_runs([runs / name for name in "abc"])
-    assert read["low"].dropna().tolist() == told.differences["low"].dropna().tolist() and len(
+    comparison = compare_runs([runs / name for name in "abc"])
+    assert read["low"].dropna().tolist() == comparison.differences["low"].dropna().tolist() and len(
         read
-    ) == len(told.differences)
+    ) == len(comparison.differences)
     assert (
-        pd.read_csv(tmp_path / "told.flipped.csv")["scenario"].tolist()
-        == told.flipped["scenario"].tolist()
+        pd.read_csv(tmp_path / "comparison.flipped.csv")["scenario"].tolist()
+        == comparison.flipped["scenario"].tolist()
     )
-    assert files[1].read_text() == as_markdown(told) and files[2].read_text() == as_latex(told)
+    assert files[1].read_text() == as_markdown(comparison) and files[2].read_text() == as_latex(
+        comparison
+    )
     assert not [*tmp_path.glob("*.part")]
 
 
 def test_below_five_scenarios_a_comparison_shows_counts(runs: Path) -> None:
     """Four scenarios of `test` have counts without interval or verdict in every format; the CSV
     counts larger groups, too."""
-    told = compare_runs([runs / "a", runs / "b"])
-    of_test = row(told, "success", "test")
+    comparison = compare_runs([runs / "a", runs / "b"])
+    of_test = row(comparison, "success", "test")
     assert (of_test["counts_before"], of_test["counts_after"]) == ("2/4", "4/4")
     assert np.isnan(of_test["low"]) and of_test["verdict"] == ""
-    (_, grouped) = tables_of_comparison(told, told.others[0])
+    (_, grouped) = tables_of_comparison(comparison, comparison.others[0])
     by_metric = {cells[1]: cells[2:] for cells in grouped.rows if cells[0] == "test"}
     assert by_metric["SR"] == ("2/4", "4/4", "-", "-", "4", "")
     assert by_metric["FC"] == ("2 in 24 m", "0 in 32 m", "-", "-", "4", "")
     assert by_metric["RC"][0] == "0.72" and by_metric["RC"][-3:] == ("-", "4", "")
-    assert "| test     | SR | 2/4 | 4/4 |" in re.sub(" +", " ", as_markdown(told)).replace(
+    assert "| test     | SR | 2/4 | 4/4 |" in re.sub(" +", " ", as_markdown(comparison)).replace(
         "| test |", "| test     |"
     )
-    assert "test & SR & 2/4 & 4/4 & - & - & 4 &" in as_latex(told)
-    assert row(told, "success")["counts_after"] == "18/20"
-    assert row(told, "route_completion")["counts_after"] == ""
+    assert "test & SR & 2/4 & 4/4 & - & - & 4 &" in as_latex(comparison)
+    assert row(comparison, "success")["counts_after"] == "18/20"
+    assert row(comparison, "route_completion")["counts_after"] == ""
 
 
 def test_names_are_escaped(runs: Path) -> None:
     """A name of all special characters of LaTeX, Markdown and HTML ends no cell, starts no command,
     and is no tag."""
     odd = r"<script>_a&b|c$1%#{2}~^\input{x}*`d`[e](f)"
-    told = compare_runs([runs / "a", runs / "b"])
-    other = told.others[0]._replace(label=odd)
+    comparison = compare_runs([runs / "a", runs / "b"])
+    other = comparison.others[0]._replace(label=odd)
     frames = [
-        frame.replace({"b": odd, "frontal": odd}) for frame in (told.differences, told.flipped)
+        frame.replace({"b": odd, "frontal": odd})
+        for frame in (comparison.differences, comparison.flipped)
     ]
-    told = told._replace(others=(other,), differences=frames[0], flipped=frames[1], notes=(odd,))
-    tables = tables_of_comparison(told, other)
-    latex = as_latex(told)
+    comparison = comparison._replace(
+        others=(other,), differences=frames[0], flipped=frames[1], notes=(odd,)
+    )
+    tables = tables_of_comparison(comparison, other)
+    latex = as_latex(comparison)
     assert r"\input" not in latex.replace(r"\textbackslash{}input", "") and "<" not in latex
     assert "$+0.400$ & $+" in latex
     plain = re.sub(r"\\[&%$#_{}]|\\text\w+\{\}|\$[-+][\d.]+\$", "", latex)
@@ -425,7 +450,7 @@ def test_names_are_escaped(runs: Path) -> None:
     assert len(rows) == sum(len(table.rows) + 1 for table in tables)
     assert {line.count("&") for line in rows} == {len(table.heads) - 1 for table in tables}
     assert plain.count("{") == plain.count("}")
-    markdown = as_markdown(told)
+    markdown = as_markdown(comparison)
     assert "<script" not in markdown and "&lt;script&gt;" in markdown
     bars = [
         len(re.findall(r"(?<!\\)\|", line))
@@ -511,11 +536,11 @@ def test_unreadable_runs_are_refused_in_one_line(tmp_path: Path, cosim: Cosim, n
     first, run = (run_of(tmp_path / which, [GOALS, HIT], which) for which in ("first", "second"))
     spoil, words = BAD[name]
     spoil(run)
-    said = cosim("compare", str(first), str(run), "-o", str(tmp_path / "out.csv"))
-    assert said.returncode == 2 and not said.stdout and not (tmp_path / "out.csv").exists()
-    comparing, told = said.stderr.splitlines()
-    assert comparing == "comparing 2 runs ..." and told.startswith("error: ")
-    assert words.format(run=run, first=first) in told
+    result = cosim("compare", str(first), str(run), "-o", str(tmp_path / "out.csv"))
+    assert result.returncode == 2 and not result.stdout and not (tmp_path / "out.csv").exists()
+    comparing, error = result.stderr.splitlines()
+    assert comparing == "comparing 2 runs ..." and error.startswith("error: ")
+    assert words.format(run=run, first=first) in error
 
 
 def test_a_run_in_progress_is_not_compared(tmp_path: Path, cosim: Cosim) -> None:
@@ -524,38 +549,38 @@ def test_a_run_in_progress_is_not_compared(tmp_path: Path, cosim: Cosim) -> None
         run_of(tmp_path / which, [GOALS, HIT, GOALS], which) for which in ("first", "second")
     )
     with hold(run):
-        said = cosim("compare", str(first), str(run))
-    assert said.returncode == 2 and f"{run} is in use by process {os.getpid()}" in said.stderr
+        result = cosim("compare", str(first), str(run))
+    assert result.returncode == 2 and f"{run} is in use by process {os.getpid()}" in result.stderr
     with closing(sqlite3.connect(run / "results.sqlite")) as database, database:
         database.execute("delete from episodes where scenario = 's-002'")
-    said = cosim("compare", str(first), str(run))
+    result = cosim("compare", str(first), str(run))
     assert (
-        said.returncode == 0
-        and "second is not to be quoted: 1 of 3 scheduled episodes have not ended" in said.stdout
+        result.returncode == 0
+        and "second is not to be quoted: 1 of 3 scheduled episodes have not ended" in result.stdout
     )
     assert (
         "scenarios that only one of both runs has are left out: 1 of first, 0 of second"
-        in said.stdout
+        in result.stdout
     )
 
 
 def test_invalid_arguments_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
     """A single run, an unknown format, and an unwritable folder are refused."""
     one, other = str(runs / "a"), str(runs / "b")
-    said = cosim("compare", one)
+    result = cosim("compare", one)
     assert (
-        said.returncode == 2
-        and "a comparison needs two runs or more: cosim compare RUN OTHER ..." in said.stderr
+        result.returncode == 2
+        and "a comparison needs two runs or more: cosim compare RUN OTHER ..." in result.stderr
     )
-    said = cosim("compare", one, other, "-o", "table.pdf")
+    result = cosim("compare", one, other, "-o", "table.pdf")
     assert (
-        said.returncode == 2
-        and "table.pdf: its name must end in .csv, .png, .md, .tex" in said.stderr
+        result.returncode == 2
+        and "table.pdf: its name must end in .csv, .png, .md, .tex" in result.stderr
     )
-    said = cosim("compare", one, other, "--by", "city")
-    assert said.returncode == 2 and "unknown axis of --by 'city'" in said.stderr
-    said = cosim("compare", one, other, "-o", str(tmp_path / "gone/table.md"))
+    result = cosim("compare", one, other, "--by", "city")
+    assert result.returncode == 2 and "unknown axis of --by 'city'" in result.stderr
+    result = cosim("compare", one, other, "-o", str(tmp_path / "gone/table.md"))
     assert (
-        said.returncode == 3
-        and "gone/table.md: cannot be written: No such file or directory" in said.stderr
+        result.returncode == 3
+        and "gone/table.md: cannot be written: No such file or directory" in result.stderr
     )

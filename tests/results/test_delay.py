@@ -26,13 +26,13 @@ from cosim.spec.robot import COURIER
 def tracks(*ways: list[float]) -> Tracks:
     """Tracks of people c0, c1, ... on lines 20 m apart at these x, tick by tick; all of equal
     length."""
-    told = Tracks()
+    result = Tracks()
     for xs in zip(*ways, strict=True):
         n = len(xs)
         names = tuple(f"c{i}" for i in range(n))
         xy = [(x, 20.0 * i) for i, x in enumerate(xs)]
-        told.add(People.of(names, xy, np.zeros(n), np.zeros(n), ("walk",) * n))
-    return told
+        result.add(People.of(names, xy, np.zeros(n), np.zeros(n), ("walk",) * n))
+    return result
 
 
 WALK = [0.05 * k for k in range(201)]

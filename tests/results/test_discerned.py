@@ -105,16 +105,16 @@ def test_without_the_other_member_there_is_no_pair(runs: Path) -> None:
 
 def test_files_record_the_event_of_a_decoy(runs: Path) -> None:
     """record.json and results.csv have the column, so that no table needs the suite."""
-    told = json.loads((runs / "a/episodes/lateral-000-decoy/record.json").read_bytes())
-    assert told["decoy_of"] == "lateral-000"
+    fields = json.loads((runs / "a/episodes/lateral-000-decoy/record.json").read_bytes())
+    assert fields["decoy_of"] == "lateral-000"
     rows = pd.read_csv(runs / "a/results.csv").set_index("scenario")["decoy_of"]
     assert rows["lateral-000-decoy"] == "lateral-000" and pd.isna(rows["lateral-000"])
 
 
 def test_a_run_shows_d_beside_sr(runs: Path, cosim: Cosim) -> None:
     """D is shown over all and per kind with its pairs and exclusions, and not without decoys."""
-    said = cosim("show", str(runs / "a"))
-    lines = [" ".join(line.replace("│", " ").split()) for line in said.stdout.splitlines()]
+    result = cosim("show", str(runs / "a"))
+    lines = [" ".join(line.replace("│", " ").split()) for line in result.stdout.splitlines()]
     text = " ".join(" ".join(lines).split())
     assert any(line.startswith("discerned (D) 0.50") and line.endswith("8") for line in lines)
     assert "decoys count in D alone, over 8 pairs; left out: 2 with an invalid member" in text
@@ -122,23 +122,23 @@ def test_a_run_shows_d_beside_sr(runs: Path, cosim: Cosim) -> None:
     assert "of all rows 10 are decoys" in text
     assert any(line.startswith("lateral 4 3/4 - 1/4 - 4") for line in lines), lines
     assert "decoy" not in cosim("show", str(runs / "events")).stdout.replace("of decoys: go", "")
-    said = cosim("show", str(runs / "a"), "--episode", "lateral-000-decoy")
-    assert said.stdout.startswith("lateral-000-decoy (decoy of lateral-000): done goal"), said
+    result = cosim("show", str(runs / "a"), "--episode", "lateral-000-decoy")
+    assert result.stdout.startswith("lateral-000-decoy (decoy of lateral-000): done goal"), result
 
 
 def test_a_comparison_pairs_the_pairs(runs: Path, tmp_path: Path) -> None:
     """D is compared over common pairs, for the suite and each kind; SR is over events; exports have
     both."""
-    told = compare_runs([runs / "a", runs / "b"])
-    rows = told.differences.set_index(["metric", "group"])
+    comparison = compare_runs([runs / "a", runs / "b"])
+    rows = comparison.differences.set_index(["metric", "group"])
     whole = rows.loc[("discerned", "reactive")]
     assert (whole["n"], whole["value_before"], whole["value_after"]) == (8, 0.5, 1.0)
     assert rows.loc[("discerned", "lateral"), "changed"] == 3
     assert (
         rows.loc[("success", "reactive"), "n"] == 10 and rows.loc[("success", "static"), "n"] == 1
     )
-    assert "a: D is over 8 pairs; left out: 2 with an invalid member" in told.notes
-    for text in (as_markdown(told), as_latex(told)):
+    assert "a: D is over 8 pairs; left out: 2 with an invalid member" in comparison.notes
+    for text in (as_markdown(comparison), as_latex(comparison)):
         assert "discerned" in text and "D share of events solved with their decoys" in text
         assert any("lateral" in line and " D " in line for line in text.splitlines())
 
@@ -169,7 +169,7 @@ def test_a_report_has_d_in_tables_and_a_plot(runs: Path) -> None:
 
 def refused(runs: Sequence[Path], target: Path) -> dict[str, str]:
     """Return the refusals of a comparison, a report and a merge of runs."""
-    said = {}
+    refusals = {}
     for name, of in (
         ("compare", lambda: compare_runs(runs)),
         ("report", lambda: read_runs(runs)),
@@ -177,17 +177,17 @@ def refused(runs: Sequence[Path], target: Path) -> dict[str, str]:
     ):
         with pytest.raises(RunError) as caught:
             of()
-        said[name] = str(caught.value)
-    return said
+        refusals[name] = str(caught.value)
+    return refusals
 
 
 def test_runs_of_the_former_suite_are_refused(runs: Path, tmp_path: Path) -> None:
     """Comparison, report and merge refuse a suite without decoys, with both hashes or the differing
     field."""
-    said = refused([runs / "b", runs / "events"], tmp_path / "merged")
-    assert "run both on the same version of it (former suite, edited" in said["compare"]
-    assert "are of different suites 'reactive'" in said["report"]
-    assert "its suite_hash is" in said["merge"]
+    refusals = refused([runs / "b", runs / "events"], tmp_path / "merged")
+    assert "run both on the same version of it (former suite, edited" in refusals["compare"]
+    assert "are of different suites 'reactive'" in refusals["report"]
+    assert "its suite_hash is" in refusals["merge"]
     assert not (tmp_path / "merged").exists()
 
 

@@ -62,12 +62,12 @@ def test_a_run_of_another_schema_is_refused_by_every_command(
     """File, schema, readable schema and remedy are named, the exit code is 2, and the folder is
     unchanged."""
     before = sorted(path.name for path in (runs / "run").iterdir())
-    said = cosim(*words, cwd=runs)
-    told = (
+    result = cosim(*words, cwd=runs)
+    expected = (
         "run.json: run schema 99, and this version reads 1: use the version of cosim that made "
         "the run"
     )
-    assert said.returncode == 2 and told in said.stderr.splitlines()[-1], said
+    assert result.returncode == 2 and expected in result.stderr.splitlines()[-1], result
     assert (
         before == sorted(path.name for path in (runs / "run").iterdir())
         and not (runs / "both").exists()
@@ -78,19 +78,19 @@ def test_a_run_that_never_began_cannot_be_resumed(tmp_path: Path, cosim: Cosim) 
     """A run that was stopped before its folder existed or was written is refused with how to begin
     it."""
     words = ("run", "reactive", "--policy", "straight", "--episodes", "1", "--out")
-    said = cosim(*words, "mine", "--resume", "--seed", "1", cwd=tmp_path)
-    told = "mine: no run has begun there, so there is nothing to resume: give the command of the run without"
-    assert said.returncode == 2 and told in said.stderr.splitlines()[-1], said
+    result = cosim(*words, "mine", "--resume", "--seed", "1", cwd=tmp_path)
+    expected = "mine: no run has begun there, so there is nothing to resume: give the command of the run without"
+    assert result.returncode == 2 and expected in result.stderr.splitlines()[-1], result
     (tmp_path / "half" / "episodes").mkdir(parents=True)
     (tmp_path / "half" / "lock").touch()
-    said = cosim(*words, "half", "--resume", cwd=tmp_path)
+    result = cosim(*words, "half", "--resume", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "half: no run has begun there" in said.stderr.splitlines()[-1]
-    ), said
-    said = cosim("show", "half", cwd=tmp_path)
+        result.returncode == 2 and "half: no run has begun there" in result.stderr.splitlines()[-1]
+    ), result
+    result = cosim("show", "half", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "half: no run has begun there" in said.stderr.splitlines()[-1]
-    ), said
+        result.returncode == 2 and "half: no run has begun there" in result.stderr.splitlines()[-1]
+    ), result
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["a-pipe", "a-folder"])
@@ -98,10 +98,10 @@ def test_a_run_json_that_is_no_file_is_refused(tmp_path: Path, cosim: Cosim, mak
     """It is refused without waiting for it."""
     (tmp_path / "run").mkdir()
     make(tmp_path / "run" / "run.json")  # type: ignore[operator]
-    said = cosim("show", "run", cwd=tmp_path)
-    assert said.returncode == 2 and "run.json: cannot be read: is no regular file" in said.stderr, (
-        said
-    )
+    result = cosim("show", "run", cwd=tmp_path)
+    assert (
+        result.returncode == 2 and "run.json: cannot be read: is no regular file" in result.stderr
+    ), result
 
 
 def test_ctrl_c_before_a_run_began_reports_that_nothing_is_saved(
@@ -113,20 +113,21 @@ def test_ctrl_c_before_a_run_began_reports_that_nothing_is_saved(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("scenarios.runs.run.planned_run", interrupted)
-    said = cosim("run", "reactive", "--policy", "straight", "--out", "mine", cwd=tmp_path)
+    result = cosim("run", "reactive", "--policy", "straight", "--out", "mine", cwd=tmp_path)
     assert (
-        said.returncode == 130 and "Stopped before the run began: mine holds nothing" in said.stderr
-    ), said
+        result.returncode == 130
+        and "Stopped before the run began: mine holds nothing" in result.stderr
+    ), result
 
 
 def test_a_run_whose_events_never_triggered_has_no_sheet(tmp_path: Path, cosim: Cosim) -> None:
     """A line replaces the table, also where the scenarios have no events."""
     run_of(tmp_path / "run", ["goal"])
-    said = cosim("show", "run", "--events", cwd=tmp_path)
-    assert (said.returncode, said.stdout) == (
+    result = cosim("show", "run", "--events", cwd=tmp_path)
+    assert (result.returncode, result.stdout) == (
         0,
         "No event of this run's episodes was triggered.\n",
-    ), said
+    ), result
 
 
 def test_an_unreadable_results_table_is_refused(tmp_path: Path, cosim: Cosim) -> None:
@@ -134,11 +135,11 @@ def test_an_unreadable_results_table_is_refused(tmp_path: Path, cosim: Cosim) ->
     run = run_of(tmp_path / "run", ["goal"])
     for content in (b"scenario\n" + b"9" * 200_000, b'scenario\n"a\0b\n', b"\xff\xfe"):
         (run / "results.csv").write_bytes(content)
-        said = cosim("score", "run", cwd=tmp_path)
+        result = cosim("score", "run", cwd=tmp_path)
         assert (
-            said.returncode == 2
-            and "results.csv: not the table of this run: remove it" in said.stderr
-        ), said
+            result.returncode == 2
+            and "results.csv: not the table of this run: remove it" in result.stderr
+        ), result
 
 
 def test_unreadable_attempts_are_ignored(tmp_path: Path) -> None:

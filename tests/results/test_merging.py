@@ -110,11 +110,11 @@ def test_a_killed_shard_is_read_without_changes(tmp_path: Path) -> None:
 def test_missing_scenarios_are_named_and_can_be_run(tmp_path: Path, cosim: Cosim) -> None:
     """A merge without one shard names its scenarios, writes no results.csv, and can be resumed."""
     parts = shards(tmp_path, 3)
-    said = cosim("merge", str(parts[0]), str(parts[2]), "--out", str(tmp_path / "merged"))
-    assert said.returncode == 1
+    result = cosim("merge", str(parts[0]), str(parts[2]), "--out", str(tmp_path / "merged"))
+    assert result.returncode == 1
     assert (
         "2 scenarios are missing: s-001, s-004: give the command of the run without --shard"
-        in said.stderr
+        in result.stderr
     )
     assert not (tmp_path / "merged/results.csv").exists()
     with RunFolder.resume(tmp_path / "merged", SPEC) as folder:
@@ -144,12 +144,12 @@ def test_different_episodes_of_a_scenario_are_a_conflict(
         else:
             log.pose[0, 2] += 1e-16
         folder.write_episode(record, log.encoded())
-    said = cosim("merge", *map(str, parts), str(other), "--out", str(tmp_path / "merged"))
-    assert said.returncode == 2 and not (tmp_path / "merged").exists()
-    assert f"CONFLICT: {other} and {parts[0]} have different episodes of 's-002'" in said.stderr
+    result = cosim("merge", *map(str, parts), str(other), "--out", str(tmp_path / "merged"))
+    assert result.returncode == 2 and not (tmp_path / "merged").exists()
+    assert f"CONFLICT: {other} and {parts[0]} have different episodes of 's-002'" in result.stderr
     assert (
         "state_hash is 'f00'" if what == "record" else "trajectory.npz is another one"
-    ) in said.stderr
+    ) in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -185,11 +185,11 @@ def test_folders_of_different_runs_are_refused(
     theirs = finished_run(
         tmp_path / "theirs", changed(SPEC, shard=Shard(2, 2), **{field: value}), WAYS[1:2]
     )
-    said = cosim("merge", str(mine), str(theirs), "--out", str(tmp_path / "merged"))
+    result = cosim("merge", str(mine), str(theirs), "--out", str(tmp_path / "merged"))
     assert (
-        said.returncode == 2
-        and f"{theirs} is of another run than {mine}" in said.stderr
-        and words in said.stderr
+        result.returncode == 2
+        and f"{theirs} is of another run than {mine}" in result.stderr
+        and words in result.stderr
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "theirs"]
 
@@ -242,9 +242,9 @@ def test_every_scenario_is_in_exactly_one_shard() -> None:
 
 def test_a_shard_needs_the_seed_of_its_run(cosim: Cosim) -> None:
     """A seed drawn for each shard would give another run."""
-    said = cosim("run", "reactive", "--policy", "straight", "--shard", "1/2")
-    assert said.returncode == 2 and "--shard needs --seed: shards are of one run" in " ".join(
-        said.stderr.split()
+    result = cosim("run", "reactive", "--policy", "straight", "--shard", "1/2")
+    assert result.returncode == 2 and "--shard needs --seed: shards are of one run" in " ".join(
+        result.stderr.split()
     )
 
 

@@ -238,12 +238,12 @@ def test_out_of_lane_is_exact_at_every_step_across_the_edge() -> None:
     rng = np.random.default_rng(6)
     one = referee()
     y_m = 0.0
-    told = []
+    failed = []
     for tick in range(800):
         y_m = float(np.clip(y_m + rng.normal(0.0, 0.3) * rng.random() ** 3, -2.3, 2.3))
-        told.append(bool(one.judge(step(tick, 20.0 + 0.05 * tick, y_m)).failures))
-        assert told[-1] is not AREA.contains(20.0 + 0.05 * tick, y_m)
-    assert 50 < sum(told) < 750
+        failed.append(bool(one.judge(step(tick, 20.0 + 0.05 * tick, y_m)).failures))
+        assert failed[-1] is not AREA.contains(20.0 + 0.05 * tick, y_m)
+    assert 50 < sum(failed) < 750
 
 
 def test_freezing_is_half_a_metre_in_ten_seconds() -> None:

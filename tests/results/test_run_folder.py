@@ -294,16 +294,16 @@ def test_run_json_and_record_json_are_flat_and_tolerate_missing_keys(
             msgspec.structs.replace(record("s-0"), setup=spec.setup, manifest=spec.manifest), LOG
         )
     path = tmp_path / "run/episodes/s-0/record.json"
-    told = [json.loads((tmp_path / "run/run.json").read_text()), json.loads(path.read_text())]
+    files = [json.loads((tmp_path / "run/run.json").read_text()), json.loads(path.read_text())]
     assert read_spec(tmp_path / "run") == spec and Record.load(path).setup == spec.setup
-    for file in told:
+    for file in files:
         assert (
             not file.keys() & {"setup", "manifest"}
             and file["camera"]["width"] == 64
             and file["latency_ms"] == 50.0
         )
-    assert set(RunSetup.__struct_fields__) <= told[0].keys()
-    assert (told[0]["seed"], told[0]["policy"], told[0]["policy_name"], told[1]["policy"]) == (
+    assert set(RunSetup.__struct_fields__) <= files[0].keys()
+    assert (files[0]["seed"], files[0]["policy"], files[0]["policy_name"], files[1]["policy"]) == (
         0,
         "p",
         "p",
@@ -320,9 +320,9 @@ def test_run_json_and_record_json_are_flat_and_tolerate_missing_keys(
         "metric_schema",
     }
     (tmp_path / "run/run.json").write_text(
-        json.dumps({key: told[0][key] for key in told[0].keys() - later})
+        json.dumps({key: files[0][key] for key in files[0].keys() - later})
     )
-    path.write_text(json.dumps({key: told[1][key] for key in told[1].keys() - later}))
+    path.write_text(json.dumps({key: files[1][key] for key in files[1].keys() - later}))
     old = Record.load(path)
     assert read_spec(tmp_path / "run").manifest.camera is old.manifest.camera is None
     assert (old.setup.latency_ms, old.setup.metric_schema, old.scenario) == (
@@ -330,7 +330,7 @@ def test_run_json_and_record_json_are_flat_and_tolerate_missing_keys(
         0,
         record("s-0").scenario,
     )
-    path.write_text(json.dumps(told[1] | {"suite_hash": 5}))
+    path.write_text(json.dumps(files[1] | {"suite_hash": 5}))
     with pytest.raises(
         RunError,
         match=r"record\.json: not an episode record: Expected `str`, got `int` - at `\$\.suite_h",
@@ -484,7 +484,7 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
         with RunFolder.create(tmp_path / name, SPEC, SUITE):
             pass
     (tmp_path / "file").touch()
-    for name, told in (
+    for name, expected in (
         ("other", "unknown run '{run}'. Valid choices: {beside}/mine. Did you mean"),
         (
             "runs",
@@ -494,7 +494,7 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
         ("file", "{run} is no run folder: a file is there, and a run is a folder with run.json"),
     ):
         with pytest.raises(
-            UsageError, match=re.escape(told.format(run=tmp_path / name, beside=tmp_path))
+            UsageError, match=re.escape(expected.format(run=tmp_path / name, beside=tmp_path))
         ):
             read_records(tmp_path / name)
 
@@ -506,11 +506,11 @@ def test_a_run_path_through_a_file_is_refused_with_an_alternative(
     """That file is named, and a place beside it."""
     (tmp_path / "file").touch()
     path = tmp_path / "file" / below
-    told = (
+    expected = (
         f"{path}: cannot be written: {tmp_path / 'file'} is a file, no folder: choose a path "
         f"next to it, like "
     )
-    with pytest.raises(MachineError, match=re.escape(f"{told}{tmp_path / below}")):
+    with pytest.raises(MachineError, match=re.escape(f"{expected}{tmp_path / below}")):
         RunFolder.create(path, SPEC, SUITE).__enter__()
 
 
@@ -545,9 +545,10 @@ def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
     outcome."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as held:
         held.write_episode(record("s-0", status="crashed"))
-    said = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
+    result = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "episode 's-0' is crashed: it has no track to draw" in said.stderr
+        result.returncode == 2
+        and "episode 's-0' is crashed: it has no track to draw" in result.stderr
     )
     assert not (tmp_path / "above.png").exists()
     assert cosim("show", "run", "--episode", "s-0", cwd=tmp_path).returncode == 0

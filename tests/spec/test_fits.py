@@ -95,7 +95,7 @@ def test_a_fitting_scenario_has_no_faults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         (
             {"route": ((-30.0, 1.8), (0.0, 0.0), (30.0, 0.0))},
@@ -167,9 +167,11 @@ def test_a_fitting_scenario_has_no_faults() -> None:
         "obstacle-on-goal",
     ],
 )
-def test_a_fault_is_named_with_its_place(changes: dict[str, Any], told: str) -> None:
+def test_a_fault_is_named_with_its_place(changes: dict[str, Any], expected: str) -> None:
     """The message has field, number or id, and position."""
-    assert list(misfits([from_west_to_east(**changes)], crossroads())) == [f"scenario 's': {told}"]
+    assert list(misfits([from_west_to_east(**changes)], crossroads())) == [
+        f"scenario 's': {expected}"
+    ]
 
 
 def test_a_density_respects_the_limit_of_people(
@@ -213,10 +215,10 @@ def test_every_place_is_read_once_and_all_faults_are_reported(
         for name, one, seed in (("fine", fine, 1), ("odd", odd, 2))
     )
     whole = Suite(name="w", version="1", scenarios=scenarios)
-    with pytest.raises(SpecError) as told:
+    with pytest.raises(SpecError) as caught:
         check_places(whole, scenarios)
     assert made == [1, 2]
-    head, *faults = str(told.value).splitlines()
+    head, *faults = str(caught.value).splitlines()
     assert head == "suite 'w': 5 faults:"
     assert f"unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}" in faults[0]
     assert "hdri 'nowhere.hdr' does not exist" in faults[1]
@@ -232,13 +234,13 @@ def test_several_processes_report_the_same_faults() -> None:
         for i, at in enumerate(where)
     )
     whole = Suite(name="w", version="1", scenarios=lost)
-    told = []
+    messages = []
     for jobs in (1, 2):
         with pytest.raises(SpecError) as refusal:
             check_places(whole, lost, jobs=jobs)
-        told.append(str(refusal.value))
+        messages.append(str(refusal.value))
     assert (
-        told[0] == told[1]
-        and "16 faults" in told[0]
-        and "scenario 's4': unknown map 'nowhere-4'" in told[0]
+        messages[0] == messages[1]
+        and "16 faults" in messages[0]
+        and "scenario 's4': unknown map 'nowhere-4'" in messages[0]
     )

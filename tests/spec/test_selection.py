@@ -160,13 +160,15 @@ def test_nothing_that_a_policy_gets_reveals_a_decoy(reactive: Suite) -> None:
     """Ids, seeds and order of a pair are independent: over many run seeds each puts the decoy first
     half the time."""
     pairs = [pair for pair in pairs_of(with_decoys_of(reactive).scenarios) if len(pair) == 2]
-    told = [[episode_id_of(seed, one) for one in pair] for seed in range(250) for pair in pairs]
+    pseudonyms = [
+        [episode_id_of(seed, one) for one in pair] for seed in range(250) for pair in pairs
+    ]
     drawn = [
         [[seed_for(purpose, seed, one) for one in pair] for seed in range(250) for pair in pairs]
         for purpose in ("policy", "goal", "odometry")
     ]
-    assert drawn[0] == [[one.seed for one in pair] for pair in told]
-    for values in (told, *drawn):
+    assert drawn[0] == [[one.seed for one in pair] for pair in pseudonyms]
+    for values in (pseudonyms, *drawn):
         decoy_first = sum(decoy < event for event, decoy in values)
         assert 900 < decoy_first < 1100
-    assert all(len(one.episode) == 12 for pair in told for one in pair)
+    assert all(len(one.episode) == 12 for pair in pseudonyms for one in pair)

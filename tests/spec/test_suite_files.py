@@ -40,9 +40,9 @@ def valid_suite() -> dict[str, Any]:
 def refusal(path: Path, data: bytes | str) -> str:
     """Return the refusal of a file with this content, without the file's name."""
     path.write_bytes(data if isinstance(data, bytes) else data.encode())
-    with pytest.raises(SpecError) as told:
+    with pytest.raises(SpecError) as caught:
         read_suite(path, EVENT_KINDS)
-    message = str(told.value)
+    message = str(caught.value)
     assert message.startswith(f"{path}: ")
     return message.removeprefix(f"{path}: ")
 
@@ -58,13 +58,13 @@ def test_a_thousand_mutated_suites_are_read_or_refused_with_reasons(tmp_path: Pa
             read_suite(path, EVENT_KINDS)
             accepted += 1
         except SpecError as error:
-            told = str(error).removeprefix(f"{path}: ")
-            lines = told.splitlines()
+            message = str(error).removeprefix(f"{path}: ")
+            lines = message.splitlines()
             assert len(lines) <= 6 and all(
                 line.isprintable() and len(line) <= 500 for line in lines
-            ), (seed, told)
+            ), (seed, message)
             faults = lines[1:] if len(lines) > 1 else lines
-            assert all(PLACE.search(line) for line in faults), (seed, told)
+            assert all(PLACE.search(line) for line in faults), (seed, message)
     assert 100 < accepted < 600
 
 
@@ -171,16 +171,16 @@ OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
     ),
     (("first", "ends_at"), "stop", "ends_at 'stop' needs an event 'gesturing'"),
 )
-"""Where in the file (`first`: in its first scenario), what stands there, and what is said of it."""
+"""Where in the file (`first`: in its first scenario), its value, and the expected message."""
 
 
 @pytest.mark.parametrize(
-    ("where", "value", "told"),
+    ("where", "value", "expected"),
     OUT_OF_RANGE,
     ids=[".".join(map(str, where)) for where, _, _ in OUT_OF_RANGE],
 )
 def test_a_value_out_of_its_range_is_named(
-    tmp_path: Path, where: tuple[str | int, ...], value: object, told: str
+    tmp_path: Path, where: tuple[str | int, ...], value: object, expected: str
 ) -> None:
     """The message has field, range and value, also for numbers that JSON lacks, such as NaN."""
     whole: Any = valid_suite()
@@ -189,7 +189,7 @@ def test_a_value_out_of_its_range_is_named(
     for step in holders:
         holder = holder["scenarios"][0] if step == "first" else holder[step]
     holder[key] = value
-    assert told in refusal(tmp_path / "s.json", json.dumps(whole))
+    assert expected in refusal(tmp_path / "s.json", json.dumps(whole))
 
 
 def test_several_faults_are_reported_at_once(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> Non
     """A file that is cut off, not UTF-8, or nested endlessly is refused with line and byte, or the
     general fault."""
     text = json.dumps(valid_suite(), indent=1).encode()
-    told = {
+    expected = {
         text[: text.index(b'"version"')]: "JSON ends too early, line 3, byte 1 of it",
         text.replace(
             b'"version"', b",", 1
@@ -229,7 +229,7 @@ def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> Non
         b"": "JSON ends too early, line 1, byte 0 of it",
         b"[]": "Expected `object`, got `array`",
     }
-    for data, words in told.items():
+    for data, words in expected.items():
         assert refusal(tmp_path / "s.json", data).startswith(words)
     (tmp_path / "s.json").write_bytes(b"\xef\xbb\xbf" + text)
     assert read_suite(tmp_path / "s.json").name == "sound"

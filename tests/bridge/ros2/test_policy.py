@@ -88,8 +88,8 @@ def test_a_node_drives_in_lockstep(at: str) -> None:
         assert stamps == 2 * [10**9, 11 * 10**8, 12 * 10**8]
         clock = [messages.ns_of(one.clock) for one in peer.seen["/clock"]]
         assert clock == 2 * [10**9 + 5 * 10**7 * tick for tick in range(5)]
-        told = [msgspec.json.decode(one.data) for one in peer.seen["/cosim/episode"]]
-        assert [(one["episode"], one["seed"], one["reset"]) for one in told] == [
+        announced = [msgspec.json.decode(one.data) for one in peer.seen["/cosim/episode"]]
+        assert [(one["episode"], one["seed"], one["reset"]) for one in announced] == [
             ("k1", 7, False),
             ("k2", 7, False),
         ]

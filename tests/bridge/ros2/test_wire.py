@@ -201,9 +201,11 @@ def test_a_goal_is_sent_when_it_changes() -> None:
     assert topic == "/goal_pose"
     assert messages.new_goal(seen(goal=PointGoal(10.1, 2.0)), sent, NOW_NS)[1] == ""
     assert messages.new_goal(seen(goal=PointGoal(12.0, 2.0)), sent, NOW_NS)[1] == "/goal_pose"
-    told, topic, message = messages.new_goal(seen(goal=Instruction("Go.")), sent, NOW_NS)
+    sent_instruction, topic, message = messages.new_goal(
+        seen(goal=Instruction("Go.")), sent, NOW_NS
+    )
     assert (topic, message.data) == ("/cosim/instruction", "Go.")
-    assert messages.new_goal(seen(goal=Instruction("Go.")), told, NOW_NS)[1] == ""
+    assert messages.new_goal(seen(goal=Instruction("Go.")), sent_instruction, NOW_NS)[1] == ""
 
 
 def twist(v_mps: float, w_radps: float, stamp_ns: int | None = None) -> Received:

@@ -54,7 +54,7 @@ def test_the_command_creates_shows_and_never_overwrites(tmp_path: Path, cosim: C
     ):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = (folder / "coordinator" / "cert.pem").read_bytes()
-    for words, said in {
+    for words, expected in {
         ("init", str(folder)): "is not empty",
         ("role", str(folder), "coordinator"): "--renew replaces it",
         ("role", str(folder), "guest"): "Valid choices: coordinator, director",
@@ -65,7 +65,7 @@ def test_the_command_creates_shows_and_never_overwrites(tmp_path: Path, cosim: C
         ("show", str(tmp_path)): "holds no certificate",
     }.items():
         refused = cosim("certs", *words)
-        assert refused.returncode == 2 and said in refused.stderr, refused.stderr
+        assert refused.returncode == 2 and expected in refused.stderr, refused.stderr
     assert (folder / "coordinator" / "cert.pem").read_bytes() == before
     assert cosim("certs", "role", str(folder), "coordinator", "--renew").returncode == 0
     assert (folder / "coordinator" / "cert.pem").read_bytes() != before
@@ -130,8 +130,8 @@ def test_the_end_of_a_certificate_is_announced_30_days_before(made: Path) -> Non
         end = open_end(made, role)  # type: ignore[arg-type]
         assert checked_identity(end, NOW) == ""
         assert (
-            "expires on" in (said := checked_identity(end, NOW + timedelta(days=350)))
-            and "--renew" in said
+            "expires on" in (warning := checked_identity(end, NOW + timedelta(days=350)))
+            and "--renew" in warning
         )
         with pytest.raises(AccessError, match=r"has expired on .*--renew"):
             checked_identity(end, NOW + timedelta(days=366))
@@ -180,10 +180,13 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
             settings, "CONNECTS_WITHIN_S", 0.1
         )  # what is refused is so however long it is tried
         assert (
-            "the certificate of tls/localhost" in (said := tried(at, other / "worker"))
-            and "another authority" in said
+            "the certificate of tls/localhost" in (reason := tried(at, other / "worker"))
+            and "another authority" in reason
         )
-        assert "refused us" in (said := tried(at, trusting)) and "than the one there trusts" in said
+        assert (
+            "refused us" in (reason := tried(at, trusting))
+            and "than the one there trusts" in reason
+        )
         assert "is not for the address 127.0.0.1" in tried(
             at.replace("localhost", "127.0.0.1"), made / "worker"
         )

@@ -43,7 +43,7 @@ def test_no_endpoint_is_open_to_other_machines_by_default(
     beyond = "tcp/10.0.0.7:7447"
     guarded = "tls/10.0.0.7:7447"
     files = str(tmp_path / "none")
-    for more, said in {
+    for more, expected in {
         (beyond,): f"Use {guarded} with --tls FOLDER (`cosim certs` makes it), or say --insecure",
         (
             guarded,
@@ -61,7 +61,7 @@ def test_no_endpoint_is_open_to_other_machines_by_default(
         (guarded, "--tls", files, "--insecure"): "--tls guards and --insecure does not",
     }.items():
         refused = cosim(*words, *more)
-        assert refused.returncode == 2 and said in refused.stderr, refused.stderr
+        assert refused.returncode == 2 and expected in refused.stderr, refused.stderr
 
 
 @pytest.mark.engine
@@ -69,10 +69,10 @@ def test_insecure_explains_itself_in_one_line(cosim: Cosim) -> None:
     """Both the listening and the connecting command print the meaning of --insecure on standard
     error."""
     port = free_port()
-    said = list[str]()
+    lines = list[str]()
     open_to_all = Connection(role="coordinator", listen=f"tcp/0.0.0.0:{port}", insecure=True)
-    with open_session(open_to_all, said.append):
-        (line,) = said
+    with open_session(open_to_all, lines.append):
+        (line,) = lines
         assert line.startswith(
             f"--insecure: anyone who can reach tcp/0.0.0.0:{port} may watch, inject pedestrians, take"
         )

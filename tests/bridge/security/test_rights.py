@@ -62,7 +62,7 @@ def replies(session: zenoh.Session, key: str) -> list[str]:
     got = session.get(
         key, payload=OWN, timeout=PATIENCE_S, consolidation=zenoh.ConsolidationMode.NONE
     )
-    return [said.payload.to_string() for one in got if (said := one.ok or one.err) is not None]
+    return [answer.payload.to_string() for one in got if (answer := one.ok or one.err) is not None]
 
 
 class Air:
@@ -181,7 +181,7 @@ def try_all(
         guest.session.delete(key)
     guest.passed(may_ask)
     assert {key for key in air.seen if "/mark" not in key} <= set(may_ask[:1])
-    # to hear what is told, and what is asked of a policy
+    # to receive messages of the run and queries of a policy
     guest.heard.clear()
     for key in TOLD:
         air.run.publish_lossy(key, b"true")
@@ -292,9 +292,9 @@ def test_only_runs_may_query_the_copied_policy_server(certs: Path) -> None:
         begin = b"\x85\xa4type\xa5reset\xa3run\xa1r\xa7episode\xa1e\xa7attempt\xa1a\xa4seed\x00"
         (wide,) = guests["worker"].get(info.replace("info", "reset"), payload=begin)
         assert b"not a question" in wide.err.payload.to_bytes()
-        (told,) = guests["worker"].get(info)
+        (reply,) = guests["worker"].get(info)
         (begun,) = guests["worker"].get(
-            str(told.ok.key_expr).replace("info", "reset"), payload=begin
+            str(reply.ok.key_expr).replace("info", "reset"), payload=begin
         )
         assert (
             b"begun" in begun.ok.payload.to_bytes() and server.stdout.readline() == "reset of e\n"

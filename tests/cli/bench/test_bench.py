@@ -52,25 +52,25 @@ def test_compare_shows_the_figures_of_both_checkouts(tmp_path: Path, cosim: Cosi
         "'elsewhere': 1.0}\nPath(sys.argv[3]).write_text(json.dumps([{'name': k, 'value': v} for "
         "k, v in figures.items()]))"
     )
-    said = cosim("bench", "--only", "places", "--rounds", "1", "--compare", str(other))
-    assert said.returncode == 0, said.stderr
-    (row,) = [line.split() for line in said.stdout.splitlines() if "shortest walk" in line]
+    result = cosim("bench", "--only", "places", "--rounds", "1", "--compare", str(other))
+    assert result.returncode == 0, result.stderr
+    (row,) = [line.split() for line in result.stdout.splitlines() if "shortest walk" in line]
     assert float(row[4]) == 1e9 and float(row[5]) == 0.0
-    assert "elsewhere" not in said.stdout and "point in the walkable area" not in said.stdout
+    assert "elsewhere" not in result.stdout and "point in the walkable area" not in result.stdout
 
 
 def test_unknown_measurements_and_checkouts_are_refused(tmp_path: Path, cosim: Cosim) -> None:
     """An unknown measurement and a folder that is no checkout are named before anything is
     measured."""
-    said = cosim("bench", "--only", "drivin")
+    result = cosim("bench", "--only", "drivin")
     assert (
-        said.returncode == 2
-        and "Did you mean driving?" in said.stderr
-        and "street 50" in said.stderr
+        result.returncode == 2
+        and "Did you mean driving?" in result.stderr
+        and "street 50" in result.stderr
     )
-    said = cosim("bench", "--compare", str(tmp_path))
+    result = cosim("bench", "--compare", str(tmp_path))
     assert (
-        said.returncode == 2
-        and str(tmp_path) in said.stderr
-        and "scenarios/tools/bench/take.py" in said.stderr
+        result.returncode == 2
+        and str(tmp_path) in result.stderr
+        and "scenarios/tools/bench/take.py" in result.stderr
     )

@@ -119,9 +119,9 @@ def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim
     street_map = place(city)[1]
     scenario: Scenario = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     write_suite(Suite(name="tiny", version="1", scenarios=(scenario,)), tmp_path / "tiny.json")
-    said = cosim("export", "t-0", "street.glb", "--suite", "tiny.json", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
-    assert "building tiles ..." in said.stderr and said.stdout.startswith(
+    result = cosim("export", "t-0", "street.glb", "--suite", "tiny.json", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "building tiles ..." in result.stderr and result.stdout.startswith(
         "Street: street.glb (t-0, "
     )
     ground = ground_of(tmp_path / "street.glb")
@@ -161,8 +161,8 @@ def test_the_robot_of_a_run_is_exported_with_its_legs(
     write_suite(Suite(name="one", version="1", scenarios=(way,)), tmp_path / "one.json")
     words = ("one.json", "--policy", "straight", "--robot", "dog")
     assert cosim("run", *words, "--out", "dog", cwd=tmp_path).returncode == 0
-    said = cosim("export", "way", "dog.glb", "--run", "dog", "--at", "4", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim("export", "way", "dog.glb", "--run", "dog", "--at", "4", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     body = robot_of(tmp_path / "dog.glb")
     log = Log.load(tmp_path / "dog" / "episodes" / "way" / "trajectory.npz")
     assert body.mean(axis=0)[:2] == pytest.approx(log.pose[79, :2], abs=0.1)
@@ -196,6 +196,6 @@ def test_invalid_export_requests_are_refused_before_the_build(tmp_path: Path, co
         ("lh-011-00", "a.glb", "--run", "no"): (2, "no"),
     }
     for words, (code, message) in asked.items():
-        said = cosim("export", *words, cwd=tmp_path)
-        assert (said.returncode, said.stdout) == (code, "") and message in said.stderr, said
+        result = cosim("export", *words, cwd=tmp_path)
+        assert (result.returncode, result.stdout) == (code, "") and message in result.stderr, result
     assert not list(tmp_path.iterdir())

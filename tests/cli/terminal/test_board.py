@@ -40,22 +40,22 @@ def board_of(
     scenarios: tuple, done: tuple[str, ...] = (), **options: object
 ) -> tuple[ProgressDisplay, Clock, io.StringIO]:
     clock = Clock()
-    said = io.StringIO()
-    console = Console(file=said, width=80)
+    output = io.StringIO()
+    console = Console(file=output, width=80)
     return (
         ProgressDisplay(scenarios, set(done), console=console, clock=clock, **options),
         clock,
-        said,
+        output,
     )  # type: ignore[arg-type]
 
 
 def test_a_log_has_the_number_done_and_the_remaining_time() -> None:
     """Each finished episode logs one line with its status, the count of all, and the estimated
     rest."""
-    board, clock, said = board_of(long_ways()[:3], done=(long_ways()[0].id,))
+    board, clock, output = board_of(long_ways()[:3], done=(long_ways()[0].id,))
     clock.now_s = 40.0
     board.tell(Done(long_ways()[1].id, "done"))
-    (line,) = said.getvalue().splitlines()
+    (line,) = output.getvalue().splitlines()
     rest_m, gone_m = (
         long_ways()[2].route_line.length_m + SETUP_M,
         long_ways()[1].route_line.length_m + SETUP_M,
@@ -65,7 +65,7 @@ def test_a_log_has_the_number_done_and_the_remaining_time() -> None:
     )
     clock.now_s = 160.0
     board.tell(Done(long_ways()[2].id, "crashed"))
-    assert said.getvalue().splitlines()[1] == f"{long_ways()[2].id}: crashed, 3 of 3"
+    assert output.getvalue().splitlines()[1] == f"{long_ways()[2].id}: crashed, 3 of 3"
 
 
 def test_a_stuck_episode_progresses_by_its_time_limit() -> None:
@@ -103,13 +103,13 @@ def test_the_bars_fit_80_columns() -> None:
     """With the longest name, thousands of seconds and dozens of failures no line is broken and
     nothing is cut."""
     named = msgspec.structs.replace(long_ways()[7], id="ped_crossing-001")
-    board, clock, said = board_of((named, *long_ways()[:2]))
+    board, clock, output = board_of((named, *long_ways()[:2]))
     clock.now_s = 4000.0
     board.tell(Progress(named.id, 3185.2, 630.4, 88))
     board.bars.refresh()
-    Console(file=said, width=80).print(board.bars.get_renderable())
-    lines = said.getvalue().splitlines()
-    assert max(map(len, lines)) <= 80 and "…" not in said.getvalue()
+    Console(file=output, width=80).print(board.bars.get_renderable())
+    lines = output.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80 and "…" not in output.getvalue()
     way = f"630/{long_ways()[7].route_line.length_m:.0f} m"
     assert any(
         "ped_crossing-001" in line and way in line and "88 failures" in line for line in lines

@@ -34,9 +34,9 @@ def test_an_event_is_logged_as_json_and_as_text(
                 "retried", logging.WARNING, scenario="s-0", why="its worker was lost", attempts=1
             )
     log_event("retried", scenario="later")
-    told = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert len(told) == 2 and told[0].pop("time")[10] == "T"
-    assert told[0] == {
+    entries = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert len(entries) == 2 and entries[0].pop("time")[10] == "T"
+    assert entries[0] == {
         "level": "warning",
         "event": "retried",
         "scenario": "s-0",

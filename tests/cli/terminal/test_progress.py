@@ -13,24 +13,24 @@ from cosim.core.units import duration
 
 def test_a_log_gets_one_line_for_each_stage() -> None:
     """Where standard error is no terminal, each stage prints one line when it begins."""
-    said = io.StringIO()
-    with doing("reading [the] city", Console(file=said, width=80)) as tell:
+    output = io.StringIO()
+    with doing("reading [the] city", Console(file=output, width=80)) as tell:
         for share in (0.0, 0.5, 1.0):
             tell("simulating to 20 s", share)
         tell("drawing")
-    assert said.getvalue() == "reading [the] city ...\nsimulating to 20 s ...\ndrawing ...\n"
+    assert output.getvalue() == "reading [the] city ...\nsimulating to 20 s ...\ndrawing ...\n"
 
 
 def test_a_terminal_gets_a_progress_line_that_is_erased() -> None:
     """The line shows the stage with its share and time, and is erased at the end."""
-    said = io.StringIO()
+    output = io.StringIO()
     console = Console(
-        file=said, width=80, force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"}
+        file=output, width=80, force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"}
     )
     with doing("reading [the] city", console) as tell:
         tell("simulating to 20 s", 0.5)
-    assert "simulating to 20 s: 50 %" in said.getvalue() and "0:00:00" in said.getvalue()
-    assert said.getvalue().endswith("\x1b[2K") or "\x1b[1A\x1b[2K" in said.getvalue()
+    assert "simulating to 20 s: 50 %" in output.getvalue() and "0:00:00" in output.getvalue()
+    assert output.getvalue().endswith("\x1b[2K") or "\x1b[1A\x1b[2K" in output.getvalue()
 
 
 @pytest.mark.parametrize(

@@ -84,8 +84,11 @@ def of_comparison(out: Console) -> None:
         ("a", "b", by, LONG, name, "", *figures) for by in ("suite", "event") for name in METRICS
     ]
     before, after = (ComparedRun(label, Path(label), episodes()) for label in "ab")
-    told = pd.DataFrame(rows, columns=list(DIFFERENCES)), pd.DataFrame([], columns=list(FLIPPED))
-    print_comparison(out, RunComparison("reactive", before, (after,), *told, ()))
+    tables_of_differences = (
+        pd.DataFrame(rows, columns=list(DIFFERENCES)),
+        pd.DataFrame([], columns=list(FLIPPED)),
+    )
+    print_comparison(out, RunComparison("reactive", before, (after,), *tables_of_differences, ()))
 
 
 def of_sheet(out: Console) -> None:
@@ -143,13 +146,13 @@ TABLES: dict[str, tuple[Callable[[Console], None], Sequence[str]]] = {
 def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a narrow, a usual and a wide terminal lines fit, no cell ends in dots, and figures are
     complete."""
-    said = io.StringIO()
-    out = Console(file=said, width=width)
+    output = io.StringIO()
+    out = Console(file=output, width=width)
     for module in ("scenario", "bench"):
         monkeypatch.setattr(f"cosim.cli.{module}.out", out)
     prints, figures = TABLES[name]
     prints(out)
-    text = said.getvalue()
+    text = output.getvalue()
     in_tables = [line for line in text.splitlines() if not line.startswith("Paired by scenario")]
     assert "…" not in text and max(map(len, in_tables)) <= width, text
     for figure in figures:
@@ -160,13 +163,13 @@ def test_a_table_that_is_too_wide_is_divided() -> None:
     """Each part repeats the names and holds as many figures as fit; every figure appears once, in
     column order."""
     heads = [f"figure {k}" for k in range(9)]
-    said = io.StringIO()
+    output = io.StringIO()
     row = (LONG, *(f"{k}.000000" for k in range(9)))
     tables.show(
-        Console(file=said, width=50), [*tables.names("what"), *tables.figures(*heads)], [row]
+        Console(file=output, width=50), [*tables.names("what"), *tables.figures(*heads)], [row]
     )
-    parts = said.getvalue().split("what")[1:]
-    assert len(parts) > 1 and max(map(len, said.getvalue().splitlines())) <= 50
+    parts = output.getvalue().split("what")[1:]
+    assert len(parts) > 1 and max(map(len, output.getvalue().splitlines())) <= 50
     found = [[word for word in part.split() if word.endswith(".000000")] for part in parts]
     assert [word for words in found for word in words] == [f"{k}.000000" for k in range(9)] and all(
         found
@@ -185,11 +188,11 @@ def test_a_table_that_fits_is_unchanged() -> None:
 def test_cells_are_plain_text() -> None:
     """Brackets in a name are no markup, a section is separated, and title and note surround the
     table."""
-    said = io.StringIO()
+    output = io.StringIO()
     columns = [*tables.names("what"), *tables.labels("how"), *tables.words("why")]
     rows = [("a [1]", "b", "c"), None, ("d", "e", "f")]
-    tables.show(Console(file=said, width=40), columns, rows, title="above", note="below")
-    lines = [line.split() for line in said.getvalue().splitlines()]
+    tables.show(Console(file=output, width=40), columns, rows, title="above", note="below")
+    lines = [line.split() for line in output.getvalue().splitlines()]
     assert lines[0] == ["above"] and lines[-1] == ["below"]
     assert ["a", "[1]", "b", "c"] in lines and ["d", "e", "f"] in lines
 

@@ -71,19 +71,19 @@ SHAPES: dict[str, Shapes] = {
         "hidden_state": (1, 512),
     },
 }
-"""As far as they are public; what is not is a guess, told in README.md beside the manifests."""
+"""As far as they are public; what is not is a guess, explained in README.md beside the manifests."""
 SAMPLE = ("nomad", "s2e")
 
 
 def bundle_of(name: str, folder: Path, **changes: object) -> Path:
     """A folder with an adapter's manifest, without its files, and a small graph; `changes` are of
     the output."""
-    told = json.loads((ADAPTERS / name / "manifest.json").read_text())
+    manifest = json.loads((ADAPTERS / name / "manifest.json").read_text())
     bundle: BundleManifest = read_bundle_manifest(ADAPTERS / name)
     (folder / bundle.model).write_bytes(likeness(bundle, SHAPES[name]))
-    told.pop("files", None)
-    told["output"] |= changes
-    (folder / "manifest.json").write_text(json.dumps(told))
+    manifest.pop("files", None)
+    manifest["output"] |= changes
+    (folder / "manifest.json").write_text(json.dumps(manifest))
     return folder
 
 
@@ -135,11 +135,13 @@ def test_every_adapter_says_where_its_weights_are(
         bundle = read_bundle_manifest(ADAPTERS / name)
         with pytest.raises(UsageError) as refused:
             load_policy(name)
-        said = str(refused.value)
-        assert f"{bundle.model} is missing" in said and bundle.source in said and bundle.licence
+        message = str(refused.value)
+        assert (
+            f"{bundle.model} is missing" in message and bundle.source in message and bundle.licence
+        )
         if bundle.model in bundle.files:
             facts = bundle.files[bundle.model]
-            assert f"{facts.bytes} bytes, SHA-256 {facts.sha256}" in said
+            assert f"{facts.bytes} bytes, SHA-256 {facts.sha256}" in message
         else:
             assert (
                 "unknown" in bundle.source
@@ -188,9 +190,11 @@ def test_internvla_is_queried_as_by_its_authors(
     assert without.returncode == 2 and "github.com/InternRobotics/InternNav" in without.stderr
     monkeypatch.setenv("COSIM_INTERNVLA", "checkpoint")
     done = cosim("policy", "check", name, "--frames", "3", "--json", cwd=tmp_path)
-    told = json.loads(done.stdout)
-    assert done.returncode == 0, told
+    report = json.loads(done.stdout)
+    assert done.returncode == 0, report
     assert (
-        told["checks"]["goal_mirrored"]["outcome"] == told["checks"]["side"]["outcome"] == "passed"
+        report["checks"]["goal_mirrored"]["outcome"]
+        == report["checks"]["side"]["outcome"]
+        == "passed"
     )
-    assert np.isfinite(told["answer_ms"])
+    assert np.isfinite(report["answer_ms"])

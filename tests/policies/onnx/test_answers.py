@@ -18,9 +18,9 @@ ROWS = np.array([[[1.0, 0.5], [2.0, 1.0], [3.0, 2.0]]])
 WAYPOINTS = {"what": "waypoints", "name": "plan", "index": 1}
 
 
-def answered(output: dict[str, Any], last: Command = STILL, **told: Any) -> Any:
+def answered(output: dict[str, Any], last: Command = STILL, **outputs: Any) -> Any:
     """Return the answer of a graph with this output."""
-    arrays = {name: np.asarray(array, np.float32) for name, array in told.items()}
+    arrays = {name: np.asarray(array, np.float32) for name, array in outputs.items()}
     return decode_answer(msgspec.convert(output, GraphOutput), arrays, COURIER, last)
 
 
@@ -47,8 +47,8 @@ PLANS: dict[str, tuple[dict[str, Any], Any, list[list[float]]]] = {
 @pytest.mark.parametrize("name", PLANS)
 def test_waypoints_are_read_by_their_columns(name: str) -> None:
     """They are summed, turned, scaled and offset as the output declares."""
-    fields, told, wanted = PLANS[name]
-    np.testing.assert_allclose(answered(WAYPOINTS | fields, plan=told), wanted, atol=1e-6)
+    fields, expected, wanted = PLANS[name]
+    np.testing.assert_allclose(answered(WAYPOINTS | fields, plan=expected), wanted, atol=1e-6)
 
 
 def test_of_several_modes_the_one_with_the_highest_score_is_followed() -> None:

@@ -162,11 +162,11 @@ def test_a_bundle_that_cannot_be_driven_is_refused_when_it_is_loaded(
 ) -> None:
     """One message has the bundle, the place, what was found and what is required; the runtime
     prints nothing."""
-    graph, fields, told = REFUSED[name]
+    graph, fields, expected = REFUSED[name]
     place = bundle(tmp_path / "net", graph, **fields)
     with pytest.raises(UsageError) as caught:
         load_policy(f"onnx:{place}")
-    assert f"policy 'onnx:{place}': " in str(caught.value) and told in str(caught.value)
+    assert f"policy 'onnx:{place}': " in str(caught.value) and expected in str(caught.value)
     assert capfd.readouterr() == ("", "")
 
 
@@ -312,8 +312,8 @@ def test_the_example_of_a_bundle_is_compared_with_its_graph(
     obs = np.ones((1, 6, 4, 8), np.float32)
     goal = np.array([[1, 0]], np.float32)
     right = exemplary(obs=obs, goal=goal)
-    told = right.graph.run({"obs": obs, "goal": goal}, ["action"])["action"]
-    expected = {"expected.action": told + np.float32(0.5)}
+    answer = right.graph.run({"obs": obs, "goal": goal}, ["action"])["action"]
+    expected = {"expected.action": answer + np.float32(0.5)}
     assert example_differences(exemplary(obs=obs, goal=goal, **expected)) == pytest.approx(
         {"action": 0.5}
     )
@@ -333,8 +333,8 @@ def test_the_hash_of_a_bundle_depends_on_the_processors_rounding(
 
     def next_number(graph: Graph, *words: Any) -> dict[str, Any]:
         return {
-            name: np.nextafter(told, told.dtype.type(9))
-            for name, told in run(graph, *words).items()
+            name: np.nextafter(output, output.dtype.type(9))
+            for name, output in run(graph, *words).items()
         }
 
     assert OnnxPolicy(folder).digest == here

@@ -50,18 +50,18 @@ def grey_picture(value: int) -> NDArray[np.uint8]:
 def first_pixels(feeding: Feeder, *levels: int) -> list[float]:
     """Return the first pixels of the last query's frames, after pictures of these greys."""
     for one in levels:
-        told = feeding.feed(replace(SEEN, rgb=grey_picture(one)))["obs"]
-    return [round(float(number) * 255) for number in told[:, 0, 0, 0]]
+        tensor = feeding.feed(replace(SEEN, rgb=grey_picture(one)))["obs"]
+    return [round(float(number) * 255) for number in tensor[:, 0, 0, 0]]
 
 
 def test_history_is_the_last_frames_padded_with_the_first() -> None:
     """Order, stride and zero padding follow the manifest, and history restarts after a reset."""
-    told = feeder((3, 3, 2, 4), obs={**SMALL, "frames": 3})
-    assert first_pixels(told, 1) == [1, 1, 1]
-    assert first_pixels(told, 2) == [1, 1, 2]
-    assert first_pixels(told, 3, 4, 5) == [3, 4, 5]
-    told.clear()
-    assert first_pixels(told, 6) == [6, 6, 6]
+    feeding = feeder((3, 3, 2, 4), obs={**SMALL, "frames": 3})
+    assert first_pixels(feeding, 1) == [1, 1, 1]
+    assert first_pixels(feeding, 2) == [1, 1, 2]
+    assert first_pixels(feeding, 3, 4, 5) == [3, 4, 5]
+    feeding.clear()
+    assert first_pixels(feeding, 6) == [6, 6, 6]
     newest = feeder(
         (3, 3, 2, 4),
         obs={**SMALL, "frames": 3, "every": 2, "order": "newest_first", "before": "zeros"},
@@ -116,17 +116,17 @@ def test_a_picture_becomes_the_declared_tensor(name: str) -> None:
     """A pixel of a picture that is red at the left and dark blue at the right is at its declared
     place."""
     fields, shape, pixel, value = PICTURES[name]
-    told = feeder(shape, obs=SMALL | fields).feed(replace(SEEN, rgb=COLOURED))["obs"]
-    assert told.shape == shape and told.dtype == np.float32 and told.flags.c_contiguous
-    assert told[pixel] == pytest.approx(value, abs=0.005)
+    tensor = feeder(shape, obs=SMALL | fields).feed(replace(SEEN, rgb=COLOURED))["obs"]
+    assert tensor.shape == shape and tensor.dtype == np.float32 and tensor.flags.c_contiguous
+    assert tensor[pixel] == pytest.approx(value, abs=0.005)
 
 
 def test_pictures_stay_bytes_for_a_graph_of_bytes() -> None:
     """With scale 1 they are unchanged."""
-    told = feeder(
+    feeding = feeder(
         (None, 8, 16, 3), np.uint8, obs={**SMALL, "size": [16, 8], "layout": "NHWC", "scale": 1}
     )
-    np.testing.assert_array_equal(told.feed(replace(SEEN, rgb=COLOURED))["obs"], COLOURED[None])
+    np.testing.assert_array_equal(feeding.feed(replace(SEEN, rgb=COLOURED))["obs"], COLOURED[None])
 
 
 AHEAD_LEFT = PointGoal(3.0, 4.0)
@@ -151,7 +151,7 @@ VECTORS: dict[str, tuple[dict[str, Any], Goal | None, list[float]]] = {
         [-math.pi / 2],
     ),
     "speeds": ({"what": "speeds", "values": ["v", "w", "-w"]}, None, [1.2, -0.3, 0.3]),
-    "left-told": (
+    "left-instruction": (
         {"what": "command"},
         Instruction("Follow the sidewalk. In 5 m, turn left."),
         [-1.0],
@@ -182,8 +182,8 @@ VECTORS: dict[str, tuple[dict[str, Any], Goal | None, list[float]]] = {
 def test_numbers_are_given_as_declared(name: str) -> None:
     """A robot at 1.2 m/s that turns right at 0.3 rad/s has this goal."""
     fields, goal, wanted = VECTORS[name]
-    told = feeder((None, len(wanted)), one=fields).feed(replace(SEEN, goal=goal))["one"]
-    np.testing.assert_allclose(told, [wanted], atol=1e-6)
+    tensor = feeder((None, len(wanted)), one=fields).feed(replace(SEEN, goal=goal))["one"]
+    np.testing.assert_allclose(tensor, [wanted], atol=1e-6)
 
 
 SENSORS: dict[str, tuple[dict[str, Any], list[float]]] = {
@@ -212,8 +212,8 @@ def test_sensors_are_given_as_declared(name: str) -> None:
     """The sensors are a scan with a missing and a too far return, two tracked people, and an
     inertial reading."""
     fields, wanted = SENSORS[name]
-    told = feeder((None, len(wanted)), one=fields).feed(SENSED)["one"]
-    np.testing.assert_allclose(told, [wanted], atol=1e-6)
+    tensor = feeder((None, len(wanted)), one=fields).feed(SENSED)["one"]
+    np.testing.assert_allclose(tensor, [wanted], atol=1e-6)
 
 
 def test_a_mask_marks_whether_another_input_has_its_goal() -> None:
@@ -223,11 +223,11 @@ def test_a_mask_marks_whether_another_input_has_its_goal() -> None:
         "goal": TensorPort("goal", np.dtype(np.float32), (1, 3, 2, 4)),
         "mask": TensorPort("mask", np.dtype(np.int64), (1,)),
     }
-    told = Feeder(
+    feeding = Feeder(
         msgspec.convert({"goal": goal, "mask": {"what": "mask"}}, dict[str, GraphInput]), ports, 0
     )
-    assert told.feed(replace(SEEN, goal=ImageGoal(grey_picture(255))))["mask"].tolist() == [0]
-    without = told.feed(replace(SEEN, goal=AHEAD_LEFT))
+    assert feeding.feed(replace(SEEN, goal=ImageGoal(grey_picture(255))))["mask"].tolist() == [0]
+    without = feeding.feed(replace(SEEN, goal=AHEAD_LEFT))
     assert without["mask"].tolist() == [1] and not without["goal"].any()
 
 
@@ -236,21 +236,21 @@ def test_a_route_patch_has_the_declared_numbers() -> None:
     patch = np.zeros((80, 80), np.uint8)
     patch[:40, 40] = 255
     fields = {"what": "route_patch", "frames": 2, "on": 2, "off": -1, "layout": "NTHW"}
-    told = feeder((1, 2, 80, 80), one=fields).feed(replace(SEEN, goal=RoutePatch(patch)))["one"]
+    tensor = feeder((1, 2, 80, 80), one=fields).feed(replace(SEEN, goal=RoutePatch(patch)))["one"]
     assert (
-        told[0, 1, 0, 40] == told[0, 0, 39, 40] == 2
-        and told[0, 1, 41, 40] == told[0, 1, 0, 0] == -1
+        tensor[0, 1, 0, 40] == tensor[0, 0, 39, 40] == 2
+        and tensor[0, 1, 41, 40] == tensor[0, 1, 0, 0] == -1
     )
 
 
 def test_past_positions_are_relative_to_the_robots_pose() -> None:
     """After 2 m ahead, a left turn and 1 m, the start is 1 m behind and 2 m to the left."""
-    told = feeder((1, 3, 2), one={"what": "past_positions", "frames": 3, "before": "zeros"})
+    feeding = feeder((1, 3, 2), one={"what": "past_positions", "frames": 3, "before": "zeros"})
     for place in ((0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 1.0, math.pi / 2)):
-        seen = told.feed(replace(SEEN, odometry=Odometry(*place)))["one"]
+        seen = feeding.feed(replace(SEEN, odometry=Odometry(*place)))["one"]
     np.testing.assert_allclose(seen[0], [[-1, 2], [-1, 0], [0, 0]], atol=1e-6)
-    told.clear()
-    again = told.feed(replace(SEEN, odometry=Odometry(9.0, 9.0, 0.0)))["one"]
+    feeding.clear()
+    again = feeding.feed(replace(SEEN, odometry=Odometry(9.0, 9.0, 0.0)))["one"]
     np.testing.assert_array_equal(again, np.zeros((1, 3, 2)))
 
 

@@ -109,13 +109,13 @@ def test_an_example_that_cannot_be_used_is_refused_before_it_is_read(
 ) -> None:
     """One line has its file, what was found and what is required."""
     place = bundle(tmp_path / "net", tiny_graph())
-    make, told = EXAMPLES[name]
+    make, expected = EXAMPLES[name]
     make(place / "example.npz")
     with pytest.raises(UsageError) as caught:
         example_differences(OnnxPolicy(place))
-    assert str(caught.value).startswith(f"{place}/example.npz: ") and told in str(caught.value), (
+    assert str(caught.value).startswith(f"{place}/example.npz: ") and expected in str(
         caught.value
-    )
+    ), caught.value
     assert "\n" not in str(caught.value)
 
 
@@ -198,11 +198,11 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_a_bundle_reads_no_file_outside_its_folder(tmp_path: Path, name: str) -> None:
     """A key of `files`, a name in the graph and a link to an outside file are named and refused."""
     place = bundle(tmp_path / "net", tiny_graph(), MANIFEST)
-    make, told = PLACES[name]
+    make, expected = PLACES[name]
     make(place)
     with pytest.raises(UsageError) as caught:
         load_policy(f"onnx:{place}")
-    assert told in str(caught.value), caught.value
+    assert expected in str(caught.value), caught.value
 
 
 def test_a_graph_of_gigabytes_is_refused_before_it_is_read(tmp_path: Path) -> None:

@@ -130,11 +130,11 @@ def test_a_manifest_has_the_facts_that_a_run_needs(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_manifest_with_a_fault_is_refused_with_its_place(tmp_path: Path, name: str) -> None:
     """The message has file, place, what was found and the valid values."""
-    change, told = FAULTS[name]
+    change, expected = FAULTS[name]
     (tmp_path / "manifest.json").write_text(json.dumps(GNM | change))
     with pytest.raises(SpecError) as caught:
         read_bundle_manifest(tmp_path)
-    assert str(tmp_path / "manifest.json") in str(caught.value) and told in str(caught.value)
+    assert str(tmp_path / "manifest.json") in str(caught.value) and expected in str(caught.value)
 
 
 def test_all_faults_of_a_manifest_are_reported(tmp_path: Path) -> None:

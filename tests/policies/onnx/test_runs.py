@@ -114,17 +114,17 @@ def test_the_documented_bundle_runs_as_written(tmp_path: Path, cosim: Cosim) -> 
     write_suite(
         Suite(name="reactive", version="1", scenarios=(second("a"),)), tmp_path / "one.json"
     )
-    said = cosim(
+    result = cosim(
         *["one.json" if word == "reactive" else word for word in command[1:]],
         "--out",
         "run",
         cwd=tmp_path,
     )
     (record,) = read_records(tmp_path / "run")
-    assert said.returncode == 0 and (record.manifest.name, record.status) == (
+    assert result.returncode == 0 and (record.manifest.name, record.status) == (
         "my-network",
         "done",
-    ), said.stderr
+    ), result.stderr
 
 
 def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(
@@ -134,7 +134,7 @@ def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(
     bundle(tmp_path / "net", tiny_graph())
     write_suite(Suite(name="one", version="1", scenarios=(second("a"),)), tmp_path / "one.json")
     bundle(tmp_path / "text", b"once upon a time")
-    for words, told in (
+    for words, expected in (
         (
             ("--policy", "onnx:net", "--goal", "image"),
             "policy 'tiny' wants goals route_point or final_point or random",
@@ -145,6 +145,6 @@ def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(
             "policy 'onnx:nowhere': nowhere: no bundle: has no manifest.json",
         ),
     ):
-        said = cosim("run", "one.json", "--out", "run", *words, cwd=tmp_path)
-        assert said.returncode == 2 and f"error: {told}" in said.stderr, said.stderr
+        result = cosim("run", "one.json", "--out", "run", *words, cwd=tmp_path)
+        assert result.returncode == 2 and f"error: {expected}" in result.stderr, result.stderr
         assert not (tmp_path / "run").exists()

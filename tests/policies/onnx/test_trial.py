@@ -68,7 +68,7 @@ def test_a_graph_that_never_answers_is_refused(tmp_path: Path, cosim: Cosim) -> 
     extend it."""
     place = bundle(tmp_path / "net", endless(), **repeated_input(1.0))
     before = {*psutil.Process().children()}
-    said = cosim(
+    result = cosim(
         "run",
         "unit",
         "--policy",
@@ -79,11 +79,13 @@ def test_a_graph_that_never_answers_is_refused(tmp_path: Path, cosim: Cosim) -> 
         "0.5",
         cwd=tmp_path,
     )
-    told = (
+    expected = (
         f"{place}/model.onnx: gives no answer within 0.5 s, to be loaded and to answer: it may "
         f"hold a loop without end"
     )
-    assert said.returncode == 2 and told in said.stderr and "--start-timeout" in said.stderr, said
+    assert (
+        result.returncode == 2 and expected in result.stderr and "--start-timeout" in result.stderr
+    ), result
     assert {path.name for path in tmp_path.iterdir()} == {"net"} and {
         *psutil.Process().children()
     } <= before

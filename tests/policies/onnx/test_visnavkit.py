@@ -41,7 +41,7 @@ def exported(
         folder / f"{name}.inputs.npz",
         **(example | ({"action_bounds": BOUNDS} if "action_bounds" in shapes else {})),
     )
-    told = {
+    defaults = {
         "exp_name": "flowpilot dst",
         "model": "FlowPilotDST",
         "precision": "fp32",
@@ -52,7 +52,7 @@ def exported(
         "input_shapes": dict(shapes),
         "input_dtypes": dict.fromkeys(shapes, "float32"),
     }
-    (folder / f"{name}.metadata.json").write_text(json.dumps(told | metadata))
+    (folder / f"{name}.metadata.json").write_text(json.dumps(defaults | metadata))
     return folder
 
 
@@ -170,8 +170,8 @@ def test_the_graph_of_a_frame_gets_its_own_features_back(tmp_path: Path) -> None
     assert (rule.index, rule.dt_s, driver.manifest.goal) == (2, 0.5, "route_point")
     driver.reset("a", 0)
     seen = example_observation(driver.manifest)
-    told = [driver.policy.act(seen) for _ in range(5)]
-    assert [float(np.asarray(one)[0, 0]) for one in told] == [0, 1, 2, 3, 3]
+    answers = [driver.policy.act(seen) for _ in range(5)]
+    assert [float(np.asarray(one)[0, 0]) for one in answers] == [0, 1, 2, 3, 3]
     driver.reset("b", 0)
     assert float(np.asarray(driver.policy.act(seen))[0, 0]) == 0
 
@@ -215,7 +215,7 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_an_export_that_cannot_be_driven_is_refused(tmp_path: Path, name: str) -> None:
     """The message names its file and what was found."""
-    fields, told = BROKEN[name]
+    fields, expected = BROKEN[name]
     with pytest.raises(UsageError) as caught:
         load_policy(f"onnx:{window_export(tmp_path, **fields)}")
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
