@@ -108,10 +108,10 @@ def frontal(scenario_id: str) -> Scenario:
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_reactive(
+    scenario = build_reactive(
         EVENT_KINDS["frontal"], city, street_map, WalkGraph(street_map), 1, scenario_id
     )
-    return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
+    return msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
 
 
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
@@ -182,11 +182,11 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
         finally:
             run.kill()
             run.wait()
-    kept = recorded(tmp_path, "t-0")
+    record = recorded(tmp_path, "t-0")
     assert (
         undisturbed.status == "done" and (undisturbed.events[0].triggered_at_s or PATIENCE_S) < 4.0
     )
-    assert kept["status"] == "done" and kept["state_hash"] == undisturbed.state_hash
+    assert record["status"] == "done" and record["state_hash"] == undisturbed.state_hash
 
 
 def test_a_director_that_does_not_return_is_reported(tmp_path: Path, cosim: Cosim) -> None:
@@ -257,7 +257,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     from scenarios.episodes.director import remote_director
 
     at = f"unixsock-stream/{tmp_path}/director.sock"
-    there = Connection(role="coordinator", connect=at)
+    address = Connection(role="coordinator", connect=at)
     query = EventQuery(
         episode="e",
         tick=0,
@@ -278,7 +278,9 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
             DirectorLost,
             match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct",
         ),
-        remote_director(DirectorAddress(connection=there, run="r", wait_s=0.5), notes.append, "e"),
+        remote_director(
+            DirectorAddress(connection=address, run="r", wait_s=0.5), notes.append, "e"
+        ),
     ):
         pass
     directors: list[subprocess.Popen[str]] = []
@@ -288,7 +290,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     late.start()
     try:
         with remote_director(
-            DirectorAddress(connection=there, run="r", wait_s=PATIENCE_S), notes.append, "e"
+            DirectorAddress(connection=address, run="r", wait_s=PATIENCE_S), notes.append, "e"
         ) as director:
             assert director.react(query).tick == 0
         late.join()

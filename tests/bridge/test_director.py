@@ -52,8 +52,8 @@ def query(tick: int = 0) -> EventQuery:
     )
 
 
-def echo(asked: EventQuery) -> EventReply:
-    return EventReply(episode=asked.episode, tick=asked.tick, states=(), actors=())
+def echo(sent: EventQuery) -> EventReply:
+    return EventReply(episode=sent.episode, tick=sent.tick, states=(), actors=())
 
 
 def endpoint(folder: Path) -> str:
@@ -73,9 +73,9 @@ def test_an_episodes_own_director_answers_in_the_calling_thread() -> None:
     """Over a Zenoh session without a socket its replies equal the pure function's, tick by tick."""
     before, threads = open_sockets(), set()
 
-    def seen(asked: EventQuery) -> EventReply:
+    def seen(sent: EventQuery) -> EventReply:
         threads.add(threading.get_ident())
-        return echo(asked)
+        return echo(sent)
 
     with LocalSession() as session:
         serve_director(session, KEY, seen, version="cafe")
@@ -94,10 +94,10 @@ def test_ctrl_c_during_a_query_of_the_own_director_is_not_lost() -> None:
     """An interrupt ends the query, an exception is an engine error, and the next query works."""
     raised: list[BaseException] = [KeyboardInterrupt(), RuntimeError("no idea")]
 
-    def broken(asked: EventQuery) -> EventReply:
+    def broken(sent: EventQuery) -> EventReply:
         if raised:
             raise raised.pop(0)
-        return echo(asked)
+        return echo(sent)
 
     with LocalSession() as session:
         serve_director(session, KEY, broken)
@@ -113,7 +113,7 @@ def test_ctrl_c_during_a_query_of_the_own_director_is_not_lost() -> None:
 def test_a_director_that_raises_is_reported_with_its_message(tmp_path: Path) -> None:
     """An exception in the director comes back as the reason, not as silence."""
 
-    def broken(asked: EventQuery) -> EventReply:
+    def broken(sent: EventQuery) -> EventReply:
         raise RuntimeError("no idea")
 
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
@@ -147,7 +147,7 @@ def test_an_answer_to_another_tick_is_refused(tmp_path: Path) -> None:
         serve_director(
             hub,
             KEY,
-            lambda asked: EventReply(episode="t", tick=asked.tick + 1, states=(), actors=()),
+            lambda sent: EventReply(episode="t", tick=sent.tick + 1, states=(), actors=()),
         )
         with pytest.raises(DirectorLost, match="answered tick 1"):
             RemoteDirector(client, KEY).react(query(0))
@@ -197,17 +197,17 @@ def test_an_invalid_reply_is_refused_with_a_reason(
 ) -> None:
     """Replies to another tick or episode, with too many states, unknown people or impossible places
     are refused."""
-    asked = msgspec.structs.replace(query(5), events=(event(),))
+    sent = msgspec.structs.replace(query(5), events=(event(),))
     sane = EventReply(episode="t", tick=5, states=(SANE,), actors=(SHOWN,))
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(
-            hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if asked.states else {})
+            hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if sent.states else {})
         )
         director = RemoteDirector(client, KEY)
-        assert director.react(asked) == sane
-        asked = msgspec.structs.replace(asked, states=sane.states)
+        assert director.react(sent) == sane
+        sent = msgspec.structs.replace(sent, states=sane.states)
         with pytest.raises(DirectorLost, match=f"tick 5 of 't'.*{words}"):
-            director.react(asked)
+            director.react(sent)
 
 
 @pytest.mark.parametrize("theirs", ["feed", ""])

@@ -84,25 +84,25 @@ def anna(**fields: object) -> Injection:
 def test_an_injected_person_enters_at_its_tick_walks_its_path_and_leaves() -> None:
     """Accepted between ticks 2 and 3 it appears at 3, stands after 3 m at 1.5 m/s, and is gone a
     second later."""
-    one = injected_people()
+    pedestrians = injected_people()
     for tick in range(3):
-        assert not one.react(query(tick)).actors
-    ack = one.offer(anna(doing="look"))
+        assert not pedestrians.react(query(tick)).actors
+    ack = pedestrians.offer(anna(doing="look"))
     assert ack == Ack(id="anna", status="accepted", tick=3, time_s=0.15, x_m=10.0, y_m=10.0)
-    seen = {tick: one.react(query(tick)).actors for tick in range(3, 80)}
+    seen = {tick: pedestrians.react(query(tick)).actors for tick in range(3, 80)}
     assert (seen[3][0].id, seen[3][0].x_m, seen[3][0].y_m) == ("ei-anna", 10.0, 10.0)
     assert seen[23][0].x_m == pytest.approx(11.5) and seen[23][0].speed_mps == pytest.approx(1.5)
     assert seen[43][0].x_m == pytest.approx(13.0) and seen[45][0].doing == "look"
-    gone = min(tick for tick, actors in seen.items() if not actors)
-    assert gone == pytest.approx(43 + 20, abs=1)
-    assert one.log == (Injected(tick=3, injection=anna(doing="look")),)
+    left_tick = min(tick for tick, actors in seen.items() if not actors)
+    assert left_tick == pytest.approx(43 + 20, abs=1)
+    assert pedestrians.log == (Injected(tick=3, injection=anna(doing="look")),)
 
 
 def test_a_final_posture_is_shown_only_at_the_end_of_the_path() -> None:
     """A person who is to sit at its end is shown standing as it appears, then walking, and sits
     only at the end."""
-    one = injected_people(Injected(tick=0, injection=anna(doing="sit")))
-    shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
+    pedestrians = injected_people(Injected(tick=0, injection=anna(doing="sit")))
+    shown = [actor for tick in range(60) for actor in pedestrians.react(query(tick)).actors]
     assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
     assert {actor.doing for actor in shown if actor.speed_mps == 0.0 and actor.x_m == 13.0} == {
         "sit"
@@ -116,8 +116,10 @@ def test_an_injected_person_whose_end_the_robot_blocks_stops_near_it(
     """It comes within a metre, stays for its time, and leaves, instead of walking round the robot
     for ever."""
     end = (90.0 + off_m[0], 90.0 + off_m[1])
-    one = injected_people(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
-    shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
+    pedestrians = injected_people(
+        Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0))
+    )
+    shown = [actor for tick in range(300) for actor in pedestrians.react(query(tick)).actors]
     assert len(shown) < 240
     assert {(actor.speed_mps, actor.doing) for actor in shown[-38:]} == {(0.0, "stand")}
     assert math.dist((shown[-1].x_m, shown[-1].y_m), end) < 1.0
@@ -140,12 +142,12 @@ def test_injected_people_are_replayed_from_the_log_alone() -> None:
 def test_points_relative_to_the_robot_are_resolved_when_the_pedestrian_enters() -> None:
     """Points ahead and left of its pose at that tick mix with map points; the log holds map points
     only, and replays."""
-    one = injected_people()
+    pedestrians = injected_people()
     robot = Pose(50.0, 50.0, math.pi / 2)
-    one.react(query(0))
-    one.set_robot(RobotOnRoute(1, robot, 40.0))
+    pedestrians.react(query(0))
+    pedestrians.set_robot(RobotOnRoute(1, robot, 40.0))
     ack = answer_injection(
-        b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', one.offer
+        b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', pedestrians.offer
     )
     assert (ack.status, ack.tick, ack.x_m, ack.y_m) == (
         "accepted",
@@ -153,8 +155,8 @@ def test_points_relative_to_the_robot_are_resolved_when_the_pedestrian_enters() 
         pytest.approx(49.0),
         pytest.approx(65.0),
     )
-    shown = [one.react(query(tick)).actors for tick in range(1, 100)]
-    (entry,) = msgspec.json.decode(msgspec.json.encode(one.log), type=tuple[Injected, ...])
+    shown = [pedestrians.react(query(tick)).actors for tick in range(1, 100)]
+    (entry,) = msgspec.json.decode(msgspec.json.encode(pedestrians.log), type=tuple[Injected, ...])
     path = [(49.0, 65.0), (60.0, 60.0), (50.0, 47.5)]
     assert [number for point in entry.injection.path for number in point] == pytest.approx(
         sum(path, ())
@@ -167,14 +169,14 @@ def test_points_relative_to_the_robot_are_resolved_when_the_pedestrian_enters() 
 def test_a_hanging_tick_refuses_points_relative_to_the_robot(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """While an engine hangs, map points are accepted, and clients are told to send the others
+    """While an engine hangs, map points are accepted, and clients must send the others
     again."""
     monkeypatch.setattr(injected, "TICK_TIMEOUT_S", 0.01)
-    one = injected_people()
-    one.react(query(0))
-    ack = one.offer(InjectionRequest(id="a", path=(RelativePoint(10.0),)))
+    pedestrians = injected_people()
+    pedestrians.react(query(0))
+    ack = pedestrians.offer(InjectionRequest(id="a", path=(RelativePoint(10.0),)))
     assert ack.status == "refused" and "send it again" in ack.reason
-    assert one.offer(anna()).status == "accepted"
+    assert pedestrians.offer(anna()).status == "accepted"
 
 
 @pytest.mark.parametrize(
@@ -191,9 +193,9 @@ def test_a_refusal_has_the_robots_place_and_a_valid_point(
     robot: tuple[float, float, float, float], path: str
 ) -> None:
     """At the start, in a turn and near the goal, either form of the suggested point is accepted."""
-    one = injected_people()
-    one.set_robot(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
-    reason = answer_injection(f'{{"id":"a","path":{path}}}'.encode(), one.offer).reason
+    pedestrians = injected_people()
+    pedestrians.set_robot(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
+    reason = answer_injection(f'{{"id":"a","path":{path}}}'.encode(), pedestrians.offer).reason
     assert reason.startswith("path[1] is ") and "not on this map" in reason
     assert f"The robot is at [{robot[0]:.1f}, {robot[1]:.1f}]" in reason
     found = re.search(
@@ -201,7 +203,8 @@ def test_a_refusal_has_the_robots_place_and_a_valid_point(
     )
     assert found is not None
     acks = [
-        answer_injection(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), one.offer) for i in (1, 2)
+        answer_injection(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), pedestrians.offer)
+        for i in (1, 2)
     ]
     assert [ack.status for ack in acks] == ["accepted", "accepted"]
     assert (
@@ -285,40 +288,42 @@ def test_a_refusal_has_the_robots_place_and_a_valid_point(
 )
 def test_an_invalid_message_is_refused_with_a_reason(message: bytes, reason: str) -> None:
     """An invalid message is refused with its reason, and nothing of it reaches the simulation."""
-    one = injected_people()
-    ack = answer_injection(message, one.offer)
+    pedestrians = injected_people()
+    ack = answer_injection(message, pedestrians.offer)
     assert ack.status == "refused" and ack.tick is None and reason in ack.reason
-    assert not one.react(query(0)).actors and one.log == ()
+    assert not pedestrians.react(query(0)).actors and pedestrians.log == ()
 
 
 def test_a_repeated_name_is_refused() -> None:
     """A name is refused the second time even after the first person left, because the log
     identifies people by name."""
-    one = injected_people()
-    assert one.offer(anna()).status == "accepted"
-    assert "of this id" in one.offer(anna()).reason
+    pedestrians = injected_people()
+    assert pedestrians.offer(anna()).status == "accepted"
+    assert "of this id" in pedestrians.offer(anna()).reason
     for tick in range(120):
-        one.react(query(tick))
-    assert not one.react(query(120)).actors and one.offer(anna()).status == "refused"
+        pedestrians.react(query(tick))
+    assert (
+        not pedestrians.react(query(120)).actors and pedestrians.offer(anna()).status == "refused"
+    )
 
 
 def test_a_flood_of_messages_is_bounded() -> None:
     """Of 100,000 messages as many are accepted as people may exist at once; the rest are refused
     with the reason."""
-    one = injected_people()
-    acks = [one.offer(anna(id=f"p{i}")) for i in range(100_000)]
+    pedestrians = injected_people()
+    acks = [pedestrians.offer(anna(id=f"p{i}")) for i in range(100_000)]
     assert sum(ack.status == "accepted" for ack in acks) == MAX_INJECTED
     assert "are here already" in acks[-1].reason
-    assert len(one.react(query(0)).actors) == MAX_INJECTED
+    assert len(pedestrians.react(query(0)).actors) == MAX_INJECTED
 
 
 def test_an_injected_person_does_not_walk_through_the_robot() -> None:
     """With the robot on its path the person walks round it and arrives."""
-    one = injected_people()
-    one.offer(anna(path=((80.0, 90.0), (99.0, 90.0)), stay_s=60.0))
+    pedestrians = injected_people()
+    pedestrians.offer(anna(path=((80.0, 90.0), (99.0, 90.0)), stay_s=60.0))
     gaps = []
     for tick in range(400):
-        actor = one.react(query(tick)).actors[0]
+        actor = pedestrians.react(query(tick)).actors[0]
         gaps.append(max(abs(actor.x_m - 90.0) - 0.35, abs(actor.y_m - 90.0) - 0.275))
     assert min(gaps) > 0.2 and actor.x_m == pytest.approx(99.0)
 
@@ -440,10 +445,10 @@ def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
+    scenario = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     crowd = CrowdSpec(persons=6, radius_m=50.0, vehicles=2)
     short = msgspec.structs.replace(
-        whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=()
+        scenario, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=()
     )
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
     (folder / "slow.py").write_text(SLOW)
@@ -462,7 +467,7 @@ def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
         [*words, "--out", "run", "--live", at, *guard], cwd=folder, text=True
     ) as run:
         try:
-            yield OnAir(run, folder, at, [(x, y) for x, y in whole.route[20:26]])
+            yield OnAir(run, folder, at, [(x, y) for x, y in scenario.route[20:26]])
         finally:
             run.kill()
 
@@ -480,10 +485,10 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
         ("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector")
     )  # type: ignore[arg-type]
     with on_air(tmp_path, at, "--tls", "certs/coordinator") as air:
-        there = ("--connect", air.at, "--wait", str(PATIENCE_S))
+        connection = ("--connect", air.at, "--wait", str(PATIENCE_S))
 
         def log_on_air() -> dict[str, Any]:
-            result = cosim("listen", "events", *there, *viewer, "--seconds", "0")
+            result = cosim("listen", "events", *connection, *viewer, "--seconds", "0")
             assert result.returncode == 0, result
             return dict(json.loads(result.stdout.splitlines()[0]))
 
@@ -491,11 +496,11 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
         message = json.dumps(
             {"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"}
         )
-        sent = cosim("inject", message, *there, *injector)
+        sent = cosim("inject", message, *connection, *injector)
         assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
-        again = cosim("inject", message, *there, *injector)
+        again = cosim("inject", message, *connection, *injector)
         assert again.returncode == 2 and "of this id" in again.stderr
-        swapped = cosim("inject", message, *there, *viewer)
+        swapped = cosim("inject", message, *connection, *viewer)
         assert (
             swapped.returncode == 2
             and "is of the role viewer, and this needs injector" in swapped.stderr
@@ -507,9 +512,11 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
                 and result.returncode == 2
             )
         )
-        wait_for(lambda: [one["injection"]["id"] for one in log_on_air()["injections"]] == ["anna"])
-        words = [sys.executable, "-m", "cosim", "listen", "robot", *there, *viewer]
-        for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
+        wait_for(
+            lambda: [entry["injection"]["id"] for entry in log_on_air()["injections"]] == ["anna"]
+        )
+        words = [sys.executable, "-m", "cosim", "listen", "robot", *connection, *viewer]
+        for ends, code in (("SIGTERM", 130), ("closed pipe", 141)):
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
                 assert listener.stdout is not None
                 ticks = [json.loads(listener.stdout.readline()) for _ in range(4)]
@@ -560,7 +567,7 @@ def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosi
             )
             assert vandal.returncode == 0, vandal.stderr
             record = air.record()
-            heard = json.loads(listener.stdout.read())
+            received = json.loads(listener.stdout.read())
     assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
     replies = json.loads(vandal.stdout)
     for name, words in {
@@ -574,21 +581,23 @@ def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosi
     }.items():
         assert words in replies[name], replies[name]
     assert replies["wrong run"] == "" and replies["camera"] == b"\x89PNG\r\n\x1a\n".hex()
-    taken_in = [one["injection"]["id"] for one in record["injections"]]
+    taken_in = [entry["injection"]["id"] for entry in record["injections"]]
     for ack in replies["flood"]:
         assert (ack["id"] in taken_in) is (ack["status"] == "accepted"), ack
         assert ack["status"] == "accepted" or "are here already" in ack["reason"]
     assert len(replies["flood"]) <= 2000 and taken_in[0] == "bob"
     assert len(taken_in) == len(set(taken_in)) >= MAX_INJECTED
-    assert [one["injection"]["id"] for one in replies["log"]["injections"]] == taken_in
-    injected_people = [sum(one["kind"] == "injected" for one in crowd) for crowd in heard["crowd"]]
+    assert [entry["injection"]["id"] for entry in replies["log"]["injections"]] == taken_in
+    injected_people = [
+        sum(person["kind"] == "injected" for person in crowd) for crowd in received["crowd"]
+    ]
     assert MAX_INJECTED // 2 < max(injected_people) <= MAX_INJECTED
     assert (
-        set(heard) == {"clock", "robot", "crowd", "signals", "events"}
-        and heard["events"][-1][-1] == "ended: failure"
+        set(received) == {"clock", "robot", "crowd", "signals", "events"}
+        and received["events"][-1][-1] == "ended: failure"
     )
-    assert heard["clock"][-1]["tick"] > bob["tick"]
-    assert any(one["id"] == "ei-bob" for crowd in heard["crowd"] for one in crowd)
+    assert received["clock"][-1]["tick"] > bob["tick"]
+    assert any(person["id"] == "ei-bob" for crowd in received["crowd"] for person in crowd)
     assert record["status"] == "done"
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr

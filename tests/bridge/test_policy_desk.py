@@ -75,7 +75,7 @@ def act(episode: str, tick: int = 0, step: int = 0, *, reset: bool = False) -> A
     return ActRequest("r", episode, "a", step, tick, tick / 20.0, 0.0, 0.0, reset)
 
 
-def began(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
+def desk_with(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
     """Return a desk at which these episodes are under way."""
     desk = PolicyDesk(policy, timer=timer)
     for episode in episodes:
@@ -87,7 +87,7 @@ def began(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
 
 def replies_of_two(does: Callable[[Sequence[Any]], Any]) -> list[PolicyReply]:
     """The replies to "a" and "b", which are queried together."""
-    return began(RecordsBatchCalls(does), "a", "b").replies([act("a", 2), act("b", 4)])
+    return desk_with(RecordsBatchCalls(does), "a", "b").replies([act("a", 2), act("b", 4)])
 
 
 def without_line(reply: PolicyReply) -> PolicyReply:
@@ -164,7 +164,7 @@ def test_an_invalid_batch_answer_crashes_every_episode_of_it(
 def test_a_policy_for_many_episodes_gets_resets_and_ends_of_each() -> None:
     """`on_reset` is called before the following act of its episode, and `ended` once."""
     policy = RecordsBatchCalls(lambda some: [STILL for _ in some])
-    desk = began(policy, "a", "b")
+    desk = desk_with(policy, "a", "b")
     policy.calls.clear()
     desk.replies([act("a", 5, reset=True), act("b", 10)])
     desk.replies([EndRequest("r", "a", "a"), EndRequest("r", "a", "a")])
@@ -177,7 +177,7 @@ def test_an_on_reset_that_raises_crashes_only_its_episode(
 ) -> None:
     """The others of the batch are answered; an `ended` that raises is printed and is no crash."""
     policy = RecordsBatchCalls(lambda some: [STILL for _ in some])
-    desk = began(policy, "a", "bad", "c")
+    desk = desk_with(policy, "a", "bad", "c")
     first, bad, last = desk.replies([act(name, 5, reset=True) for name in ("a", "bad", "c")])
     assert (
         isinstance(first, ActReply)
@@ -200,17 +200,17 @@ def test_an_object_serves_one_episode_at_a_time_and_a_class_many() -> None:
             super().__init__()
             made.append(self)
 
-    one = began(RecordsCalls(), "a")
+    one = desk_with(RecordsCalls(), "a")
     again, other = one.replies([ResetRequest("r", name, "a", 7) for name in ("a", "b")])
     assert isinstance(again, EpisodeReply) and isinstance(other, Refusal) and other.why == "busy"
-    many = began(Made, "a", "b")
+    many = desk_with(Made, "a", "b")
     assert len(made) == 2
     many.replies([EndRequest("r", "a", "a")])
     many.replies([ResetRequest("r", "c", "a", 7)])
     assert len(made) == 2 and made[0].calls[-1] == ("reset", "c", 7)
     rgb = {"rgb": pack_array(np.zeros((2, 2, 3), np.uint8))}
-    asked = ActRequest("r", "b", "a", 0, 0, 0.0, 0.0, 0.0, arrays=rgb)
-    first, repeated, later = many.replies([asked] * 3)
+    request = ActRequest("r", "b", "a", 0, 0, 0.0, 0.0, 0.0, arrays=rgb)
+    first, repeated, later = many.replies([request] * 3)
     assert first == repeated == later and made[1].calls.count("b") == 1
 
 
@@ -218,7 +218,7 @@ def test_a_request_that_cannot_be_decoded_is_refused() -> None:
     """For garbage and arrays of missing or wrong sizes the policy is not queried, and other
     requests are answered."""
     policy = RecordsCalls()
-    desk = began(policy, "a")
+    desk = desk_with(policy, "a")
     garbage = read_request(b"\x91" * 100_000)
     assert isinstance(garbage, Refusal) and desk.replies([garbage]) == [garbage]
     for array in (
@@ -226,7 +226,7 @@ def test_a_request_that_cannot_be_decoded_is_refused() -> None:
         PackedArray("|u1", (9, 9)),
         PackedArray("<f8", (1,)),
     ):
-        desk = began(policy, "a")
+        desk = desk_with(policy, "a")
         (refused,) = desk.replies(
             [ActRequest("r", "a", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": array})]
         )
@@ -262,7 +262,7 @@ def hosted(policy: Any) -> HostedDriver:
     return HostedDriver(HostedPolicy(MANIFEST, ToDesk(policy), "r"), "remote", "")
 
 
-def seen(tick: int, *, reset: bool = False) -> Observation:
+def observation_at(tick: int, *, reset: bool = False) -> Observation:
     return Observation(tick, tick / 20.0, None, 0.5, 0.0, COURIER, episode="bad", reset=reset)
 
 
@@ -271,6 +271,6 @@ def test_a_command_keeps_the_waypoints_that_it_follows() -> None:
     plan = np.array([[1.0, 0.0], [2.0, 0.5]], np.float32)
     driver = hosted(RecordsCalls(lambda _: WaypointCommand(0.5, 0.1, plan, 1)))
     driver.reset("a", 0)
-    command = driver.act(seen(0))
+    command = driver.act(observation_at(0))
     assert isinstance(command, WaypointCommand) and (command.v_mps, command.w_radps) == (0.5, 0.1)
     assert command.waypoints.tobytes() == plan.tobytes() and command.index == 1

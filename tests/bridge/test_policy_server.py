@@ -67,14 +67,14 @@ class Counting:
     }
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
+        self.queried: list[str] = []
 
     def reset(self, episode_id: str, seed: int) -> None:
         self.count = 0
 
     def act(self, seen: Any) -> Any:
         self.count += 1
-        self.asked.append(seen.episode)
+        self.queried.append(seen.episode)
         self.seen = seen
         if seen.episode == "raises":
             raise KeyError("no such weight")
@@ -110,7 +110,7 @@ class Together(Counting):
         return [np.full((3, 2), [self.counts[one.episode] / 40.0, 0.0]) for one in observations]
 
 
-def seen_at(tick: int, episode: str = "k1") -> Observation:
+def observation_at(tick: int, episode: str = "k1") -> Observation:
     return Observation(
         tick,
         tick / 20.0,
@@ -138,7 +138,7 @@ def hub(tmp_path: Path) -> Iterator[Connection]:
 def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> Iterator[None]:
     """A policy served by a thread of this process, until the block ends."""
     session = open_session(at)
-    heard: list[Any] = []
+    handlers: list[Any] = []
 
     class Ending:
         """The session, whose end ends the serving thread, too."""
@@ -146,7 +146,7 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
         def declare_queryable(
             self, key: str, handler: Callable[[Any], None], complete: bool
         ) -> Any:
-            heard.append(handler)
+            handlers.append(handler)
             return session.zenoh_session.declare_queryable(key, handler, complete=complete)
 
     def run() -> None:
@@ -156,10 +156,10 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        wait_until(lambda: len(heard) == 4)
+        wait_until(lambda: len(handlers) == 4)
         yield
     finally:
-        heard[1](None)  # no query: the end
+        handlers[1](None)  # no query: the end
         thread.join(PATIENCE_S)
         session.close()
 
@@ -183,7 +183,7 @@ def test_a_remote_policy_is_queried_like_a_local_one(hub: Connection) -> None:
     with served(hub, policy), driver_at(hub) as driver:
         assert (driver.runs, driver.manifest.camera, driver.at_once) == ("remote", SPEC, 1)
         driver.reset("k1", 7)
-        assert [driver.act(seen_at(tick)) for tick in (0, 5)] == [
+        assert [driver.act(observation_at(tick)) for tick in (0, 5)] == [
             Command(0.1, 0.0),
             Command(0.2, 0.0),
         ]
@@ -207,12 +207,12 @@ def test_a_remote_policy_is_queried_like_a_local_one(hub: Connection) -> None:
         }
         driver.ended()
         driver.reset("most", 7)
-        assert driver.act(seen_at(5, "most")).v_mps == 0.0
+        assert driver.act(observation_at(5, "most")).v_mps == 0.0
         driver.ended()
         for name, words in expected.items():
             driver.reset(name, 7)
             with pytest.raises(PolicyError, match=words):
-                driver.act(seen_at(5, name))
+                driver.act(observation_at(5, name))
             driver.ended()
 
 
@@ -222,11 +222,11 @@ def test_a_repeated_step_is_answered_from_the_cache(hub: Connection) -> None:
     policy = Counting()
     with served(hub, policy), driver_at(hub, times=ServerTimes(try_s=0.2)) as driver:
         driver.reset("slow", 7)
-        assert [driver.act(seen_at(tick, "slow")) for tick in (0, 5)] == [
+        assert [driver.act(observation_at(tick, "slow")) for tick in (0, 5)] == [
             Command(0.1, 0.0),
             Command(0.2, 0.0),
         ]
-    assert policy.asked == ["slow", "slow"]
+    assert policy.queried == ["slow", "slow"]
 
 
 @pytest.mark.engine
@@ -247,7 +247,7 @@ def test_a_link_cut_during_a_long_query_is_waited_for(
     with served(hub, Counting()), driver_at(hub, times=SOON) as driver:
         driver.reset("k1", 7)
         monkeypatch.setattr(Session, "query_once", cut_once)
-        assert driver.act(seen_at(0)) == Command(0.1, 0.0)
+        assert driver.act(observation_at(0)) == Command(0.1, 0.0)
 
 
 @pytest.mark.engine
@@ -256,20 +256,20 @@ def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None
     batch, and ended episodes are forgotten."""
     policy = Together()
 
-    def drive(name: str, came: list[float]) -> None:
+    def drive(name: str, speeds_of: list[float]) -> None:
         with driver_at(hub, "together", run=name) as driver:
             driver.reset(name, 1)
-            came += [driver.act(seen_at(tick, name)).v_mps for tick in range(6)]
+            speeds_of += [driver.act(observation_at(tick, name)).v_mps for tick in range(6)]
             driver.ended()
 
-    came: list[list[float]] = [[] for _ in range(8)]
+    speeds_of: list[list[float]] = [[] for _ in range(8)]
     with served(hub, policy, "together"):
-        threads = [threading.Thread(target=drive, args=(f"k{i}", came[i])) for i in range(8)]
+        threads = [threading.Thread(target=drive, args=(f"k{i}", speeds_of[i])) for i in range(8)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join(PATIENCE_S)
-    assert all(speeds == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]) for speeds in came)
+    assert all(speeds == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]) for speeds in speeds_of)
     assert sum(policy.batches) == 48 and max(policy.batches) > 1 and not policy.counts
 
 
@@ -286,7 +286,7 @@ def test_servers_of_one_name_share_the_episodes(hub: Connection) -> None:
         ):
             for driver in (a, b):
                 driver.reset("k1", 1)
-                driver.act(seen_at(0))
+                driver.act(observation_at(0))
             assert (len(one.batches), len(other.batches)) == (1, 1)
             for driver in (a, b):
                 driver.ended()
@@ -303,14 +303,14 @@ def test_a_restarted_server_has_lost_its_episode(hub: Connection) -> None:
     with driver_after(hub) as driver:
         with served(hub, Counting()):
             driver.reset("k1", 7)
-            driver.act(seen_at(0))
+            driver.act(observation_at(0))
         with pytest.raises(PolicyServerLost, match="is gone"):
-            driver.act(seen_at(5))
+            driver.act(observation_at(5))
         with served(hub, Counting()):
             with pytest.raises(PolicyServerLost, match="is gone"):
-                driver.act(seen_at(5))
+                driver.act(observation_at(5))
             driver.reset("k1", 7)
-            assert driver.act(seen_at(0)) == Command(0.1, 0.0)
+            assert driver.act(observation_at(0)) == Command(0.1, 0.0)
 
 
 @pytest.mark.engine
@@ -319,19 +319,22 @@ def test_a_listening_server_is_lost_as_soon_as_another_takes_its_endpoint(
 ) -> None:
     """The episode is lost at once, without waiting for the time that a cut link is allowed."""
     times = ServerTimes(lost_after_s=PATIENCE_S)
-    there = Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")
+    address = Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")
     with ExitStack() as stack:
-        with open_session(there) as first, served(first.inside, Counting(), listen=there.listen):
-            run = Connection(role="coordinator", connect=there.listen)
+        with (
+            open_session(address) as first,
+            served(first.inside, Counting(), listen=address.listen),
+        ):
+            run = Connection(role="coordinator", connect=address.listen)
             driver = remote_driver(
                 "zenoh:counting", PolicyHost(servers=(run,), run="run1"), times=times
             )
             stack.callback(driver.close)
             driver.reset("k1", 7)
-            driver.act(seen_at(0))
-        stack.enter_context(open_session(there))
+            driver.act(observation_at(0))
+        stack.enter_context(open_session(address))
         with pytest.raises(PolicyServerLost, match="is gone"):
-            driver.act(seen_at(5))
+            driver.act(observation_at(5))
 
 
 @contextmanager
@@ -364,17 +367,17 @@ def test_a_wrong_reply_of_a_server_is_a_policy_crash(hub: Connection) -> None:
         with liar(hub, answer), driver_at(hub, "wrong") as driver:
             driver.reset("k1", 7)
             with pytest.raises(PolicyError, match=f"policy 'wrong' {words}"):
-                driver.act(seen_at(0))
+                driver.act(observation_at(0))
 
 
-def answer_to(one: ActRequest, **other: Any) -> bytes:
+def answer_to(request: ActRequest, **other: Any) -> bytes:
     return encode_message(
-        msgspec.structs.replace(ActReply(*one.signature, one.step, 1.0, 0.0), **other)
+        msgspec.structs.replace(ActReply(*request.signature, request.step, 1.0, 0.0), **other)
     )
 
 
-def begin(one: ActRequest | ResetRequest) -> bytes:
-    return encode_message(EpisodeReply(*one.signature))
+def begin(request: ActRequest | ResetRequest) -> bytes:
+    return encode_message(EpisodeReply(*request.signature))
 
 
 @contextmanager
@@ -385,10 +388,11 @@ def liar(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Ses
     with open_session(hub) as session:
         session.serve(f"{below}/info", lambda _: encode_message(info), found=True)
         session.serve(
-            f"{below}/reset", lambda asked: begin(msgspec.msgpack.decode(asked, type=ResetRequest))
+            f"{below}/reset",
+            lambda payload: begin(msgspec.msgpack.decode(payload, type=ResetRequest)),
         )
         session.serve(
-            f"{below}/act", lambda asked: answer(msgspec.msgpack.decode(asked, type=ActRequest))
+            f"{below}/act", lambda payload: answer(msgspec.msgpack.decode(payload, type=ActRequest))
         )
         yield session
 
@@ -411,14 +415,14 @@ def test_foreign_messages_are_refused_and_change_nothing(hub: Connection) -> Non
             b"\x91" * 100_000,
             encode_message(ActRequest(*sign, 0, 0, 0.0, 0.0, 0.0)),
         ):
-            heard = stranger.query_once(key, payload, timeout_s=PATIENCE_S)
-            assert heard.outcome == "refused" and isinstance(decode_reply(heard.payload), Refusal)
+            reply = stranger.query_once(key, payload, timeout_s=PATIENCE_S)
+            assert reply.outcome == "refused" and isinstance(decode_reply(reply.payload), Refusal)
         everybody = key.rpartition("/")[0].rpartition("/")[0] + "/**"
         assert stranger.query_once(everybody, b"", timeout_s=PATIENCE_S).outcome in (
             "refused",
             "answered",
         )
-        assert driver.act(seen_at(0)) == Command(0.1, 0.0) and policy.asked == ["k1"]
+        assert driver.act(observation_at(0)) == Command(0.1, 0.0) and policy.queried == ["k1"]
 
 
 @pytest.mark.engine
@@ -529,7 +533,7 @@ def test_several_cosim_serve_processes_answer_for_one_policy(tmp_path: Path) -> 
             servers.close()
             driver = remote_driver("zenoh:both", PolicyHost(servers=(at,), run="r"))
             driver.reset("k1", 1)
-            assert driver.act(seen_at(0)).v_mps == pytest.approx(1.0 + RGB.mean() / 1e4)
+            assert driver.act(observation_at(0)).v_mps == pytest.approx(1.0 + RGB.mean() / 1e4)
             driver.close()
             one.send_signal(signal.SIGINT)
             assert one.wait(PATIENCE_S) == 130

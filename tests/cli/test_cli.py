@@ -75,8 +75,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     graph = WalkGraph(street_map)
     scenarios = []
     for i in range(4):
-        whole = build_long_horizon(city, street_map, graph, i, f"t-{i}")
-        fields = {name: getattr(whole, name) for name in Scenario.__struct_fields__}
+        long_way = build_long_horizon(city, street_map, graph, i, f"t-{i}")
+        fields = {name: getattr(long_way, name) for name in Scenario.__struct_fields__}
         crowd = CrowdSpec(persons=8, radius_m=50.0, vehicles=2)
         scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 1.0}))
     for name, count in (("tiny", 3), ("four", 4)):
@@ -203,8 +203,8 @@ def test_a_run_prints_its_table_and_leaves_its_folder(
         and "3 episodes" in again.stdout
         and "equal to the bit" in again.stdout
     )
-    one = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
-    assert one.returncode == 0, one.stderr
+    result = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
+    assert result.returncode == 0, result.stderr
     assert (desk / "above.png").stat().st_size > 5000
 
 
@@ -263,11 +263,11 @@ def test_an_interrupted_run_is_finished_by_resume(
         stderr = run.communicate(timeout=PATIENCE_S)[1]
         if how != signal.SIGKILL:
             assert run.returncode == 130 and reports_stop(stderr, out.name), stderr
-        kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
+        written_ns = (out / "episodes/t-0/record.json").stat().st_mtime_ns
         wait_until(lambda: not alive(out))
     again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
     assert again.returncode == 0, again.stderr
-    assert (out / "episodes/t-0/record.json").stat().st_mtime_ns == kept
+    assert (out / "episodes/t-0/record.json").stat().st_mtime_ns == written_ns
     assert (out / "results.csv").read_bytes() == unbroken
 
 
@@ -391,7 +391,7 @@ def test_unknown_names_are_answered_with_the_valid_ones(
 ) -> None:
     """Unknown suites, policies, scenarios, runs and episodes give exit code 2, the name, and the
     valid choices."""
-    asked = {
+    requests = {
         ("run", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
         ("run", "tiny.json", "--policy", "rout"): ("policy 'rout'", "social_force, stop, straight"),
         ("run", "tiny.json", "--policy", "mine:Hel"): ("'Hel'", "Held"),
@@ -413,7 +413,7 @@ def test_unknown_names_are_answered_with_the_valid_ones(
         ("show", "nothing"): ("run 'nothing'", "whole"),
         ("list", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
     }
-    for words, (name, choices) in asked.items():
+    for words, (name, choices) in requests.items():
         result = cosim(*words, cwd=desk)
         assert result.returncode == 2, (words, result.stderr)
         assert name in result.stderr and choices in result.stderr, (words, result.stderr)
@@ -439,10 +439,10 @@ def test_a_run_with_a_wrong_endpoint_leaves_no_folder(desk: Path, cosim: Cosim) 
         "cannot listen at tcp/192.0.2.1:7447" in result.stderr
         and "Choose an address of this" in result.stderr
     )
-    heard = cosim("listen", "--connect", "7447", cwd=desk)
+    listening = cosim("listen", "--connect", "7447", cwd=desk)
     assert (
-        heard.returncode == 2
-        and "--connect '7447': write it as PROTOCOL/ADDRESS:PORT" in heard.stderr
+        listening.returncode == 2
+        and "--connect '7447': write it as PROTOCOL/ADDRESS:PORT" in listening.stderr
     )
 
 

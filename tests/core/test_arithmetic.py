@@ -13,10 +13,10 @@ from cosim.core.versions import arithmetic, versions
 
 FLAGS = set(Path("/proc/cpuinfo").read_text().split())
 WITHOUT_FMA = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-FMA4,-AVX2_Usable,-FMA_Usable,-AVX2"}
-TELLS = "from cosim.core.versions import arithmetic as a; print(a())"
+PRINT_FINGERPRINT = "from cosim.core.versions import arithmetic as a; print(a())"
 
 
-def fingerprint(program: str = TELLS, **environment: str) -> str:
+def fingerprint(program: str = PRINT_FINGERPRINT, **environment: str) -> str:
     command = [sys.executable, "-W", "ignore", "-c", program]
     return subprocess.run(
         command, env=os.environ | environment, capture_output=True, text=True, check=True
@@ -40,14 +40,15 @@ def test_numpy_with_avx512_has_another_fingerprint() -> None:
     if "avx512f" not in FLAGS:
         pytest.skip("this processor has no AVX-512")
     assert (
-        fingerprint("import numpy; " + TELLS, NPY_DISABLE_CPU_FEATURES="").strip() != arithmetic()
+        fingerprint("import numpy; " + PRINT_FINGERPRINT, NPY_DISABLE_CPU_FEATURES="").strip()
+        != arithmetic()
     )
 
 
 _FEATURES = "from numpy._core._multiarray_umath import __cpu_features__ as f; print(f['X86_V4'])"
 
 
-def _said(program: str) -> subprocess.CompletedProcess[str]:
+def _run(program: str) -> subprocess.CompletedProcess[str]:
     clean = {"PYTHONPATH": ":".join(sys.path)}
     return subprocess.run(
         [sys.executable, "-c", program], env=clean, capture_output=True, text=True, check=True
@@ -66,20 +67,20 @@ def _said(program: str) -> subprocess.CompletedProcess[str]:
 )
 def test_every_package_loads_numpy_without_avx512(room: str) -> None:
     """Whichever package of the project a program imports first, numpy computes without AVX-512."""
-    assert _said(f"import {room}; {_FEATURES}").stdout == "False\n"
+    assert _run(f"import {room}; {_FEATURES}").stdout == "False\n"
 
 
 def test_a_program_that_loads_numpy_first_is_warned() -> None:
     """The warning says that numpy computes with AVX-512, and what to do."""
-    if _said(_FEATURES).stdout == "False\n":
+    if _run(_FEATURES).stdout == "False\n":
         pytest.skip("this processor has no AVX-512")
-    assert "Import cosim first" in _said("import numpy, cosim").stderr
-    assert "AVX-512" not in _said("import cosim, numpy").stderr
+    assert "Import cosim first" in _run("import numpy, cosim").stderr
+    assert "AVX-512" not in _run("import cosim, numpy").stderr
 
 
 def test_features_that_the_user_disables_stay_disabled() -> None:
     """Features of numpy that the environment already disables remain disabled."""
-    asked = "import os; os.environ['NPY_DISABLE_CPU_FEATURES'] = 'X86_V3, X86_V4'; import cosim; "
-    assert _said(asked + "print(os.environ['NPY_DISABLE_CPU_FEATURES'])").stdout.startswith(
+    program = "import os; os.environ['NPY_DISABLE_CPU_FEATURES'] = 'X86_V3, X86_V4'; import cosim; "
+    assert _run(program + "print(os.environ['NPY_DISABLE_CPU_FEATURES'])").stdout.startswith(
         "X86_V3 X86_V4 "
     )

@@ -67,9 +67,9 @@ def test_least_recently_used_entries_are_evicted_beyond_the_limit(
 ) -> None:
     """Imported maps count and stay, whatever the limit; below it nothing is evicted."""
     assert len(left(cache)) == 5 and not clean_up().entries
-    gone = clean_up(limit_bytes=round(3.5 * MB))
-    assert [entry.path.name for entry in gone.entries] == ["a.map", "city-1.net.xml"]
-    assert gone.size_bytes == pytest.approx(2 * MB, rel=0.1)
+    evicted = clean_up(limit_bytes=round(3.5 * MB))
+    assert [entry.path.name for entry in evicted.entries] == ["a.map", "city-1.net.xml"]
+    assert evicted.size_bytes == pytest.approx(2 * MB, rel=0.1)
     monkeypatch.setenv("COSIM_CACHE_LIMIT", "0")
     clean_up_if_due()
     assert left(cache) == {"maps/town"}
@@ -79,8 +79,8 @@ def test_entries_of_a_living_process_are_not_evicted(cache: Path) -> None:
     """The oldest entry stays, whatever the limit, until the process that uses it ends, however it
     ends."""
     with user_of("city-1.net.xml") as process:
-        gone = clean_up(limit_bytes=0)
-        assert [entry.path.name for entry in gone.in_use] == ["city-1.net.xml"]
+        evicted = clean_up(limit_bytes=0)
+        assert [entry.path.name for entry in evicted.in_use] == ["city-1.net.xml"]
         assert left(cache) == {"maps/town", "city-1.net.xml"}
         process.kill()
         process.wait(PATIENCE_S)

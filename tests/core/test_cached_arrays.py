@@ -72,9 +72,10 @@ def files_in(cache: Path) -> list[Path]:
 
 def same(arrays: Arrays) -> bool:
     return [*arrays] == [*WANTED] and all(
-        (held.dtype, held.shape, held.tobytes()) == (wanted.dtype, wanted.shape, wanted.tobytes())
-        and not held.flags.writeable
-        for held, wanted in zip(arrays.values(), WANTED.values(), strict=True)
+        (array.dtype, array.shape, array.tobytes())
+        == (wanted.dtype, wanted.shape, wanted.tobytes())
+        and not array.flags.writeable
+        for array, wanted in zip(arrays.values(), WANTED.values(), strict=True)
     )
 
 

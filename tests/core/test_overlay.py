@@ -104,9 +104,9 @@ def test_shapes_that_geos_refuses_are_repaired(name: str) -> None:
     repaired = shapely.make_valid(bow, method="structure")
     assert operation(bow, square).is_valid
     assert operation(bow, square).area == pytest.approx(plain(repaired, square).area, abs=1e-6)
-    whole = box(0.1, 0.2, 3.3, 7.7)
-    many = operation(np.array([whole, bow, None], dtype=object), square)
-    assert many[0].wkb == plain(whole, square).wkb and many[1].is_valid and many[2] is None
+    sound = box(0.1, 0.2, 3.3, 7.7)
+    many = operation(np.array([sound, bow, None], dtype=object), square)
+    assert many[0].wkb == plain(sound, square).wkb and many[1].is_valid and many[2] is None
 
 
 def test_shapes_that_geos_accepts_keep_their_bits() -> None:

@@ -184,15 +184,19 @@ def test_a_crop_is_the_slice_of_the_whole_picture(camera: str, lens: Lens) -> No
         spec = CameraSpec(64, 48, lens=lens, crop=crop)
         with camera_of(camera, world, spec, depth=True) as eyes:  # type: ignore[arg-type]
             frames.append(eyes.render(robot, street))
-    whole, part = frames
+    uncropped, part = frames
     assert spec.size == (40, 26) and part.rgb.shape == (26, 40, 3)
-    assert len(np.unique(whole.rgb)) > 10
-    for one, other in (
-        (whole.rgb, part.rgb),
-        (whole.labels, part.labels),
-        (whole.depth, part.depth),
+    assert len(np.unique(uncropped.rgb)) > 10
+    for expected, other in (
+        (uncropped.rgb, part.rgb),
+        (uncropped.labels, part.labels),
+        (uncropped.depth, part.depth),
     ):
-        assert one is not None and other is not None and np.array_equal(one[4:30, 10:50], other)
+        assert (
+            expected is not None
+            and other is not None
+            and np.array_equal(expected[4:30, 10:50], other)
+        )
 
 
 @pytest.mark.engine

@@ -41,7 +41,7 @@ class FakePolicy:
         return self.does(observation)  # type: ignore[return-value]
 
 
-def seen(tick: int = 0, known: Privileged | None = None) -> Observation:
+def observation_at(tick: int = 0, known: Privileged | None = None) -> Observation:
     return Observation(tick, 0.05 * tick, np.full((4, 4, 3), 7, np.uint8), 0.5, 0.0, COURIER, known)
 
 
@@ -92,7 +92,7 @@ def deaf() -> object:
         (KeyboardInterrupt(), "raised KeyboardInterrupt (act at 0.10 s)"),
         (GeneratorExit(), "raised GeneratorExit (act at 0.10 s)"),
         (MemoryError(), "raised MemoryError (act at 0.10 s)"),
-        (UnreadableError(), "raised Mute: (its message cannot be read)"),
+        (UnreadableError(), "raised UnreadableError: (its message cannot be read)"),
         (ValueError("\ud800\x1b[2J"), "raised ValueError: ??[2J"),
         (ValueError("x" * 10_000), "... (10000 characters)"),
     ],
@@ -104,7 +104,7 @@ def test_any_exception_of_a_policy_is_its_crash(
     """Also BaseExceptions and unprintable errors give one message with the policy's name and the
     time."""
     with pytest.raises(PolicyError) as caught:
-        PolicyCaller(FakePolicy(raising(error))).act(seen(tick=2))
+        PolicyCaller(FakePolicy(raising(error))).act(observation_at(tick=2))
     assert str(caught.value).startswith("policy 'mine' raised ") and expected in without_lines(
         str(caught.value)
     )
@@ -122,7 +122,7 @@ def test_a_crash_names_the_last_line_of_the_users_code() -> None:
     with pytest.raises(
         PolicyError, match=rf"size 3 into shape \(2,\) in test_driver\.py:{line} \(act at 0\.00 s\)"
     ):
-        PolicyCaller(FakePolicy(by_numpy)).act(seen(tick=0))
+        PolicyCaller(FakePolicy(by_numpy)).act(observation_at(tick=0))
 
 
 def test_a_reset_that_raises_is_a_crash_too() -> None:
@@ -136,7 +136,7 @@ def test_a_reset_that_raises_is_a_crash_too() -> None:
 def test_ctrl_c_is_no_crash() -> None:
     """Ctrl-C in an interactive process ends the call as KeyboardInterrupt."""
     with pytest.raises(KeyboardInterrupt):
-        PolicyCaller(FakePolicy(raising(KeyboardInterrupt()))).act(seen())
+        PolicyCaller(FakePolicy(raising(KeyboardInterrupt()))).act(observation_at())
 
 
 def test_an_answer_is_read_once_and_safely() -> None:
@@ -152,11 +152,11 @@ def test_an_answer_is_read_once_and_safely() -> None:
             return next(values)
 
     with pytest.raises(PolicyError, match="raised SystemExit: 9"):
-        PolicyCaller(FakePolicy(lambda _: Command(Pretends(1.0), 0.0))).act(seen())
+        PolicyCaller(FakePolicy(lambda _: Command(Pretends(1.0), 0.0))).act(observation_at())
     values = iter([1.0, float("nan"), 99.0])
     shifty = object.__new__(Shifty)
     object.__setattr__(shifty, "w_radps", 0.0)
-    assert PolicyCaller(FakePolicy(lambda _: shifty)).act(seen()) == Command(1.0, 0.0)
+    assert PolicyCaller(FakePolicy(lambda _: shifty)).act(observation_at()) == Command(1.0, 0.0)
 
 
 def test_a_policy_gets_copies_that_it_may_write_to() -> None:
@@ -188,7 +188,7 @@ def test_a_policy_gets_copies_that_it_may_write_to() -> None:
         return STILL
 
     known = knowledge()
-    observation = seen(known=known)
+    observation = observation_at(known=known)
     PolicyCaller(FakePolicy(scribbles, dataclasses.replace(MINE, privileged=True))).act(observation)
     assert (observation.rgb == 7).all()
     again = knowledge()
@@ -212,9 +212,9 @@ def test_a_route_stays_the_same_object_through_an_episode() -> None:
     driver = PolicyCaller(FakePolicy(notes, dataclasses.replace(MINE, privileged=True)))
     known = knowledge()
     for tick in (0, 5):
-        driver.act(seen(tick, known))
+        driver.act(observation_at(tick, known))
     driver.reset("next", 0)
-    driver.act(seen(0, known))
+    driver.act(observation_at(0, known))
     assert routes[0] is routes[1] and routes[2] is not routes[0]
 
 
@@ -232,7 +232,7 @@ def test_a_manifest_is_read_once() -> None:
     policy = FakePolicy(greedy)
     driver = PolicyCaller(policy)
     for tick in range(3):
-        driver.act(seen(tick, knowledge()))
+        driver.act(observation_at(tick, knowledge()))
     assert known == [None] * 3 and driver.manifest == MINE
 
 
@@ -244,7 +244,7 @@ def test_a_forked_child_of_a_policy_does_not_continue_the_episode() -> None:
         os.fork()
         return STILL
 
-    PolicyCaller(FakePolicy(forks)).act(seen())
+    PolicyCaller(FakePolicy(forks)).act(observation_at())
     os.write(write, b"x")
     _, status = os.wait()
     assert os.read(read, 10) == b"x" and os.waitstatus_to_exitcode(status) == 1
@@ -263,8 +263,8 @@ def test_a_policy_at_work_is_timed() -> None:
 
     driver = PolicyCaller(FakePolicy(lambda _: STILL), timer=Notes())
     driver.reset("a", 0)
-    driver.act(seen(0))
-    driver.act(seen(5))
+    driver.act(observation_at(0))
+    driver.act(observation_at(5))
     with pytest.raises(PolicyError):
         driver.reset("bad", 0)
     assert calls == [
@@ -286,8 +286,8 @@ def test_a_policy_gets_copies_of_its_goal_and_further_pictures() -> None:
     grey = np.full((4, 4, 3), 7, np.uint8)
     calibration = Calibration(np.eye(3), np.zeros(5), np.eye(4))
     left = CameraPicture(grey, ones, ones.astype(np.float32), calibration)
-    whole = dataclasses.replace(
-        seen(), depth=ones.astype(np.float32), labels=ones, pictures={"left": left}
+    full_observation = dataclasses.replace(
+        observation_at(), depth=ones.astype(np.float32), labels=ones, pictures={"left": left}
     )
     manifest = dataclasses.replace(MINE, cameras={})
 
@@ -315,18 +315,18 @@ def test_a_policy_gets_copies_of_its_goal_and_further_pictures() -> None:
 
     driver = PolicyCaller(FakePolicy(scribbles, manifest))
     for goal in (ImageGoal(grey), RoutePatch(ones)):
-        driver.act(dataclasses.replace(whole, goal=goal))
+        driver.act(dataclasses.replace(full_observation, goal=goal))
     assert (
         (grey == 7).all()
         and (ones == 1).all()
         and (left.depth == 1).all()
-        and (whole.depth == 1).all()
+        and (full_observation.depth == 1).all()
     )
-    assert set(whole.pictures) == {"left"} and driver.manifest.cameras == {}
+    assert set(full_observation.pictures) == {"left"} and driver.manifest.cameras == {}
 
 
 def after_reset(name: str, tick: int) -> Observation:
-    return dataclasses.replace(seen(tick), episode=name, reset=True)
+    return dataclasses.replace(observation_at(tick), episode=name, reset=True)
 
 
 class RecordsCalls(FakePolicy):
@@ -361,7 +361,7 @@ def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
     """on_reset is called only before the act after a teleport; an error in it is a crash."""
     policy = RecordsCalls()
     driver = PolicyCaller(policy)
-    for observation in (seen(0), after_reset("", 5), seen(10)):
+    for observation in (observation_at(0), after_reset("", 5), observation_at(10)):
         driver.act(observation)
     driver.ended()
     assert policy.calls == ["act", "on_reset", "act", "act"]

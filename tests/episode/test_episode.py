@@ -69,8 +69,8 @@ def test_waypoints_are_recorded_as_they_were_answered_and_the_record_replays(
 ) -> None:
     """After a second of commands the trajectory has all waypoints with the followed one, and the
     replay has the same state hash."""
-    came = run_episode(scenario, Blind())
-    record, log = came.record, came.log
+    result = run_episode(scenario, Blind())
+    record, log = result.record, result.log
     assert log is not None and log.answers[:, 0].tolist() == [*range(0, 40, 4)]
     assert log.plan_sizes.tolist() == [0] * 5 + [8] * 5 and log.plan_index == 2
     assert np.array_equal(log.plan_points, np.tile(BEND.astype(np.float32), (5, 1)))
@@ -95,8 +95,8 @@ def test_the_observation_after_a_teleport_has_reset_set() -> None:
         if verdict.reset is not None:
             put_back.append(step.tick)
 
-    whole = msgspec.structs.replace(small_scenario(), time_limit_s=12.0)
-    with Episode(whole, blind, watches=[watch]) as episode:
+    scenario = msgspec.structs.replace(small_scenario(), time_limit_s=12.0)
+    with Episode(scenario, blind, watches=[watch]) as episode:
         seen = [episode.reset()]
         while not episode.over:
             seen.append(episode.advance(Command(1.5, 0.65)))

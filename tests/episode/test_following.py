@@ -70,9 +70,9 @@ def test_waypoints_of_every_kind_are_stored_as_answered(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["plan_sizes", "plan_points", "plan_index"])
 def test_a_trajectory_with_incomplete_waypoints_is_refused(tmp_path: Path, name: str) -> None:
     """A missing array of waypoints is refused with the file's name."""
-    held = dataclasses.asdict(log_of((0, 0, WaypointCommand(1.0, 0.0, AHEAD, 1))))
-    del held[name]
-    np.savez(tmp_path / "t.npz", **held)
+    arrays = dataclasses.asdict(log_of((0, 0, WaypointCommand(1.0, 0.0, AHEAD, 1))))
+    del arrays[name]
+    np.savez(tmp_path / "t.npz", **arrays)
     with pytest.raises(RunError, match=r"t\.npz: not a trajectory"):
         Log.load(tmp_path / "t.npz")
 
@@ -86,10 +86,10 @@ def test_waypoints_are_followed_from_their_effect_to_the_next_or_a_reset() -> No
     )
     assert following.follows == 2
     poses = [Pose(1.0, 2.0 + tick, math.pi / 2.0) for tick in range(9)]
-    came = [
+    followed = [
         following.update(step_at(tick, pose), reset=tick == 7) for tick, pose in enumerate(poses)
     ]
-    assert [one is None for one in came] == [
+    assert [one is None for one in followed] == [
         True,
         True,
         False,
@@ -100,6 +100,8 @@ def test_waypoints_are_followed_from_their_effect_to_the_next_or_a_reset() -> No
         False,
         True,
     ]
-    assert all(one is came[2] for one in came[2:6])
-    for tick, asked in ((2, 0), (7, 5)):
-        assert np.allclose(came[tick], [(1.0, 2.0 + asked), (1.0, 3.0 + asked), (0.5, 4.0 + asked)])
+    assert all(one is followed[2] for one in followed[2:6])
+    for tick, answered in ((2, 0), (7, 5)):
+        assert np.allclose(
+            followed[tick], [(1.0, 2.0 + answered), (1.0, 3.0 + answered), (0.5, 4.0 + answered)]
+        )

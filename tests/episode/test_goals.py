@@ -203,13 +203,15 @@ def test_instructions_mention_only_turns_and_crosswalks() -> None:
         rf"(Follow the sidewalk\.|{what}\.( {what}\.)*)( In (5|10|15|20) m, {what}\.)?",
         re.IGNORECASE,
     )
-    heard = set()
+    instructions = set()
     for one in load_suite("long-horizon").scenarios[:12]:
         ways = manoeuvres(one.route_line, one.crossings)
-        heard |= {
+        instructions |= {
             instruction_at(s_m, ways) for s_m in np.arange(0.0, one.route_line.length_m).tolist()
         }
-    assert [text for text in heard if not allowed.fullmatch(text)] == [] and len(heard) > 8
+    assert [text for text in instructions if not allowed.fullmatch(text)] == [] and len(
+        instructions
+    ) > 8
 
 
 @pytest.mark.parametrize(

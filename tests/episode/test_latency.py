@@ -38,10 +38,10 @@ from tests.run_specs import changed, record_of
 
 def commands(answers: Floats, ticks: int) -> Floats:
     """Return (ticks, 2) the commands of an episode's answers tick by tick, without a reset."""
-    held = np.zeros((ticks, 2))
+    in_effect = np.zeros((ticks, 2))
     for tick, delay, v_mps, w_radps in answers:
-        held[int(tick + delay) :] = v_mps, w_radps
-    return held
+        in_effect[int(tick + delay) :] = v_mps, w_radps
+    return in_effect
 
 
 def test_delayed_commands_keep_their_order_and_a_reset_discards_them() -> None:
@@ -110,7 +110,7 @@ def test_tables_show_latency_only_where_there_is_any() -> None:
 
 
 @pytest.mark.parametrize(
-    "asked, real_time, expected",
+    "latency, real_time, expected",
     [
         ("soon", False, "--latency 'soon': give milliseconds, like 200, or 'measured'"),
         ("200", True, "--real-time measures the latency of every answer: leave --latency out"),
@@ -120,11 +120,11 @@ def test_tables_show_latency_only_where_there_is_any() -> None:
     ids=["a word", "both", "negative", "no number"],
 )
 def test_contradictory_latency_options_are_refused(
-    asked: str, real_time: bool, expected: str
+    latency: str, real_time: bool, expected: str
 ) -> None:
     """The options are named, with the remedy."""
     with pytest.raises(UsageError, match=re.escape(expected)):
-        RunConfig(suite="reactive", latency=asked, real_time=real_time)
+        RunConfig(suite="reactive", latency=latency, real_time=real_time)
 
 
 def small_in_two_s() -> Scenario:
@@ -155,17 +155,17 @@ class Faster:
     manifest = Manifest("faster", rate_hz=5.0, camera=None)
 
     def __init__(self, slow_s: float = 0.0) -> None:
-        self.asked: list[int] = []
+        self.queried: list[int] = []
         self._slow_s = slow_s
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Start slowly."""
-        self.asked = []
+        self.queried = []
 
     def act(self, observation: Observation) -> Command:
-        self.asked.append(observation.tick)
+        self.queried.append(observation.tick)
         time.sleep(self._slow_s)
-        return Command(0.1 * len(self.asked), 0.0)
+        return Command(0.1 * len(self.queried), 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -179,14 +179,17 @@ def test_a_fixed_latency_delays_each_command_to_the_tick(
 ) -> None:
     """By hand: 120 ms are three ticks, so commands of observations every 4 ticks begin at 3, 7, 11,
     ..."""
-    came = run_episode(scenario, Faster(), EpisodeOptions(latency_ms=120.0))
-    assert came.log is not None and (came.record.setup.latency_ms, came.record.setup.real_time) == (
+    result = run_episode(scenario, Faster(), EpisodeOptions(latency_ms=120.0))
+    assert result.log is not None and (
+        result.record.setup.latency_ms,
+        result.record.setup.real_time,
+    ) == (
         120.0,
         False,
     )
     by_hand = [0.0] * 3 + [0.1 * k for k in range(1, 10) for _ in range(4)] + [0.1 * 10]
-    assert np.allclose(came.log.command[:, 0], by_hand, atol=1e-12)
-    assert came.log.answers[:, :2].tolist() == [[4 * k, 3] for k in range(10)]
+    assert np.allclose(result.log.command[:, 0], by_hand, atol=1e-12)
+    assert result.log.answers[:, :2].tolist() == [[4 * k, 3] for k in range(10)]
 
 
 @pytest.mark.engine
@@ -196,14 +199,14 @@ def test_real_time_delays_are_recorded_and_replayed(
     """For a policy of 0.2 s the recorded delays were applied, queries do not overlap, and the
     replay has the same state hash."""
     slow = Faster(slow_s=0.2)
-    came = run_episode(scenario, slow, EpisodeOptions(real_time=True))
-    record, log = came.record, came.log
+    result = run_episode(scenario, slow, EpisodeOptions(real_time=True))
+    record, log = result.record, result.log
     assert log is not None and record.setup.real_time
-    asked, delays = log.answers[:, 0], log.answers[:, 1]
+    queried, delays = log.answers[:, 0], log.answers[:, 1]
     assert (
         (delays >= 4).all()
-        and asked.tolist() == slow.asked
-        and (asked[1:] >= (asked + delays)[:-1]).all()
+        and queried.tolist() == slow.queried
+        and (queried[1:] >= (queried + delays)[:-1]).all()
     )
     assert np.array_equal(log.command, commands(log.answers, len(log)))
     assert record.setup.latency_ms == 50.0 * np.median(delays) and record.answer_ms is not None

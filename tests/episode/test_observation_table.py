@@ -72,9 +72,11 @@ def table() -> list[Row]:
     )
     found = []
     for line in lines:
-        named, asked, types, words = (cell.strip() for cell in line.strip("|").split(" | "))
+        named, requested_by, types, words = (cell.strip() for cell in line.strip("|").split(" | "))
         stated = tuple(types.split(" or ")) if " of " not in types else (types,)
-        found += [Row(path, asked, stated, words) for path in re.findall(r"`([^`]+)`", named)]
+        found += [
+            Row(path, requested_by, stated, words) for path in re.findall(r"`([^`]+)`", named)
+        ]
     return found
 
 
@@ -256,11 +258,11 @@ def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
     fields, arrays = encode_observation(dataclasses.replace(seen, privileged=None))
     laid = {name: pack_array(array) for name, array in arrays.items()}
     about = encode_constants(seen)
-    asked = ActRequest("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
-    came = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=ActRequest)
-    copies = {name: unpack_array(array) for name, array in came.arrays.items()}
+    request = ActRequest("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
+    received = msgspec.msgpack.decode(msgspec.msgpack.encode(request), type=ActRequest)
+    copies = {name: unpack_array(array) for name, array in received.arrays.items()}
     afar, plain = (
-        kind(seen.episode, came.about).decoded(came, copies)
+        kind(seen.episode, received.about).decoded(received, copies)
         for kind in (ObservationDecoder, EpisodeDecoder)
     )
     return afar, plain
@@ -271,9 +273,9 @@ def test_an_observation_that_is_sent_arrives_equal_to_the_bit(seen: dict[str, Ob
     """By every goal protocol each array and number arrives, privileged knowledge included."""
     for one in seen.values():
         fields, arrays = encode_observation(one)
-        asked = ActRequest("r", one.episode, "a", 0, **fields)
-        came = ObservationDecoder(one.episode, encode_constants(one)).decoded(asked, arrays)
-        assert bytes_of(one) == bytes_of(came)
+        request = ActRequest("r", one.episode, "a", 0, **fields)
+        received = ObservationDecoder(one.episode, encode_constants(one)).decoded(request, arrays)
+        assert bytes_of(one) == bytes_of(received)
 
 
 def bytes_of(seen: Observation) -> bytes:
@@ -297,13 +299,19 @@ def test_goals_and_odometry_are_arrays_for_numpy() -> None:
     assert np.stack([point, point]).shape == (2, 2)  # type: ignore[call-overload]
     assert np.asarray(Odometry(1.0, 2.0, 0.5)).tolist() == [1.0, 2.0, 0.5]
     assert np.asarray(Odometry(1.0, 2.0, None)).tolist() == [1.0, 2.0]
-    for one in (ImageGoal(pixels), RoutePatch(pixels), CameraPicture(pixels, None, None, CAMERA)):
-        assert np.asarray(one) is pixels and np.asarray(one, np.float32).dtype == np.float32
-    for one, words in (
+    for expected in (
+        ImageGoal(pixels),
+        RoutePatch(pixels),
+        CameraPicture(pixels, None, None, CAMERA),
+    ):
+        assert (
+            np.asarray(expected) is pixels and np.asarray(expected, np.float32).dtype == np.float32
+        )
+    for expected, words in (
         (Instruction("Stop."), "read observation.goal.text"),
         (CAMERA, r"read .matrix \(3, 3\)"),
     ):
         with pytest.raises(TypeError, match=words):
-            np.asarray(one)
+            np.asarray(expected)
     assert point == PointGoal(3.0, -4.0) and hash(point) == hash(PointGoal(3.0, -4.0))
     assert msgspec.json.encode(point) == b'{"type":"point","x_m":3.0,"y_m":-4.0}'

@@ -106,10 +106,10 @@ def test_a_default_manifest_gets_only_the_basic_observation() -> None:
     """It has speeds, time and robot, but no picture, goal, odometry, calibration, depth, labels or
     knowledge."""
     seen = observed(Manifest("blind", camera=None))
-    given = {
+    goal_and_odometry = {
         f.name for f in dataclasses.fields(seen) if getattr(seen, f.name) not in (None, {}, False)
     }
-    assert given == {"tick", "time_s", "v_mps", "w_radps", "robot", "episode"}
+    assert goal_and_odometry == {"tick", "time_s", "v_mps", "w_radps", "robot", "episode"}
 
 
 def test_each_requested_sensor_is_given() -> None:
@@ -218,15 +218,20 @@ def test_privileged_policies_get_the_simulators_knowledge() -> None:
 def test_goals_and_errors_are_drawn_independently_from_the_runs_seed() -> None:
     """Goals and errors repeat with the seed and differ with another, and odometry changes no goal."""
 
-    def given(seed: int, odometry: OdometryKind = "gps") -> tuple[object, Odometry | None]:
+    def goal_and_odometry(
+        seed: int, odometry: OdometryKind = "gps"
+    ) -> tuple[object, Odometry | None]:
         seen = observed(
             Manifest("mine", camera=None, goal="random_point", odometry=odometry), seed=seed
         )
         return seen.goal, seen.odometry
 
-    assert given(3) == given(3)
-    assert given(3)[0] != given(4)[0] and given(3)[1] != given(4)[1]
-    assert given(3, "wheel")[0] == given(3)[0]
+    assert goal_and_odometry(3) == goal_and_odometry(3)
+    assert (
+        goal_and_odometry(3)[0] != goal_and_odometry(4)[0]
+        and goal_and_odometry(3)[1] != goal_and_odometry(4)[1]
+    )
+    assert goal_and_odometry(3, "wheel")[0] == goal_and_odometry(3)[0]
 
 
 def drove(before: Pose, after: Pose) -> Step:
@@ -239,18 +244,18 @@ def test_a_reset_gives_another_random_point_and_is_not_counted_by_the_wheels() -
     """After 2 m of driving and a reset by 6 m the wheels count 2 m, and the point is 5 to 20 m
     ahead."""
     observer = observing(Manifest("mine", camera=None, goal="random_point", odometry="wheel"))
-    start, there, back = (Pose(101.3 + d, 57.7, 0.0) for d in (0.0, 2.0, -4.0))
+    start, ahead, back = (Pose(101.3 + d, 57.7, 0.0) for d in (0.0, 2.0, -4.0))
     first = observer.observed(moment(0, start), 0.0, None, was_reset=False)[0].goal
-    observer.moved(drove(start, there), is_reset=False)
-    kept = observer.observed(moment(5, there), 0.25, None, was_reset=False)[0].goal
-    observer.moved(drove(there, there), is_reset=True)
+    observer.moved(drove(start, ahead), is_reset=False)
+    unchanged = observer.observed(moment(5, ahead), 0.25, None, was_reset=False)[0].goal
+    observer.moved(drove(ahead, ahead), is_reset=True)
     seen = observer.observed(moment(6, back), 0.3, None, was_reset=True)[0]
     assert (
         isinstance(first, PointGoal)
-        and isinstance(kept, PointGoal)
+        and isinstance(unchanged, PointGoal)
         and isinstance(seen.goal, PointGoal)
     )
-    assert (kept.x_m, kept.y_m) == pytest.approx((first.x_m - 2.0, first.y_m))
+    assert (unchanged.x_m, unchanged.y_m) == pytest.approx((first.x_m - 2.0, first.y_m))
     assert 5.0 <= seen.goal.x_m <= 20.0 and abs(seen.goal.x_m - (first.x_m + 4.0)) > 1e-6
     assert (
         seen.odometry is not None

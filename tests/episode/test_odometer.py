@@ -107,9 +107,10 @@ def test_position_fix_errors_are_as_declared() -> None:
         np.full((3, 2), math.hypot(noise.noise_m, noise.bias_m)), rel=0.12
     )
     short, long = (off[:, 1] - off[:, 0]).std(), (off[:, 2] - off[:, 1]).std()
-    kept = math.exp(-1.0 / 60.0)
+    correlation = math.exp(-1.0 / 60.0)
     assert short == pytest.approx(
-        math.hypot(math.sqrt(2) * noise.noise_m, noise.bias_m * math.sqrt(2 - 2 * kept)), rel=0.1
+        math.hypot(math.sqrt(2) * noise.noise_m, noise.bias_m * math.sqrt(2 - 2 * correlation)),
+        rel=0.1,
     )
     assert long > 2.0 * short
 

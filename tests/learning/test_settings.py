@@ -93,14 +93,14 @@ def test_the_learning_rate_rises_and_falls_to_zero() -> None:
 
 def test_the_end_of_a_training_is_summarised() -> None:
     """The summary has the bundle, the last step, and how to continue to the same or another end."""
-    stopped, whole = (
+    stopped, finished = (
         outcome_in_words(Path("small"), StepsReached(step, 300)) for step in (118, 300)
     )
     assert (
         "a bundle: --policy onnx:small, stopped at step 118 of 300. Continue with --resume"
         in stopped
     )
-    assert "--resume --steps N, at least 119" in stopped and whole.endswith(
+    assert "--resume --steps N, at least 119" in stopped and finished.endswith(
         "more steps: --resume --steps 600"
     )
     assert state_in_words(20, [10, 40, 80]) == "; step 20 of 80"

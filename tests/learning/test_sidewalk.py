@@ -109,10 +109,10 @@ def test_a_step_by_step_memory_equals_that_of_the_whole_window(data: Path, keeps
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(examples.held_out[:1], 6)
     with torch.no_grad():
-        whole = forward_steps(
+        window = forward_steps(
             parameters, batch.pictures, batch.goal, batch.speeds, torch.zeros(1, MEMORY), keeps
         )
-    wanted = plan(whole.plan).numpy()
+    wanted = plan(window.plan).numpy()
     session = session_of(build_memory_graph(parameters, keeps))
     memory = np.zeros((1, MEMORY), np.float32)
     for step in range(6):
@@ -123,9 +123,9 @@ def test_a_step_by_step_memory_equals_that_of_the_whole_window(data: Path, keeps
             ["plan", "memory_next", "near"], inputs | {"memory": memory}
         )
         np.testing.assert_allclose(found[0], wanted[step], atol=1e-4)
-        np.testing.assert_allclose(near[0], whole.near[step].numpy(), atol=1e-4)
+        np.testing.assert_allclose(near[0], window.near[step].numpy(), atol=1e-4)
         assert memory.any() == keeps
-    np.testing.assert_allclose(memory, whole.memory.numpy(), atol=1e-4)
+    np.testing.assert_allclose(memory, window.memory.numpy(), atol=1e-4)
 
 
 def test_a_run_feeds_the_graph_the_windows_of_training(data: Path) -> None:
@@ -190,12 +190,12 @@ def test_the_mirror_exchanges_left_and_right_in_labels_too(data: Path) -> None:
     """Twice it changes nothing; once people change sides, and free distances their order."""
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(np.array([0, 6]), 4)
-    there = mirror_windows(batch)
-    back = mirror_windows(there)
+    mirrored = mirror_windows(batch)
+    back = mirror_windows(mirrored)
     assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
-    torch.testing.assert_close(there.near[..., 2], -batch.near[..., 2])
-    torch.testing.assert_close(there.free[:, 0], batch.free[:, -1])
-    torch.testing.assert_close(there.near[..., 1], batch.near[..., 1])
+    torch.testing.assert_close(mirrored.near[..., 2], -batch.near[..., 2])
+    torch.testing.assert_close(mirrored.free[:, 0], batch.free[:, -1])
+    torch.testing.assert_close(mirrored.near[..., 1], batch.near[..., 1])
 
 
 def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:

@@ -237,30 +237,30 @@ def test_training_can_start_from_the_shipped_graph_alone(
     learned: Path, data: Path, tmp_path: Path
 ) -> None:
     """The graph holds the initial parameters, so that at a negligible rate it stays as it is."""
-    held = load_parameters(learned / "model.onnx", new_parameters(0))
+    parameters = load_parameters(learned / "model.onnx", new_parameters(0))
     assert train(
         [data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, ignore
     ).whole
-    for name, value in load_parameters(tmp_path / "on" / "model.onnx", held).items():
-        torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
+    for name, value in load_parameters(tmp_path / "on" / "model.onnx", parameters).items():
+        torch.testing.assert_close(value, parameters[name], atol=1e-6, rtol=0)
     drawn = new_parameters(3)
     (tmp_path / "drawn.onnx").write_bytes(build_graph(drawn))
     assert all(
         torch.equal(value, drawn[name])
-        for name, value in load_parameters(tmp_path / "drawn.onnx", held).items()
+        for name, value in load_parameters(tmp_path / "drawn.onnx", parameters).items()
     )
 
 
 def test_the_mirror_exchanges_left_and_right_everywhere(data: Path) -> None:
     """It exchanges sides in picture, goal, speeds and waypoints, and twice it changes nothing."""
     batch = Examples([data], 0, CPU).rows(np.array([0, 4]))
-    there = mirror(batch)
+    mirrored = mirror(batch)
     back = mirror(mirror(batch))
     assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
-    bright = there.pictures[0] > 0.8
+    bright = mirrored.pictures[0] > 0.8
     assert torch.equal(bright, batch.pictures[1] > 0.8)
-    torch.testing.assert_close(there.turn[0], batch.turn[1])
-    torch.testing.assert_close(there.way[0], batch.way[1])
+    torch.testing.assert_close(mirrored.turn[0], batch.turn[1])
+    torch.testing.assert_close(mirrored.way[0], batch.way[1])
 
 
 def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:

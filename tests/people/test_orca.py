@@ -15,7 +15,7 @@ from cosim.people.orca import HalfPlane, best_velocity, half_plane
 FASTEST_MPS = 2.0
 
 
-def of(
+def half_plane_for(
     apart: tuple[float, float],
     mine: tuple[float, float],
     other: tuple[float, float],
@@ -29,7 +29,7 @@ def of(
 def test_standing_still_before_a_standing_disk_is_permitted_and_driving_into_it_is_not() -> None:
     """A disk of radius 1 m at 6 m is reached in 2 s at 2.5 m/s, which is the edge, square to the
     way."""
-    plane = of((6.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    plane = half_plane_for((6.0, 0.0), (0.0, 0.0), (0.0, 0.0))
     assert plane == pytest.approx((-1.0, 0.0, -2.5))
     assert plane.excess(np.array([0.0, 0.0])) == pytest.approx(2.5)
     assert plane.excess(np.array([2.6, 0.0])) == pytest.approx(-0.1)
@@ -38,17 +38,17 @@ def test_standing_still_before_a_standing_disk_is_permitted_and_driving_into_it_
 def test_head_on_the_edge_is_the_leg_of_the_cone() -> None:
     """Two disks 5 m apart that close at 4 m/s must cross the leg at asin(1/5) to the line between
     them."""
-    plane = of((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0))
+    plane = half_plane_for((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0))
     sin = 0.2
     assert (plane.nx, plane.ny) == pytest.approx((-sin, math.sqrt(1 - sin**2)))
     assert plane.excess(np.array([2.0, 0.0])) == pytest.approx(-4.0 * sin)
-    shared = of((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0), share=0.5)
+    shared = half_plane_for((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0), share=0.5)
     assert shared.excess(np.array([2.0, 0.0])) == pytest.approx(-2.0 * sin)
 
 
 def test_a_crossing_person_is_passed_behind() -> None:
     """A person walking left to right ahead forbids going straight on, and permits left."""
-    plane = of((2.5, 1.0), (1.0, 0.0), (0.0, -0.5))
+    plane = half_plane_for((2.5, 1.0), (1.0, 0.0), (0.0, -0.5))
     assert plane.excess(np.array([1.0, 0.0])) < 0.0
     v = best_velocity([plane], np.array([1.0, 0.0]), FASTEST_MPS)
     assert plane.excess(v) == pytest.approx(0.0, abs=1e-9)
@@ -57,7 +57,7 @@ def test_a_crossing_person_is_passed_behind() -> None:
 
 def test_overlapping_disks_separate_within_a_step() -> None:
     """Disks of radius 1 m at 0.9 m separate by the missing 0.1 m in 0.1 s, at 1 m/s."""
-    plane = of((0.9, 0.0), (0.0, 0.0), (0.0, 0.0))
+    plane = half_plane_for((0.9, 0.0), (0.0, 0.0), (0.0, 0.0))
     assert plane == pytest.approx((-1.0, 0.0, 1.0))
 
 
@@ -99,7 +99,7 @@ def test_a_permitted_velocity_keeps_clear_for_the_horizon(
     """With full responsibility a velocity of the half-plane avoids the other disk for tau."""
     if math.hypot(*apart) <= 1.01:
         return
-    plane = of(apart, mine, other)
+    plane = half_plane_for(apart, mine, other)
     v = best_velocity([plane], np.array(mine), 20.0)
     assert plane.excess(v) >= -1e-6
     assert closest(np.array(apart), v - np.array(other), 2.0) >= 1.0 - 1e-4

@@ -22,7 +22,7 @@ def east(name: str) -> float:
     return 0.0
 
 
-def shown(track: Floats, facing_rad: float = 0.0) -> tuple[Floats, Floats, Floats]:
+def filtered(track: Floats, facing_rad: float = 0.0) -> tuple[Floats, Floats, Floats]:
     """Return what the filter shows of one person on a track (T, 2): (T, 2), (T,), (T,)."""
     poses = PoseFilter(DT_S)
     speed = np.hypot(*np.diff(track, axis=0, prepend=track[:1]).T) / DT_S
@@ -42,7 +42,7 @@ def walk(seconds: float, mps: float = 1.4) -> Floats:
 def test_an_even_walk_is_unchanged() -> None:
     """A person who walks evenly is shown exactly where it is, at its speed."""
     track = walk(3.0)
-    xy, facing, speed = shown(track)
+    xy, facing, speed = filtered(track)
     np.testing.assert_allclose(xy, track, atol=1e-12)
     np.testing.assert_allclose(facing, 0.0, atol=1e-12)
     np.testing.assert_allclose(speed[1:], 1.4)
@@ -52,7 +52,7 @@ def test_a_jump_becomes_a_brisk_walk_that_catches_up() -> None:
     """After a sideways jump of 2 m the shown speed stays below the limit, and the gap closes."""
     track = walk(8.0)
     track[40:, 1] += 2.0
-    xy, _, speed = shown(track)
+    xy, _, speed = filtered(track)
     assert speed.max() <= MAX_SPEED_MPS + 1e-9
     assert np.hypot(*np.diff(xy, axis=0).T).max() <= MAX_SPEED_MPS * DT_S + 1e-9
     np.testing.assert_allclose(xy[-1], track[-1], atol=1e-9)
@@ -62,7 +62,7 @@ def test_the_heading_follows_the_motion_at_a_limited_rate() -> None:
     """A turn on the spot by 90 degrees takes at least half a second."""
     track = walk(3.0)
     corner = np.concatenate([track, track[-1] + walk(3.0)[1:, ::-1]])
-    _, facing, _ = shown(corner)
+    _, facing, _ = filtered(corner)
     turns = [abs(wrap_angle(b - a)) for a, b in itertools.pairwise(facing)]
     assert max(turns) <= MAX_TURN_RADPS * DT_S + 1e-9
     assert facing[-1] == pytest.approx(math.pi / 2, abs=0.01)
@@ -72,7 +72,7 @@ def test_a_standing_person_keeps_its_heading() -> None:
     """Small shuffles of a standing person do not turn it."""
     rest = np.zeros((60, 2))
     rest[:, 1] = 0.005 * (np.arange(60) % 2)
-    _, facing, _ = shown(rest, facing_rad=1.0)
+    _, facing, _ = filtered(rest, facing_rad=1.0)
     np.testing.assert_allclose(facing, 1.0)
 
 

@@ -34,7 +34,7 @@ def thing(
     return Obstacle(kind=kind, x_m=x_m, y_m=y_m, heading_rad=heading_rad, form=form)
 
 
-def shown(things: StandingObstacles, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
+def shown_track(things: StandingObstacles, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
     """Return the track (T, 2) of a person whom SUMO moves along x at y_m, straight through every
     obstacle."""
     poses = PoseFilter(DT_S, things)
@@ -78,15 +78,15 @@ def test_cached_distances_do_not_change_a_step() -> None:
 @pytest.mark.parametrize("kind", sorted(OBSTACLE_SIZES_M))
 def test_the_crowd_walks_round_obstacles(kind: str) -> None:
     """From either side and any offset people pass the obstacle and return to their track."""
-    one = thing(kind)
+    obstacle = thing(kind)
     for y_m in (-0.5, -0.1, 0.0, 0.3):
         for east in (True, False):
-            track = shown(standing(one), y_m, east)
-            assert gap_m(track, one) > -TOUCHES_M
+            track = shown_track(standing(obstacle), y_m, east)
+            assert gap_m(track, obstacle) > -TOUCHES_M
             assert track[-1] == pytest.approx([6.6 if east else -6.6, y_m], abs=0.1)
             assert np.hypot(*np.diff(track, axis=0).T).max() <= 0.12
-    through = shown(StandingObstacles(), 0.0, True)
-    assert gap_m(through, one) < -0.2
+    through = shown_track(StandingObstacles(), 0.0, True)
+    assert gap_m(through, obstacle) < -0.2
 
 
 def test_an_obstacle_at_the_edge_is_passed_on_the_other_side() -> None:
@@ -97,7 +97,7 @@ def test_an_obstacle_at_the_edge_is_passed_on_the_other_side() -> None:
     assert (body.closed_x, body.closed_y) == pytest.approx((0.0, 1.0), abs=0.05)
     for east in (True, False):
         for y_m in (1.2, 1.0, 0.7):
-            track = shown(things, y_m, east)
+            track = shown_track(things, y_m, east)
             assert gap_m(track, *row) > -TOUCHES_M and track[:, 1].max() < 1.6
             assert abs(track[-1, 0]) > 6.0
 
@@ -107,7 +107,7 @@ def test_people_walk_between_obstacles_where_they_fit() -> None:
     apart = standing(thing("bin", 0.0, -0.8, 0.0), thing("bin", 0.0, 0.95, 0.0))
     near = standing(thing("bin", 0.0, -0.6, 0.0), thing("bin", 0.0, 0.6, 0.0))
     assert len(apart.bodies) == 2 and len(near.bodies) == 1
-    assert np.abs(shown(apart, 0.1, True)[:, 1]).max() < 0.35
+    assert np.abs(shown_track(apart, 0.1, True)[:, 1]).max() < 0.35
 
 
 def query_with(things: StandingObstacles) -> EventQuery:
@@ -134,15 +134,15 @@ def query_with(things: StandingObstacles) -> EventQuery:
 def test_directed_people_walk_round_obstacles_too(kind: str, moves: object) -> None:
     """People of events pass the obstacles in the query and walk on, and without them walk straight
     through."""
-    one = thing(kind, 0.0, 0.05, 1.3)
-    for things in (standing(one), StandingObstacles()):
+    obstacle = thing(kind, 0.0, 0.05, 1.3)
+    for things in (standing(obstacle), StandingObstacles()):
         walker = Walker(x_m=-3.0, y_m=0.0, heading_rad=0.0)
         track = []
         for _ in range(160):
             walker = moves(walker, 0.0, 1.3, Sight(query_with(things)))  # type: ignore[operator]
             track.append((walker.x_m, walker.y_m))
         assert walker.x_m > 3.0
-        assert (gap_m(np.array(track), one) > -TOUCHES_M) == bool(things.bodies)
+        assert (gap_m(np.array(track), obstacle) > -TOUCHES_M) == bool(things.bodies)
 
 
 def test_a_query_holds_only_nearby_obstacles() -> None:

@@ -119,10 +119,12 @@ def test_corners_that_cars_drive_over_are_counted_and_listed() -> None:
 def test_a_place_in_pieces_gives_a_warning() -> None:
     """Where the largest island has less than 60 % of the length, the check explains the effect and
     the remedy."""
-    whole = town()
-    assert check_map(whole).warnings == ()
+    connected = town()
+    assert check_map(connected).warnings == ()
     far = strip("far", (0, 90), (400, 90))
-    (warning,) = check_map(dataclasses.replace(whole, strips={**whole.strips, "far": far})).warnings
+    (warning,) = check_map(
+        dataclasses.replace(connected, strips={**connected.strips, "far": far})
+    ).warnings
     assert warning.startswith(
         "the largest of 6 islands of connected walkways has 42% of their length: scenarios are"
     )
@@ -194,11 +196,13 @@ def test_notes_list_what_is_not_used() -> None:
         "elevation 0 to 90 m is dropped, the ground is flat: it is the same"
         in check_map(false).notes[-1]
     )
-    kept = dataclasses.replace(
+    elevated = dataclasses.replace(
         town(), elevation=dataclasses.replace(land, steep=(next(iter(town().strips)),))
     )
-    notes = "\n".join(check_map(kept, None, facts_of(net())).notes)
-    assert [p.piece for p in check_map(kept).problems if p.kind == "steep"] == list(kept.steep)
+    notes = "\n".join(check_map(elevated, None, facts_of(net())).notes)
+    assert [p.piece for p in check_map(elevated).problems if p.kind == "steep"] == list(
+        elevated.steep
+    )
     for words in (
         "elevation 0 to 90 m is kept; 7 of 50 points had none or a false one",
         "3 places on streets were moved, by up to 1.2 m",

@@ -37,7 +37,7 @@ def feature(kind: str, geometry: dict[str, Any]) -> dict[str, Any]:
     return {"type": "Feature", "properties": {"kind": kind}, "geometry": geometry}
 
 
-def written(path: Path, *features: dict[str, Any], frame: str | None = "local") -> Path:
+def write_geojson(path: Path, *features: dict[str, Any], frame: str | None = "local") -> Path:
     stated = {} if frame is None else {"frame": frame}
     path.write_text(json.dumps({"type": "FeatureCollection", **stated, "features": features}))
     return path
@@ -55,12 +55,12 @@ def test_local_and_wgs84_files_give_equal_areas(tmp_path: Path) -> None:
         for r in (degrees, metres)
     ]
     files = [
-        written(tmp_path / f"{i}.geojson", feature("sidewalk", ring), frame=frame)
+        write_geojson(tmp_path / f"{i}.geojson", feature("sidewalk", ring), frame=frame)
         for i, (ring, frame) in enumerate(zip(rings, (None, "local"), strict=True))
     ]
     one, other = (read_areas(path, GRID, LUND)[0].polygon for path in files)
     assert shapely.hausdorff_distance(one, other) < 1e-6
-    named = written(tmp_path / "named.geojson", feature("sidewalk", rings[0]), frame="wgs84")
+    named = write_geojson(tmp_path / "named.geojson", feature("sidewalk", rings[0]), frame="wgs84")
     assert read_areas(named, GRID, LUND)[0].polygon.equals(one)
 
 
@@ -91,19 +91,19 @@ CONFUSED: dict[str, tuple[dict[str, Any], str | None, Georeference | None, str]]
 @pytest.mark.parametrize("name", CONFUSED)
 def test_metres_and_degrees_are_not_confused(tmp_path: Path, name: str) -> None:
     """Areas and paths in another unit than their frame are refused with their range and remedy."""
-    geometry, frame, there, words = CONFUSED[name]
-    path = written(tmp_path / "a.geojson", feature("sidewalk", geometry), frame=frame)
+    geometry, frame, expected, words = CONFUSED[name]
+    path = write_geojson(tmp_path / "a.geojson", feature("sidewalk", geometry), frame=frame)
     with pytest.raises(MapError, match=words):
-        read_areas(path, GRID, there)
+        read_areas(path, GRID, expected)
     line = {"type": "LineString", "coordinates": geometry["coordinates"][0][:3]}
-    path = written(tmp_path / "way.geojson", feature("", line), frame=frame)
+    path = write_geojson(tmp_path / "way.geojson", feature("", line), frame=frame)
     with pytest.raises(MapError, match=r"are (no )?degrees"):
-        read_way(path, there)
-    if frame == "local" and there is None:
+        read_way(path, expected)
+    if frame == "local" and expected is None:
         route = {"route": line["coordinates"]}
         (tmp_path / "way.json").write_text(json.dumps(route))
         with pytest.raises(MapError, match=r"way\.json: .* are degrees, .* --georeference"):
-            read_way(tmp_path / "way.json", there)
+            read_way(tmp_path / "way.json", expected)
 
 
 def test_areas_survive_writing_and_reading(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ WRONG = {
 def test_wrong_areas_are_refused(tmp_path: Path, name: str) -> None:
     """The error names file, feature and reason."""
     features, words = WRONG[name]
-    path = written(tmp_path / "areas.geojson", *features)
+    path = write_geojson(tmp_path / "areas.geojson", *features)
     with pytest.raises(MapError, match=rf"areas\.geojson: {words}"):
         read_areas(path, GRID, None)
 
@@ -153,7 +153,7 @@ def test_files_that_are_no_geojson_are_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.geojson").write_text("{")
     with pytest.raises(MapError, match="no JSON"):
         read_areas(tmp_path / "broken.geojson", GRID, None)
-    other = written(tmp_path / "other.geojson", feature("road", square(1, 1)), frame="utm")
+    other = write_geojson(tmp_path / "other.geojson", feature("road", square(1, 1)), frame="utm")
     with pytest.raises(MapError, match="frame is 'utm', but must be 'local' or 'wgs84'"):
         read_areas(other, GRID, None)
 
@@ -167,7 +167,7 @@ def test_walked_paths_of_both_formats_are_equal(tmp_path: Path) -> None:
     way = read_way(tmp_path / "way.json", LUND)
     assert way[0] == pytest.approx(to_local(origin, LUND)[0])
     line = {"type": "LineString", "coordinates": [*origin.tolist(), [13.1957, 55.6983]]}
-    path = written(
+    path = write_geojson(
         tmp_path / "way.geojson",
         {"type": "Feature", "properties": {}, "geometry": line},
         frame=None,

@@ -59,12 +59,12 @@ def test_a_closed_port_is_not_passed_in_either_direction() -> None:
     ring."""
     graph = WalkGraph(square())
     closed = frozenset({Port(":n_c0", 1)})
-    there = graph.shortest(Port("west", 0), Port(":n_c0", 1), closed)
+    forward = graph.shortest(Port("west", 0), Port(":n_c0", 1), closed)
     back = graph.shortest(Port(":n_c0", 1), Port("west", 0), closed)
-    assert there is not None and back is not None
-    assert there[0] == back[0][::-1]
-    assert there[0][-2] == Port(":n_c0", 0)
-    assert there[1] == pytest.approx(20 + HOP + 40 + HOP + 20 + HOP + 40)
+    assert forward is not None and back is not None
+    assert forward[0] == back[0][::-1]
+    assert forward[0][-2] == Port(":n_c0", 0)
+    assert forward[1] == pytest.approx(20 + HOP + 40 + HOP + 20 + HOP + 40)
 
 
 def test_an_unreachable_goal_gives_none() -> None:

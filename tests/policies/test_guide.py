@@ -121,10 +121,10 @@ def driven(
 def bodies(track: Floats) -> list[Polygon]:
     """Return the robot's outline at each pose."""
     length, width = COURIER.footprint_m
-    whole = box(-length / 2, -width / 2, length / 2, width / 2)
+    outline = box(-length / 2, -width / 2, length / 2, width / 2)
     return [
         affinity.translate(
-            affinity.rotate(whole, heading, origin=(0.0, 0.0), use_radians=True), x, y
+            affinity.rotate(outline, heading, origin=(0.0, 0.0), use_radians=True), x, y
         )
         for x, y, heading in track
     ]
@@ -182,8 +182,8 @@ def test_a_reset_robot_is_led_from_its_new_place() -> None:
 def test_another_way_is_found_where_a_person_blocks_the_first() -> None:
     """The oracle passes through another gap."""
     course = straight(box(5.0, -1.1, 17.0, 0.8), width_m=4.6)
-    somebody = People.of(("p0",), [(15.0, 1.55)], [0.0], [0.0], ("stand",))
-    track = driven(course, Pose(0.0, 0.0, 0.0), people=somebody)
+    person = People.of(("p0",), [(15.0, 1.55)], [0.0], [0.0], ("stand",))
+    track = driven(course, Pose(0.0, 0.0, 0.0), people=person)
     assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
     assert min(body.distance(Point(15.0, 1.55)) for body in bodies(track)) > 0.3
     assert min(course.solid.distance(body) for body in bodies(track)) > 0.0

@@ -48,7 +48,7 @@ def people(*rows: tuple[float, float, float, float, Doing]) -> People:
     )
 
 
-def known(
+def knowledge(
     others: People, x_m: float = 5.0, v_mps: float = 1.2, half_width_m: float = 1.7
 ) -> Privileged:
     """Knowledge of a robot on a straight route along x, with a walkway free for 1.7 m on either
@@ -77,7 +77,7 @@ def test_talkers_are_one_group_and_passers_by_are_none() -> None:
 def test_a_group_is_passed_round_on_the_side_with_room() -> None:
     """Two talkers 1.5 m apart across the way, nearer to its left edge, are passed on the right."""
     crowd = people((11.0, 1.2, 0.0, 0.0, "talk"), (11.0, -0.3, 0.0, 0.0, "talk"))
-    scene = known(crowd)
+    scene = knowledge(crowd)
     here = PathState(SampledPath(ROUTE), scene.route_s_m, DistanceField(scene.free, ROUTE))
     lane_m = best_lane_past(scene, BodyDisks.of(COURIER), here, lines(crowd), 0.0)
     assert lane_m <= -0.3 - 0.3 - 0.33 - 0.1
@@ -89,15 +89,17 @@ def test_the_oracle_stops_before_a_raised_hand_and_stays() -> None:
         people((12.0, 0.2, math.pi, 0.0, "stop")),
         people((12.0, 0.2, math.pi, 0.0, "stand")),
     )
-    limits = [gesture_limit(known(hand, x_m)) for x_m in (3.0, 6.0, 9.0, 9.9, 10.5)]
+    limits = [gesture_limit(knowledge(hand, x_m)) for x_m in (3.0, 6.0, 9.0, 9.9, 10.5)]
     assert limits == sorted(limits, reverse=True) and limits[-1] == 0.0 and limits[0] > 2.0
-    assert gesture_limit(known(nobody, 9.9)) == math.inf
+    assert gesture_limit(knowledge(nobody, 9.9)) == math.inf
     driver = PolicyCaller(Orca())
     x_m = 3.0
     v_mps = 0.0
     for tick in range(300):
         command = driver.act(
-            Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, known(hand, x_m, v_mps))
+            Observation(
+                2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, knowledge(hand, x_m, v_mps)
+            )
         )
         v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
         x_m += 0.1 * v_mps
@@ -115,7 +117,7 @@ def test_a_too_short_green_costs_the_oracle_at_most_8_s() -> None:
     for tick in range(130):
         signals = {":c0": Signal(True, 13.0 - 0.1 * tick)}
         here = replace(
-            known(people(), x_m, v_mps), crossings=((":c0", 6.0, 20.0),), signals=signals
+            knowledge(people(), x_m, v_mps), crossings=((":c0", 6.0, 20.0),), signals=signals
         )
         command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, here))
         v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
@@ -128,7 +130,7 @@ def test_a_too_short_green_costs_the_oracle_at_most_8_s() -> None:
 def test_the_oracle_slows_down_for_people_right_ahead() -> None:
     """The nearer they are the slower, never below a creep; people at its side and of events do not
     count."""
-    here = known(people((6.0, 0.2, 0.0, 0.0, "stand")))
+    here = knowledge(people((6.0, 0.2, 0.0, 0.0, "stand")))
     crowd = replace(
         here, people=dataclasses.replace(here.people, kind=np.full(1, PersonKind.CROWD.value))
     )
@@ -158,7 +160,7 @@ def test_the_oracle_waits_at_red_but_drives_on_when_it_cannot_stop(
 ) -> None:
     """0.2 m before a crossing it waits for green at rest, and at speed it drives on."""
     here = replace(
-        known(people(), 5.0, v_mps),
+        knowledge(people(), 5.0, v_mps),
         crossings=((":c0", 5.2, 12.0),),
         signals={":c0": Signal(walk, 30.0)},
     )
@@ -168,7 +170,9 @@ def test_the_oracle_waits_at_red_but_drives_on_when_it_cannot_stop(
 def test_the_robot_waits_where_no_car_turns() -> None:
     """Where cars turn directly before a crossing, it stops farther from it."""
     here = replace(
-        known(people(), 3.2), crossings=((":c0", 5.2, 12.0),), signals={":c0": Signal(False, 30.0)}
+        knowledge(people(), 3.2),
+        crossings=((":c0", 5.2, 12.0),),
+        signals={":c0": Signal(False, 30.0)},
     )
     assert crossing_limit(here, COURIER) > 1.0
     assert crossing_limit(replace(here, waits_m=(3.2,)), COURIER) == 0.0
@@ -195,7 +199,9 @@ def test_a_braking_car_counts_where_it_stops_up_to_half_a_metre() -> None:
     ahead = roll_out(SampledPath(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     for far_m, nearness in ((12.0, 0.0), (5.0, 0.5)):
         cars = Vehicles.of(("v0",), [(7.0, far_m)], [-math.pi / 2], [6.0], [(4.4, 1.8)])
-        scene = dataclasses.replace(known(people()), vehicles=cars, crossings=(("c", 4.0, 12.0),))
+        scene = dataclasses.replace(
+            knowledge(people()), vehicles=cars, crossings=(("c", 4.0, 12.0),)
+        )
         assert vehicle_violation(scene, BodyDisks.of(COURIER), ahead)[0] == pytest.approx(nearness)
 
 
@@ -207,20 +213,20 @@ def test_the_oracle_waits_for_oncoming_people_until_they_are_past() -> None:
         for x_m, y_m, heading in ((8.2, 0.0, math.pi), (6.5, 0.6, 2.4), (3.5, 1.0, 2.9))
     )
     yielding = Yielding()
-    assert not yielding.waits(known(round_it), 0.0)
-    assert [yielding.waits(known(one), 1.0) for one in (at_it, round_it, past_it)] == [
+    assert not yielding.waits(knowledge(round_it), 0.0)
+    assert [yielding.waits(knowledge(one), 1.0) for one in (at_it, round_it, past_it)] == [
         True,
         True,
         False,
     ]
-    assert yielding.waits(known(round_it), 9.9) and not yielding.waits(known(at_it), 10.1)
+    assert yielding.waits(knowledge(round_it), 9.9) and not yielding.waits(knowledge(at_it), 10.1)
     patient = Yielding()
-    stays = known(people((7.0, 0.0, math.pi, 0.0, "stand")))
-    assert patient.waits(known(at_it), 0.0)
+    stays = knowledge(people((7.0, 0.0, math.pi, 0.0, "stand")))
+    assert patient.waits(knowledge(at_it), 0.0)
     assert patient.waits(stays, 0.5) and patient.waits(stays, 4.8)
     assert not patient.waits(stays, 5.2)
     for x_m, heading in ((8.0, math.pi - 0.3), (8.0, 0.0), (9.0, math.pi)):
-        assert not Yielding().waits(known(people((x_m, 0.0, heading, 1.4, "walk"))), 1.0)
+        assert not Yielding().waits(knowledge(people((x_m, 0.0, heading, 1.4, "walk"))), 1.0)
 
 
 def test_near_people_count_at_their_current_place_too() -> None:
@@ -231,7 +237,7 @@ def test_near_people_count_at_their_current_place_too() -> None:
     assert np.ptp(ahead.pose[:, 2, 1]) == 0.0
     gaps = [
         gaps_to_people(
-            known(crowd := people((x_m, 0.3, 1.57, 2.0, "walk"))),
+            knowledge(crowd := people((x_m, 0.3, 1.57, 2.0, "walk"))),
             COURIER,
             ahead,
             crowd,
@@ -256,9 +262,9 @@ def test_the_oracle_solves_every_event(kind: str, seed: int) -> None:
     from scenarios.suites.reactive import build_reactive
 
     _, street_map = place(CITY)
-    whole = build_reactive(EVENT_KINDS[kind], CITY, street_map, WalkGraph(street_map), seed, kind)
+    built = build_reactive(EVENT_KINDS[kind], CITY, street_map, WalkGraph(street_map), seed, kind)
     scenario = msgspec.structs.replace(
-        whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4)
+        built, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4)
     )
     record = run_episode(scenario, Orca()).record
     assert (record.status, record.failures) == ("done", ())
@@ -286,8 +292,8 @@ def test_driving_straight_on_fails_before_an_oncoming_person() -> None:
             return Command(1.2, 0.0)
 
     _, street_map = place(CITY)
-    whole = build_reactive(
+    scenario = build_reactive(
         EVENT_KINDS["frontal"], CITY, street_map, WalkGraph(street_map), 1, "frontal"
     )
-    record = run_episode(msgspec.structs.replace(whole, obstacles=()), Blind()).record
+    record = run_episode(msgspec.structs.replace(scenario, obstacles=()), Blind()).record
     assert record.ended == "failure" and record.failures[0].other == "e0"

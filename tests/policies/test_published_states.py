@@ -78,8 +78,8 @@ def test_sarl_values_velocities_as_the_test_case_of_its_authors(weights: None) -
     for robot, people, values, action in zip(
         *(CASES[f"sarl.{name}"] for name in ("robot", "people", "values", "action")), strict=True
     ):
-        seen = np.column_stack([people[:, :2] - robot[:2], people[:, 2:4]])
-        found = action_values(network, robot[5:7] - robot[:2], seen)
+        in_robot_frame_rows = np.column_stack([people[:, :2] - robot[:2], people[:, 2:4]])
+        found = action_values(network, robot[5:7] - robot[:2], in_robot_frame_rows)
         assert found == pytest.approx(values, abs=2e-6)
         assert VELOCITIES[int(np.argmax(found))] == pytest.approx(action, abs=1e-9)
 
@@ -119,7 +119,7 @@ def scan(spec: ScanSpec, walls: dict[tuple[float, float], float] | None = None) 
     return Scan(ranges[None], spec)
 
 
-def seen(
+def observation_of(
     name: str, pose: Pose = START, side: float = 0.0, people: Tracks | None = None
 ) -> Observation:
     """An observation in a free street with a goal at (10, side), or a route over it."""
@@ -152,7 +152,7 @@ def test_a_robot_reaches_a_goal_on_either_side(weights: None, name: str, side: f
     step_s = 1.0 / policy.manifest.rate_hz
     while math.dist(pose.xy, (10.0, side)) > 2.0:
         assert k * step_s < 20.0
-        now = replace(seen(name, pose, side), time_s=k * step_s)
+        now = replace(observation_of(name, pose, side), time_s=k * step_s)
         last = policy.act(replace(now, v_mps=last.v_mps, w_radps=last.w_radps))
         assert last == clipped(last, COURIER)
         heading = pose.heading_rad + step_s * last.w_radps
@@ -168,7 +168,7 @@ def test_td3_turns_to_the_side_of_its_goal(weights: None) -> None:
     def turn(y_m: float) -> float:
         policy.reset("street", 0)
         return policy.act(
-            replace(seen("td3-lidar"), goal=PointGoal(3.0, y_m), scan=between)
+            replace(observation_of("td3-lidar"), goal=PointGoal(3.0, y_m), scan=between)
         ).w_radps
 
     assert turn(4.0) > 0.5 and turn(-4.0) < -0.5
@@ -182,7 +182,10 @@ def test_people_change_the_command(weights: None, name: str) -> None:
 
     def commands(people: Tracks) -> list[Command]:
         policy.reset("street", 0)
-        return [policy.act(replace(seen(name, people=people), time_s=0.1 * i)) for i in range(3)]
+        return [
+            policy.act(replace(observation_of(name, people=people), time_s=0.1 * i))
+            for i in range(3)
+        ]
 
     assert commands(near) == commands(near) != commands(tracks())
 

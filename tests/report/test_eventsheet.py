@@ -107,9 +107,11 @@ def test_the_command_runs_one_event_and_shows_its_sheet(tmp_path: Path, cosim: C
     fields = {"crowd": CrowdSpec(persons=4, radius_m=50.0, vehicles=0), "time_limit_s": 30.0}
     made = []
     for kind in ("frontal", "gesturing"):
-        whole = build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
+        scenario = build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
         made.append(
-            Scenario(**{name: getattr(whole, name) for name in Scenario.__struct_fields__} | fields)
+            Scenario(
+                **{name: getattr(scenario, name) for name in Scenario.__struct_fields__} | fields
+            )
         )
     write_suite(Suite(name="tiny", version="1", scenarios=tuple(made)), tmp_path / "tiny.json")
 

@@ -39,9 +39,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
+    scenario = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     short = msgspec.structs.replace(
-        whole,
+        scenario,
         crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2),
         time_limit_s=2.0,
         robot="courier",
@@ -90,6 +90,7 @@ def test_a_film_shows_the_requested_seconds(
     assert len(pictures) == 20 and pictures[0].shape == (180, 320, 3)
     assert all(np.abs(a.astype(int) - b).max() > 10 for a, b in itertools.pairwise(pictures))
     assert not list(desk.glob("*.part"))
+    assert len(drawn) == 20
     for area in (Layout.of(320, 180).second, Layout.of(320, 180).map):
         part = slice(area.y, area.y + area.height), slice(area.x, area.x + area.width)
         assert all((image[part] == PLANNED).all(axis=2).sum() > 5 for image in drawn)
@@ -186,12 +187,12 @@ def test_a_cut_that_differs_from_its_record_is_not_filmed(
     """One changed bit of a tick is an error with the time and no file; beyond the cut it does not
     matter."""
     path = desk / "run" / "episodes" / "t-0" / "trajectory.npz"
-    kept = path.read_bytes()
+    original = path.read_bytes()
     with np.load(path) as arrays:
-        held = dict(arrays)
-    held[column] = held[column].copy()
-    held[column][5] = np.nextafter(held[column][5], 9e9) if column != "reset_s_m" else 1.0
-    np.savez(path, **held)
+        changed = dict(arrays)
+    changed[column] = changed[column].copy()
+    changed[column][5] = np.nextafter(changed[column][5], 9e9) if column != "reset_s_m" else 1.0
+    np.savez(path, **changed)
     words = ("film", "run", "t-0", "--size", "320x180", "--speed", "4")
     try:
         until, beyond = (
@@ -199,7 +200,7 @@ def test_a_cut_that_differs_from_its_record_is_not_filmed(
             cosim(*words, "--to", "0.5", "-o", "beyond.mp4", cwd=desk),
         )
     finally:
-        path.write_bytes(kept)
+        path.write_bytes(original)
     assert until.returncode == 0 and (desk / "until.mp4").exists(), until.stderr
     assert (
         beyond.returncode == 2
@@ -212,15 +213,15 @@ def test_a_cut_that_differs_from_its_record_is_not_filmed(
 def test_a_record_that_does_not_replay_is_not_filmed(desk: Path, cosim: Cosim) -> None:
     """A record of another episode is an error, without a file."""
     path = desk / "run" / "episodes" / "t-0" / "record.json"
-    kept = path.read_bytes()
-    record = json.loads(kept)
+    original = path.read_bytes()
+    record = json.loads(original)
     path.write_text(json.dumps(record | {"state_hash": "0" * len(record["state_hash"])}))
     try:
         done = cosim(
             "film", "run", "t-0", "--from", "1.9", "--size", "320x180", "-o", "wrong.mp4", cwd=desk
         )
     finally:
-        path.write_bytes(kept)
+        path.write_bytes(original)
     assert done.returncode == 2 and "not the same when it was replayed" in done.stderr
     assert "of the same versions: of other code" in done.stderr
     assert not list(desk.glob("wrong*"))

@@ -319,11 +319,9 @@ def test_runs_of_different_scenarios_of_a_suite_are_marked(tmp_path: Path) -> No
     runs = read_runs([run_of(tmp_path / name, ["goal"] * 3, name) for name in ("one", "other")])
     assert not any(warnings_of(runs))
     first = runs[0]
-    whole = runs[1].whole
-    spec = msgspec.structs.replace(whole.spec, scenarios=whole.spec.scenarios[:2])
-    part = ReportedRun(
-        "other", whole._replace(spec=spec, records=dict([*whole.records.items()][:2]))
-    )
+    run = runs[1].whole
+    spec = msgspec.structs.replace(run.spec, scenarios=run.spec.scenarios[:2])
+    part = ReportedRun("other", run._replace(spec=spec, records=dict([*run.records.items()][:2])))
     assert warnings_of([first, part]).mixed == (("s", "one 3, other 2"),)
     text = render_page([first, part], [], [], Maps([], {}, {}), "").decode()
     assert "not all runs are of the same scenarios (one 3, other 2)" in text
@@ -446,10 +444,10 @@ def test_no_run_a_run_twice_and_a_run_without_an_episode_are_refused(
     run = run_of(tmp_path / "run", [HIT])
     with RunFolder.create(
         tmp_path / "empty", read_spec(run), read_suite(run / "scenarios.json")
-    ) as held:
+    ) as folder:
         assert (
             "in use by process"
-            in cosim("report", str(held.path), "-o", "r.html", cwd=tmp_path).stderr
+            in cosim("report", str(folder.path), "-o", "r.html", cwd=tmp_path).stderr
         )
     words = {
         ("nowhere",): "unknown run",

@@ -103,12 +103,12 @@ def test_plans_are_drawn_on_the_map_and_in_the_picture(page: Page) -> None:
         page.until(PICTURED)
         last = scene["plans"][-1][1]
         legend = page.js("document.querySelector('#key-way').textContent")
-        asked = np.array(last[:2])
+        touched = np.array(last[:2])
         points = np.array(last).reshape(-1, 2)[1:]
         begun = scene["plans"][0][0] > 0
         assert legend.startswith("what was commanded" if begun else "planned waypoints")
         assert (
-            np.allclose(np.hypot(*(points - asked).T), 100.0 * np.hypot(*BEND.T), atol=1.0)
+            np.allclose(np.hypot(*(points - touched).T), 100.0 * np.hypot(*BEND.T), atol=1.0)
             and scene["follows"] == 3
         )
         page.key("End", code=35)

@@ -191,9 +191,9 @@ def test_episodes_that_failed_without_a_referee_failure_have_a_reason() -> None:
         ),
     }
     for how, (cause, words) in ended.items():
-        one = msgspec.structs.replace(lost, ended=how)
-        (mishap,) = mishaps_of(one)
-        assert (mishap.cause, reason_of(WAY, one, mishap, log)) == (cause, words)
+        ended_record = msgspec.structs.replace(lost, ended=how)
+        (mishap,) = mishaps_of(ended_record)
+        assert (mishap.cause, reason_of(WAY, ended_record, mishap, log)) == (cause, words)
     crashed, _ = episode_of(WAY, "h", "crashed")
     assert reason_of(WAY, crashed, mishaps_of(crashed)[0], None) == "the policy crashed: it said so"
 

@@ -79,12 +79,12 @@ def test_the_map_shows_places_and_headings_of_people() -> None:
 
 def test_the_map_follows_its_robot() -> None:
     """Ten metres on, everything on the ground moves by ten metres in the picture, to half a pixel."""
-    one = minimap()
+    drawn = minimap()
     people = People.of(("e0",), [[36.0, 1.0]], [0.0], [0.0], ("stand",), kind=PersonKind.EVENT)
     east = np.array([1.0, 0.0])
     shift = []
     for x in (30.0, 32.0):
-        image = one.picture(RobotState(Pose(x, 0.0, 0.0)), Street(0, people), (300, 200), east)
+        image = drawn.picture(RobotState(Pose(x, 0.0, 0.0)), Street(0, people), (300, 200), east)
         assert image.shape == (200, 300, 3)
         shift.append(where(image, EVENT).mean(axis=0))
     assert shift[0] - shift[1] == pytest.approx((2.0 * 200 / (2.0 * MINIMAP_REACH_M), 0.0), abs=0.5)

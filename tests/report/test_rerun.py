@@ -110,9 +110,9 @@ def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Co
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
         assert np.allclose(dot, BEND @ [[cos, sin], [-sin, cos]] + (x_m, y_m), atol=1e-3)
     assert tape.column("/world/waypoints/points", "tick") == [21, 25, 29, 33, 37]
-    asked = [*range(0, len(log), 4)]
+    query_ticks = [*range(0, len(log), 4)]
     for entity in ("/world/robot/scan", "/world/robot/tracks", "/plots/imu/gyro_z"):
-        assert tape.column(entity, "tick") == asked, entity
+        assert tape.column(entity, "tick") == query_ticks, entity
     returns = tape.column("/world/robot/scan", "Points3D:positions")
     assert all(10 < len(one) <= 90 for one in returns)
     speeds = [speed for (speed,) in tape.column("/plots/speed/robot", "Scalars:scalars")]

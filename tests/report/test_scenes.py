@@ -61,17 +61,17 @@ def test_consecutive_failures_share_their_pictures(
 def test_an_episode_that_replays_differently_is_not_shown(run: Path, column: str) -> None:
     """One changed bit of a tick before the failure is an error with the time."""
     path = run / "episodes" / NAME / "trajectory.npz"
-    kept = path.read_bytes()
+    original = path.read_bytes()
     with np.load(path) as arrays:
-        held = dict(arrays)
-    held[column] = held[column].copy()
-    held[column][5] = np.nextafter(held[column][5], 9e9)
-    np.savez(path, **held)
+        changed = dict(arrays)
+    changed[column] = changed[column].copy()
+    changed[column][5] = np.nextafter(changed[column][5], 9e9)
+    np.savez(path, **changed)
     try:
         with pytest.raises(RunError, match=r"not the same when it was replayed \(from 0.25 s on\)"):
             show_again(run, NAME, mishaps_of(load_recorded(run, NAME).record), "auto")
     finally:
-        path.write_bytes(kept)
+        path.write_bytes(original)
 
 
 def test_a_replay_without_measures_has_no_result(run: Path) -> None:

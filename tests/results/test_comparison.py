@@ -109,14 +109,14 @@ def test_groups_are_suite_event_structure_and_split() -> None:
 def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
     """Nine won and one lost of twenty are listed by name, and in every group."""
     comparison = compare_runs([runs / "a", runs / "b"])
-    whole = row(comparison, "success")
-    assert (whole["value_before"], whole["value_after"], whole["n"], whole["changed"]) == (
+    success = row(comparison, "success")
+    assert (success["value_before"], success["value_after"], success["n"], success["changed"]) == (
         0.5,
         0.9,
         20,
         10,
     )
-    assert whole["low"] > 0.0 and whole["verdict"] == "better"
+    assert success["low"] > 0.0 and success["verdict"] == "better"
     assert row(comparison, "failures")["verdict"] == "better" and row(comparison, "failures")[
         "difference"
     ] == pytest.approx(-0.4)
@@ -341,9 +341,9 @@ def test_a_crashing_run_is_compared_at_its_worst_without_rates(runs: Path) -> No
         and row(comparison, "failures_per_100m", "straight", "c")["n"] == 9
     )
     assert not len(comparison.flipped)
-    whole = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
+    suite_rows = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
     ranked = [name for name, metric in METRICS.items() if metric.higher_is_better is not None]
-    assert {*whole.index[whole["n"] > 0].intersection(ranked)} == {*WORST}
+    assert {*suite_rows.index[suite_rows["n"] > 0].intersection(ranked)} == {*WORST}
     assert "better" not in {*comparison.differences["verdict"]}
     assert (
         "c: 1 crashed, counted as failed, with SR, RC, SPL and V of 0; groups with them have "
@@ -369,9 +369,9 @@ def test_a_run_that_always_crashes_is_better_in_nothing(runs: Path, tmp_path: Pa
         "differs",
         "",
     }
-    whole = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
-    assert whole.loc[["route_completion", "velocity_mean_mps"], "verdict"].eq("worse").all()
-    assert whole.loc["success", ["value_after", "verdict"]].tolist() == [0.0, "within noise"]
+    suite_rows = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
+    assert suite_rows.loc[["route_completion", "velocity_mean_mps"], "verdict"].eq("worse").all()
+    assert suite_rows.loc["success", ["value_after", "verdict"]].tolist() == [0.0, "within noise"]
     assert not len(comparison.flipped)
 
 

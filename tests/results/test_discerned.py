@@ -70,30 +70,30 @@ def table(run: Path) -> pd.DataFrame:
 def test_a_pair_counts_only_if_both_are_solved(runs: Path) -> None:
     """Crashes count as unsolved, pairs with an invalid member are excluded and counted, and D is
     over all pairs."""
-    whole = table(runs / "a")
+    episodes = table(runs / "a")
     for kind, mean in (("lateral", 0.25), ("frontal", 0.75)):
-        part = whole[whole["structure"] == kind]
+        part = episodes[episodes["structure"] == kind]
         found = summary_of(part, ["discerned"]).loc["discerned"]
         assert (found["mean"], found["n"]) == (mean, 4)
         assert pairs_of(part).in_words == "4 pairs; left out: 1 with an invalid member"
-    found = summary_of(whole).loc["discerned"]
+    found = summary_of(episodes).loc["discerned"]
     assert (found["mean"], found["low"], found["high"], found["n"]) == (0.5, *wilson(4.0, 8), 8)
     assert summary_of(table(runs / "b")).loc["discerned", ["mean", "n"]].tolist() == [1.0, 10]
 
 
 def test_every_other_mean_is_over_scenarios_without_decoys(runs: Path) -> None:
     """The rows of the events alone give the same values, so that a decoy's crash removes no rate."""
-    whole = table(runs / "a")
-    events = whole[whole["decoy_of"] == ""]
-    summary = summary_of(whole).drop("discerned")
+    episodes = table(runs / "a")
+    events = episodes[episodes["decoy_of"] == ""]
+    summary = summary_of(episodes).drop("discerned")
     pd.testing.assert_frame_equal(summary, summary_of(events))
     assert summary.loc["success"].tolist()[3] == 10 and summary.loc["failures_per_100m", "n"] == 10
 
 
 def test_without_the_other_member_there_is_no_pair(runs: Path) -> None:
     """D of events alone, of decoys alone and of halves is absent, not 0; halves are counted."""
-    whole = table(runs / "b")
-    events, decoys = whole[whole["decoy_of"] == ""], whole[whole["decoy_of"] != ""]
+    episodes = table(runs / "b")
+    events, decoys = episodes[episodes["decoy_of"] == ""], episodes[episodes["decoy_of"] != ""]
     assert "discerned" not in summary_of(events).index
     alone = summary_of(decoys).loc[["discerned", "success"]]
     assert alone["n"].tolist() == [0, 0] and alone["mean"].isna().all()
@@ -131,8 +131,8 @@ def test_a_comparison_pairs_the_pairs(runs: Path, tmp_path: Path) -> None:
     both."""
     comparison = compare_runs([runs / "a", runs / "b"])
     rows = comparison.differences.set_index(["metric", "group"])
-    whole = rows.loc[("discerned", "reactive")]
-    assert (whole["n"], whole["value_before"], whole["value_after"]) == (8, 0.5, 1.0)
+    suite_row = rows.loc[("discerned", "reactive")]
+    assert (suite_row["n"], suite_row["value_before"], suite_row["value_after"]) == (8, 0.5, 1.0)
     assert rows.loc[("discerned", "lateral"), "changed"] == 3
     assert (
         rows.loc[("success", "reactive"), "n"] == 10 and rows.loc[("success", "static"), "n"] == 1

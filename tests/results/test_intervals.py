@@ -79,9 +79,9 @@ def test_a_rate_has_an_exact_interval_for_few_failures_else_a_bootstrap() -> Non
 def test_means_have_a_bootstrap_interval() -> None:
     """It is the bootstrap of the mean of values, and with equal weights the same."""
     values = np.array([0.0, 0.5, 1.0, 1.0, 0.2, 1.0])
-    one = estimate_of_mean(values)
-    assert (one.low, one.high) == bootstrap(values) == bootstrap(values, np.ones(6))
-    assert 0.0 <= one.low < values.mean() < one.high <= 1.0
+    unweighted = estimate_of_mean(values)
+    assert (unweighted.low, unweighted.high) == bootstrap(values) == bootstrap(values, np.ones(6))
+    assert 0.0 <= unweighted.low < values.mean() < unweighted.high <= 1.0
 
 
 @pytest.mark.parametrize("n", range(MIN_N + 1))

@@ -61,10 +61,10 @@ def bytes_of(*folders: Path) -> dict[Path, bytes]:
     }
 
 
-def whole_table(folder: Path) -> bytes:
+def undivided_table(folder: Path) -> bytes:
     """Return results.csv of the same run without shards."""
-    with RunFolder.resume(finished_run(folder / "whole", SPEC, WAYS), SPEC) as held:
-        held.finish()
+    with RunFolder.resume(finished_run(folder / "whole", SPEC, WAYS), SPEC) as run:
+        run.finish()
     return (folder / "whole/results.csv").read_bytes()
 
 
@@ -77,7 +77,7 @@ def test_merged_shards_equal_the_undivided_run(tmp_path: Path, of: int) -> None:
     before = bytes_of(*parts)
     merged = merge_runs(parts, tmp_path / "deep/merged", ignore)
     assert bytes_of(*parts) == before and (merged.missing, merged.twice) == ((), ())
-    assert (tmp_path / "deep/merged/results.csv").read_bytes() == whole_table(tmp_path)
+    assert (tmp_path / "deep/merged/results.csv").read_bytes() == undivided_table(tmp_path)
     for name in (
         "run.json",
         "scenarios.json",
@@ -126,7 +126,7 @@ def test_equal_episodes_are_merged_once(tmp_path: Path) -> None:
     parts = [*shards(tmp_path, 2), finished_run(tmp_path / "again", SPEC, WAYS[2:5], wall_s=9.0)]
     merged = merge_runs(parts, tmp_path / "merged", ignore)
     assert merged.twice == ("s-002", "s-003", "s-004")
-    assert (tmp_path / "merged/results.csv").read_bytes() == whole_table(tmp_path)
+    assert (tmp_path / "merged/results.csv").read_bytes() == undivided_table(tmp_path)
 
 
 @pytest.mark.parametrize("what", ["record", "trajectory"])
@@ -250,9 +250,9 @@ def test_a_shard_needs_the_seed_of_its_run(cosim: Cosim) -> None:
 
 def test_a_finished_run_is_a_shard_too(tmp_path: Path) -> None:
     """Parts of a run from two machines without shards are merged, too."""
-    whole = run_of(tmp_path / "a", ["goal", "hit"])
-    merged = merge_runs([whole], tmp_path / "merged", ignore)
+    run = run_of(tmp_path / "a", ["goal", "hit"])
+    merged = merge_runs([run], tmp_path / "merged", ignore)
     assert (
         merged.missing == ()
-        and (tmp_path / "merged/results.csv").read_bytes() == (whole / "results.csv").read_bytes()
+        and (tmp_path / "merged/results.csv").read_bytes() == (run / "results.csv").read_bytes()
     )

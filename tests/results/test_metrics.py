@@ -43,9 +43,9 @@ def failure(kind: str, other_kind: str = "") -> Failure:
 
 
 def episode(
-    one: Log, *failures: Failure, ended: str = "timeout", length_m: float = 100.0
+    trajectory: Log, *failures: Failure, ended: str = "timeout", length_m: float = 100.0
 ) -> EpisodeFacts:
-    return EpisodeFacts(one, failures, 0, ended, length_m)  # type: ignore[arg-type]
+    return EpisodeFacts(trajectory, failures, 0, ended, length_m)  # type: ignore[arg-type]
 
 
 def test_a_clean_drive_to_the_goal() -> None:
@@ -73,14 +73,14 @@ def test_a_clean_drive_to_the_goal() -> None:
 
 def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
     """40 m forward and 20 m back with 3 failures give 3 on 60 m travelled and on 40 m of progress."""
-    there = [0.1 * (i + 1) for i in range(400)]
+    forward = [0.1 * (i + 1) for i in range(400)]
     back = [40.0 - 0.1 * (i + 1) for i in range(200)]
     failures = (
         failure("collision", "pedestrian"),
         failure("collision", "vehicle"),
         failure("freezing"),
     )
-    measures = compute_metrics(episode(log(there + back), *failures))
+    measures = compute_metrics(episode(log(forward + back), *failures))
     assert measures["path_length_m"] == pytest.approx(60.0)
     assert measures["progress_m"] == pytest.approx(40.0)
     assert measures["failures_per_100m"] == pytest.approx(5.0)
@@ -176,29 +176,29 @@ def test_space_metrics_have_the_signs_of_their_names() -> None:
 def test_time_on_the_carriageway_and_braking_vehicles_are_summed() -> None:
     """Thirty ticks on the road are 1.5 s, and two vehicles that brake at one tick and one later are
     three."""
-    one = log([0.05 * (i + 1) for i in range(100)])
-    one.on_carriageway[20:50] = True
-    one.vehicles_braked[25], one.vehicles_braked[40] = 2, 1
-    measures = compute_metrics(episode(one))
+    trajectory = log([0.05 * (i + 1) for i in range(100)])
+    trajectory.on_carriageway[20:50] = True
+    trajectory.vehicles_braked[25], trajectory.vehicles_braked[40] = 2, 1
+    measures = compute_metrics(episode(trajectory))
     assert measures["carriageway_time_s"] == pytest.approx(1.5)
     assert measures["vehicles_braked"] == 3.0
 
 
 def test_spl_charges_detours() -> None:
     """A clean drive of 125 m for a route of 100 m has an SPL of 0.8."""
-    there = [0.5 * (i + 1) for i in range(225)]
+    forward = [0.5 * (i + 1) for i in range(225)]
     back = [112.5 - 0.5 * (i + 1) for i in range(25)]
-    assert compute_metrics(episode(log(there + back), ended="goal"))["spl"] == pytest.approx(0.8)
+    assert compute_metrics(episode(log(forward + back), ended="goal"))["spl"] == pytest.approx(0.8)
 
 
 def test_every_metric_is_defined_for_every_episode() -> None:
     """No metric raises or gives NaN, whatever the episode."""
-    for one in (
+    for expected in (
         episode(log([0.05])),
         episode(log([0.0, 120.0]), ended="goal"),
         episode(log([1.0] * 3, person_m=0.1)),
     ):
-        values = compute_metrics(one)
+        values = compute_metrics(expected)
         assert set(values) == set(METRICS)
         assert all(value is None or np.isfinite(value) for value in values.values())
 
@@ -225,18 +225,18 @@ def test_people_who_walk_into_a_standing_robot_cost_it_nothing() -> None:
 
 def test_accelerations_and_jerks_are_of_the_policys_periods() -> None:
     """At 4 Hz speeds of 0, 0.5, 1.5, 1.5 m/s give 2, 4, 0 m/s2, and so 8 and -16 m/s3."""
-    one = log([0.05] * 15)
-    one.speed[:, 0] = np.repeat([0.5, 1.5, 1.5], 5)
-    measures = compute_metrics(episode(one))
+    trajectory = log([0.05] * 15)
+    trajectory.speed[:, 0] = np.repeat([0.5, 1.5, 1.5], 5)
+    measures = compute_metrics(episode(trajectory))
     assert measures["acceleration_mean_mps2"] == pytest.approx((2.0 + 4.0 + 0.0) / 3)
     assert measures["jerk_mean_mps3"] == pytest.approx((8.0 + 16.0) / 2)
 
 
 def test_a_reset_is_no_deceleration() -> None:
     """A reset to rest at 1 m/s is left out, and the new start counts."""
-    one = log([0.05 * (i + 1) for i in range(20)], resets={9: 0.5})
-    one.speed[:, 0] = 1.0
-    assert compute_metrics(episode(one))["acceleration_mean_mps2"] == pytest.approx(
+    trajectory = log([0.05 * (i + 1) for i in range(20)], resets={9: 0.5})
+    trajectory.speed[:, 0] = 1.0
+    assert compute_metrics(episode(trajectory))["acceleration_mean_mps2"] == pytest.approx(
         (4.0 + 0.0 + 4.0 + 0.0) / 4
     )
 

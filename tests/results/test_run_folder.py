@@ -66,12 +66,12 @@ LOG = driven(SUITE.scenarios[0], [1.0] * 3).encoded()
 """Of three ticks, as `record` has."""
 
 
-def write_files_of(folder: RunFolder, kept: Record, under: str = "") -> None:
+def write_files_of(folder: RunFolder, episode_record: Record, under: str = "") -> None:
     """Write the files of an episode without a row; `under` is the folder of another scenario."""
-    place = folder.episode_folder(under or kept.scenario.id)
+    place = folder.episode_folder(under or episode_record.scenario.id)
     place.mkdir(parents=True, exist_ok=True)
     (place / "trajectory.npz").write_bytes(LOG)
-    kept.save(place / "record.json")
+    episode_record.save(place / "record.json")
 
 
 def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: Path) -> None:
@@ -185,9 +185,9 @@ def test_every_row_has_the_waypoint_rule(tmp_path: Path) -> None:
     """The rule comes from the record."""
     scaled = changed(record("s-0"), waypoints=WaypointRule(index=4, unit_m=0.25))
     scaled.save(tmp_path / "record.json")
-    kept = Record.load(tmp_path / "record.json")
-    assert kept.manifest.waypoints == WaypointRule(index=4, unit_m=0.25)
-    assert table_row(kept)["waypoints"] == "waypoint 4, units of 0.25 m, in 0.25 s, shipped"
+    saved = Record.load(tmp_path / "record.json")
+    assert saved.manifest.waypoints == WaypointRule(index=4, unit_m=0.25)
+    assert table_row(saved)["waypoints"] == "waypoint 4, units of 0.25 m, in 0.25 s, shipped"
 
 
 def test_resuming_with_an_edited_policy_is_refused(tmp_path: Path) -> None:

@@ -67,9 +67,11 @@ def test_a_crash_improves_no_ranked_metric() -> None:
             continue
         worst = WORST.get(name)
         assert (worst is None) == (name in UNKNOWN_WITH_CRASH), name
-        one = table((300.0, 0, 300.0), crashed=1)
-        one.loc[0, name] = 0.4
-        both, crash = (summary_of(part, [name]).loc[name] for part in (one, one[1:]))
+        crashed_once = table((300.0, 0, 300.0), crashed=1)
+        crashed_once.loc[0, name] = 0.4
+        both, crash = (
+            summary_of(part, [name]).loc[name] for part in (crashed_once, crashed_once[1:])
+        )
         if worst is None:
             assert both["n"] == crash["n"] == 0 and np.isnan([both["mean"], crash["mean"]]).all()
         else:

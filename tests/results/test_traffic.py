@@ -127,7 +127,7 @@ def test_cached_lookups_on_the_sidewalk_equal_fresh_ones() -> None:
             return super().locate(x_m, y_m, slack_m)
 
     counted = Counted(**{f.name: getattr(street_map, f.name) for f in fields(street_map) if f.init})
-    kept = TrafficMonitor(counted, 0.05)
+    cached = TrafficMonitor(counted, 0.05)
     rng = np.random.default_rng(4)
     walk = np.concatenate(
         [
@@ -138,7 +138,7 @@ def test_cached_lookups_on_the_sidewalk_equal_fresh_ones() -> None:
     for tick, (x_m, y_m) in enumerate(walk.tolist()):
         after = street(7.7, tick % 2 == 0)
         this = step(100 * tick, x_m, y_m, street(8.0, tick % 2 == 0), after)
-        assert kept.update(this) == TrafficMonitor(street_map, 0.05).update(this)
+        assert cached.update(this) == TrafficMonitor(street_map, 0.05).update(this)
         if tick == 99:
             assert len(looks) == 1
 

@@ -80,10 +80,10 @@ def test_contradictory_options_are_refused() -> None:
 def test_a_connection_survives_encoding() -> None:
     """A connection is equal after MessagePack, and is checked again when decoded."""
     role: Role = "worker"
-    one = Connection(role=role, connect="tls/hub.lan:7447", tls="certs/worker")
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(one), type=Connection) == one
+    connection = Connection(role=role, connect="tls/hub.lan:7447", tls="certs/worker")
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(connection), type=Connection) == connection
     there = Connection(role="coordinator", connect="tls/gpu.lan:7449", tls="certs/coordinator")
-    assert there.seen_by(one) == Connection(
+    assert there.seen_by(connection) == Connection(
         role="worker", connect="tls/gpu.lan:7449", tls="certs/worker"
     )
     with pytest.raises(UsageError, match="needs --tls FOLDER"):

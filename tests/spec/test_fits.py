@@ -214,16 +214,16 @@ def test_every_place_is_read_once_and_all_faults_are_reported(
         for i in range(3)
         for name, one, seed in (("fine", fine, 1), ("odd", odd, 2))
     )
-    whole = Suite(name="w", version="1", scenarios=scenarios)
+    suite = Suite(name="w", version="1", scenarios=scenarios)
     with pytest.raises(SpecError) as caught:
-        check_places(whole, scenarios)
+        check_places(suite, scenarios)
     assert made == [1, 2]
     head, *faults = str(caught.value).splitlines()
     assert head == "suite 'w': 5 faults:"
     assert f"unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}" in faults[0]
     assert "hdri 'nowhere.hdr' does not exist" in faults[1]
     assert all(f"scenario 'odd-{i}': event 'e0' is off" in faults[2 + i] for i in range(3))
-    check_places(whole, [s for s in scenarios if s.id.startswith("fine")])
+    check_places(suite, [s for s in scenarios if s.id.startswith("fine")])
 
 
 def test_several_processes_report_the_same_faults() -> None:
@@ -233,11 +233,11 @@ def test_several_processes_report_the_same_faults() -> None:
         msgspec.structs.replace(from_west_to_east(), id=f"s{i}", place=at)
         for i, at in enumerate(where)
     )
-    whole = Suite(name="w", version="1", scenarios=lost)
+    suite = Suite(name="w", version="1", scenarios=lost)
     messages = []
     for jobs in (1, 2):
         with pytest.raises(SpecError) as refusal:
-            check_places(whole, lost, jobs=jobs)
+            check_places(suite, lost, jobs=jobs)
         messages.append(str(refusal.value))
     assert (
         messages[0] == messages[1]

@@ -17,12 +17,12 @@ from tests.support.shipped import all_shipped
 
 @settings(max_examples=12)
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))
-def test_pseudonyms_of_two_runs_are_distinct(one: int, other: int) -> None:
+def test_pseudonyms_of_two_runs_are_distinct(expected: int, other: int) -> None:
     """Names and seeds of all shipped scenarios are distinct within a run, and between runs of
     different seeds."""
-    called = [episode_id_of(one, scenario) for scenario in all_shipped()]
+    called = [episode_id_of(expected, scenario) for scenario in all_shipped()]
     assert len({name for name, _ in called}) == len(all_shipped()) == len(set(called))
-    if one != other:
+    if expected != other:
         assert not {name for name, _ in called} & {
             episode_id_of(other, scenario).episode for scenario in all_shipped()
         }

@@ -120,21 +120,21 @@ PAIRED_CHOICES: dict[str, dict[str, object]] = {
 def test_decoys_are_chosen_with_their_scenarios(reactive: Suite, words: str) -> None:
     """Kind, number and split include them unless excluded, an id selects one, and the options are
     found from the ids."""
-    whole = with_decoys_of(reactive)
-    chosen = select_scenarios(whole, **PAIRED_CHOICES[words])  # type: ignore[arg-type]
-    assert selection_in_words(whole, [scenario.id for scenario in chosen]) == words
+    suite = with_decoys_of(reactive)
+    chosen = select_scenarios(suite, **PAIRED_CHOICES[words])  # type: ignore[arg-type]
+    assert selection_in_words(suite, [scenario.id for scenario in chosen]) == words
 
 
 def test_episodes_counts_pairs_wherever_their_decoys_are(reactive: Suite) -> None:
     """--episodes 3 selects three scenarios and their decoys in suite order, of which `static` has
     none."""
-    whole = with_decoys_of(reactive)
-    chosen = select_scenarios(whole, episodes=3)
-    first = [one.id for one in whole.scenarios[:3]]
-    decoys = [one.id for one in whole.scenarios if one.decoy_of in first]
+    suite = with_decoys_of(reactive)
+    chosen = select_scenarios(suite, episodes=3)
+    first = [one.id for one in suite.scenarios[:3]]
+    decoys = [one.id for one in suite.scenarios if one.decoy_of in first]
     assert [one.id for one in chosen] == [*first, *decoys] and decoys
     with pytest.raises(UsageError, match="--no-decoys: only decoys of suite 'reactive' are chosen"):
-        select_scenarios(whole, ["frontal-001-decoy"], decoys=False)
+        select_scenarios(suite, ["frontal-001-decoy"], decoys=False)
 
 
 def test_shards_keep_pairs_together(reactive: Suite) -> None:

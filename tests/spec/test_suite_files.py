@@ -49,11 +49,11 @@ def refusal(path: Path, data: bytes | str) -> str:
 
 def test_a_thousand_mutated_suites_are_read_or_refused_with_reasons(tmp_path: Path) -> None:
     """Any file is a suite, or has a short refusal of printable lines that each name their place."""
-    whole = valid_suite()
+    suite = valid_suite()
     path = tmp_path / "mutated.json"
     accepted = 0
     for seed in range(1000):
-        path.write_bytes(mutated(whole, seed))
+        path.write_bytes(mutated(suite, seed))
         try:
             read_suite(path, EVENT_KINDS)
             accepted += 1
@@ -183,22 +183,22 @@ def test_a_value_out_of_its_range_is_named(
     tmp_path: Path, where: tuple[str | int, ...], value: object, expected: str
 ) -> None:
     """The message has field, range and value, also for numbers that JSON lacks, such as NaN."""
-    whole: Any = valid_suite()
+    suite: Any = valid_suite()
     *holders, key = where
-    holder = whole
+    holder = suite
     for step in holders:
         holder = holder["scenarios"][0] if step == "first" else holder[step]
     holder[key] = value
-    assert expected in refusal(tmp_path / "s.json", json.dumps(whole))
+    assert expected in refusal(tmp_path / "s.json", json.dumps(suite))
 
 
 def test_several_faults_are_reported_at_once(tmp_path: Path) -> None:
     """Wrong types, unknown fields and contradictions have one line each, at most five."""
-    whole = valid_suite()
-    first, second, third = whole["scenarios"]
+    suite = valid_suite()
+    first, second, third = suite["scenarios"]
     first |= {"seed": "x", "gaol": 1, "crowd": {"persons": -1, "groups": 2.0}, "goal_radius_m": 1e9}
     second["goal"] = [0.0, 0.0]
-    assert refusal(tmp_path / "s.json", json.dumps(whole)).splitlines() == [
+    assert refusal(tmp_path / "s.json", json.dumps(suite)).splitlines() == [
         "5 faults:",
         "  Object contains unknown field `gaol` - at `$.scenarios[0]`. Valid choices: "
         + ", ".join(Scenario.__struct_fields__)
@@ -211,7 +211,7 @@ def test_several_faults_are_reported_at_once(tmp_path: Path) -> None:
         f"{tuple(second['route'][-1])} - at `$.scenarios[1]`",
     ]
     third["route"] = [["x", "y"]] * 2000
-    lines = refusal(tmp_path / "s.json", json.dumps(whole)).splitlines()
+    lines = refusal(tmp_path / "s.json", json.dumps(suite)).splitlines()
     assert lines[0] == "1000 faults or more; the first 5:" and len(lines) == 6
 
 

@@ -49,7 +49,7 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Hub:
-    """A run's hub and its own process; `heard` are the keys of messages from outside that reached
+    """A run's hub and its own process; `received` are the keys of messages from outside that reached
     them."""
 
     def __init__(self, certs: Path, stack: ExitStack) -> None:
@@ -59,12 +59,14 @@ class Hub:
         )
         self.session = stack.enter_context(open_session(end))
         self.run: Session = stack.enter_context(open_session(self.session.inside))
-        self.heard: list[tuple[str, int]] = []
+        self.received: list[tuple[str, int]] = []
         self.tokens: list[str] = []
         for topic, name in OUT.items():
             self.run.advertise(name, latched=int(topic == "/tf_static"))
         self.run.declare_token(rmw_token(Endpoint("NN", 3, "cd", "cosim")))
-        self.run.subscribe("**", lambda name, payload, _: self.heard.append((name, len(payload))))
+        self.run.subscribe(
+            "**", lambda name, payload, _: self.received.append((name, len(payload)))
+        )
         for tokens in ("@ros2_lv/**", "cosim/**"):
             self.run.watch_tokens(tokens, lambda name, alive: self.tokens.append(name))
 
@@ -79,13 +81,13 @@ def test_a_node_receives_topics_and_sends_only_commands_and_plans(certs: Path, h
     """A node gets every published topic and sees the run's token; of its messages only commands,
     plans and tokens arrive."""
     with plain_zenoh(hub.at, certs, "ros2") as guest:
-        got: list[str] = []
-        guest.declare_subscriber("3/**", lambda sample: got.append(str(sample.key_expr)))
+        received: list[str] = []
+        guest.declare_subscriber("3/**", lambda sample: received.append(str(sample.key_expr)))
         for name in OUT.values():
-            guest.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
-        asked: list[str] = []
+            guest.declare_subscriber(name, lambda sample: received.append(str(sample.key_expr)))
+        queried: list[str] = []
         for name in (*IN.values(), *FOREIGN):
-            guest.declare_queryable(name, lambda query: asked.append(str(query.key_expr)))
+            guest.declare_queryable(name, lambda query: queried.append(str(query.key_expr)))
         token = guest.liveliness().declare_token(TOKEN)
         foreign = guest.liveliness().declare_token("cosim/r/workers/one")
         wait_until(lambda: TOKEN in hub.tokens)
@@ -97,19 +99,19 @@ def test_a_node_receives_topics_and_sends_only_commands_and_plans(certs: Path, h
             for name in OUT.values():
                 hub.run.publish(name, b"x")
             time.sleep(0.05)
-            return set(OUT.values()) <= set(got)
+            return set(OUT.values()) <= set(received)
 
         wait_until(all_arrived)
         hub.run.publish_lossy("cosim/r/env/e/robot", b"x")
-        hub.heard.clear()
+        hub.received.clear()
         for name in (*FOREIGN, *OUT.values(), IN["/plan"], IN["/cmd_vel"]):
             guest.put(name, b"x")
             guest.delete(name)
         guest.put(IN["/plan"], bytes(MAX_MESSAGE_B))
         guest.put(IN["/cmd_vel"], b"last")
-        wait_until(lambda: (IN["/cmd_vel"], 4) in hub.heard)
+        wait_until(lambda: (IN["/cmd_vel"], 4) in hub.received)
         own = {(name, 1) for name in OUT.values()} | {("cosim/r/env/e/robot", 1)}
-        assert set(hub.heard) - own == {
+        assert set(hub.received) - own == {
             (IN["/plan"], 1),
             (IN["/plan"], MAX_MESSAGE_B),
             (IN["/cmd_vel"], 1),
@@ -117,38 +119,38 @@ def test_a_node_receives_topics_and_sends_only_commands_and_plans(certs: Path, h
         }
         for name in (*IN.values(), *FOREIGN):
             assert hub.run.query_all(name, timeout_s=GIVEN_UP_S) == {}
-        assert asked == []
+        assert queried == []
         del token, foreign
 
 
 def test_nodes_do_not_reach_each_other_through_the_run(certs: Path, hub: Hub) -> None:
     """Commands and private topics of one node are not passed to another."""
     with plain_zenoh(hub.at, certs, "ros2") as one, plain_zenoh(hub.at, certs, "ros2") as other:
-        got: list[str] = []
+        received: list[str] = []
         for name in (IN["/cmd_vel"], FOREIGN[0]):
-            other.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
-        hub.heard.clear()
+            other.declare_subscriber(name, lambda sample: received.append(str(sample.key_expr)))
+        hub.received.clear()
         one.put(FOREIGN[0], b"x")
         one.put(IN["/cmd_vel"], b"x")
-        wait_until(lambda: (IN["/cmd_vel"], 1) in hub.heard)
+        wait_until(lambda: (IN["/cmd_vel"], 1) in hub.received)
         time.sleep(GIVEN_UP_S)
-        assert got == []
+        assert received == []
 
 
 def test_without_a_node_certificate_nothing_is_received(certs: Path, hub: Hub) -> None:
     """Without a certificate there is no link; a certificate of another role gives a link that
     carries nothing."""
     with plain_zenoh(hub.at, certs, "viewer") as viewer:
-        got: list[str] = []
+        received: list[str] = []
         for name in (*OUT.values(), "**"):
-            viewer.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
-        hub.heard.clear()
+            viewer.declare_subscriber(name, lambda sample: received.append(str(sample.key_expr)))
+        hub.received.clear()
         viewer.put(IN["/cmd_vel"], b"forged")
         for name in OUT.values():
             hub.run.publish(name, b"x")
         time.sleep(GIVEN_UP_S)
-        assert (IN["/cmd_vel"], 6) not in hub.heard
-        assert [name for name in got if not name.endswith(IN["/cmd_vel"])] == []
+        assert (IN["/cmd_vel"], 6) not in hub.received
+        assert [name for name in received if not name.endswith(IN["/cmd_vel"])] == []
         assert list(viewer.liveliness().get("@ros2_lv/**", timeout=GIVEN_UP_S)) == []
     with pytest.raises((AccessError, EngineError)):
         open_session(Connection(role="worker", connect=hub.at.replace("tls/", "tcp/")))

@@ -58,7 +58,7 @@ DEPTH = np.linspace(0.5, 30.0, 40 * 64, dtype=np.float32).reshape(40, 64)
 NOW_NS = messages.stamp_ns(20)
 
 
-def seen(**more: Any) -> Observation:
+def observation_with(**more: Any) -> Observation:
     """An observation with every sensor that ROS 2 is sent."""
     lidar = ScanSpec(rays=8)
     values: dict[str, Any] = {
@@ -122,12 +122,16 @@ def test_a_namespace_is_mangled_in_tokens() -> None:
 def test_each_message_is_decoded_to_what_was_observed() -> None:
     """All topics of an observation survive CDR with values, frames and stamps, as the same bytes
     each time."""
-    one = seen()
-    sent = {row.name: row.message(one, NOW_NS) for row in messages.TOPICS.values() if row.message}
+    observation = observation_with()
+    sent = {
+        row.name: row.message(observation, NOW_NS)
+        for row in messages.TOPICS.values()
+        if row.message
+    }
     assert sent.pop("/points") is None
-    sent["/goal_pose"] = messages.goal_pose(one, NOW_NS)
-    sent["/tf_static"] = messages.static_tf(one, NOW_NS)
-    sent["/initialpose"] = messages.initial_pose(one, NOW_NS)
+    sent["/goal_pose"] = messages.goal_pose(observation, NOW_NS)
+    sent["/tf_static"] = messages.static_tf(observation, NOW_NS)
+    sent["/initialpose"] = messages.initial_pose(observation, NOW_NS)
     back = {}
     for name, message in sent.items():
         data = types.to_cdr(message)
@@ -141,12 +145,12 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
     assert (image.data.reshape(40, 64, 3) == RGB).all()
     assert (back["/camera/depth"].data.view("<f4").reshape(40, 64) == DEPTH).all()
     info = back["/camera/camera_info"]
-    assert one.camera is not None
-    assert (info.k.reshape(3, 3) == one.camera.matrix).all() and info.p[3] == 0.0
+    assert observation.camera is not None
+    assert (info.k.reshape(3, 3) == observation.camera.matrix).all() and info.p[3] == 0.0
     pose = back["/odom"].pose.pose
     assert (pose.position.x, pose.position.y) == (3.0, -1.0)
     scan = back["/scan"]
-    assert (scan.ranges == one.scan.ranges_m[0]).all()  # type: ignore[union-attr]
+    assert (scan.ranges == observation.scan.ranges_m[0]).all()  # type: ignore[union-attr]
     assert math.isclose(scan.angle_max, math.pi - scan.angle_increment, rel_tol=1e-6)
     assert back["/imu"].linear_acceleration.z == 9.81
     goal = back["/goal_pose"].pose.position
@@ -159,28 +163,30 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
 def test_optical_frames_look_ahead() -> None:
     """The chain base_link -> camera_link -> optical frame equals the calibration of the picture,
     and camera_link has x ahead."""
-    one = seen()
-    frames = {frame.child_frame_id: frame for frame in messages.static_tf(one, NOW_NS).transforms}
+    observation = observation_with()
+    frames = {
+        frame.child_frame_id: frame for frame in messages.static_tf(observation, NOW_NS).transforms
+    }
     assert list(frames) == ["odom", messages.CAMERA, messages.OPTICAL, messages.LIDAR, messages.IMU]
     camera, optical = (
         _matrix(frames[name].transform) for name in (messages.CAMERA, messages.OPTICAL)
     )
-    assert one.camera is not None
-    assert np.allclose(camera @ optical, one.camera.on_robot)
+    assert observation.camera is not None
+    assert np.allclose(camera @ optical, observation.camera.on_robot)
     assert camera[0, 0] > 0.9 and abs(camera[1, 0]) < 1e-9
 
 
 def _matrix(transform: Any) -> np.ndarray[Any, Any]:
     at, turn = transform.translation, transform.rotation
     x, y, z, w = turn.x, turn.y, turn.z, turn.w
-    whole = np.eye(4)
-    whole[:3, :3] = [
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    whole[:3, 3] = at.x, at.y, at.z
-    return whole
+    matrix[:3, 3] = at.x, at.y, at.z
+    return matrix
 
 
 def test_a_cloud_of_rings_has_the_points_of_the_scan() -> None:
@@ -197,15 +203,21 @@ def test_a_cloud_of_rings_has_the_points_of_the_scan() -> None:
 
 def test_a_goal_is_sent_when_it_changes() -> None:
     """A point is sent again after it has moved in odom, and an instruction when its text differs."""
-    sent, topic, _ = messages.new_goal(seen(), messages.SentGoal(), NOW_NS)
+    sent, topic, _ = messages.new_goal(observation_with(), messages.SentGoal(), NOW_NS)
     assert topic == "/goal_pose"
-    assert messages.new_goal(seen(goal=PointGoal(10.1, 2.0)), sent, NOW_NS)[1] == ""
-    assert messages.new_goal(seen(goal=PointGoal(12.0, 2.0)), sent, NOW_NS)[1] == "/goal_pose"
+    assert messages.new_goal(observation_with(goal=PointGoal(10.1, 2.0)), sent, NOW_NS)[1] == ""
+    assert (
+        messages.new_goal(observation_with(goal=PointGoal(12.0, 2.0)), sent, NOW_NS)[1]
+        == "/goal_pose"
+    )
     sent_instruction, topic, message = messages.new_goal(
-        seen(goal=Instruction("Go.")), sent, NOW_NS
+        observation_with(goal=Instruction("Go.")), sent, NOW_NS
     )
     assert (topic, message.data) == ("/cosim/instruction", "Go.")
-    assert messages.new_goal(seen(goal=Instruction("Go.")), sent_instruction, NOW_NS)[1] == ""
+    assert (
+        messages.new_goal(observation_with(goal=Instruction("Go.")), sent_instruction, NOW_NS)[1]
+        == ""
+    )
 
 
 def twist(v_mps: float, w_radps: float, stamp_ns: int | None = None) -> Received:
@@ -222,12 +234,12 @@ def twist(v_mps: float, w_radps: float, stamp_ns: int | None = None) -> Received
     return Received(data, name, types.HASHES[name], bytes(16), "/a", len(data))
 
 
-def verdict(got: Received, wait: Ros2Wait = "next", distro: str = "jazzy") -> Any:
+def verdict(message: Received, wait: Ros2Wait = "next", distro: str = "jazzy") -> Any:
     return judged(
-        got,
+        message,
         wait,
         NOW_NS,
-        type_hash(got.type, distro) if got.type in types.HASHES else "",
+        type_hash(message.type, distro) if message.type in types.HASHES else "",
         attached=True,
     )
 

@@ -24,7 +24,7 @@ NOW = datetime.now(UTC)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An authority with a coordinator of localhost and a worker."""
     folder = tmp_path_factory.mktemp("authority") / "certs"
     make_authority(folder, ["localhost"], 365)
@@ -83,7 +83,7 @@ def test_the_command_creates_shows_and_never_overwrites(tmp_path: Path, cosim: C
     ]
 
 
-def test_each_kind_of_unusable_file_is_named(made: Path, tmp_path: Path) -> None:
+def test_each_kind_of_unusable_file_is_named(certificates: Path, tmp_path: Path) -> None:
     """A missing or damaged file, another's key, another authority, a readable key and another role
     are each named."""
     other = tmp_path / "other"
@@ -92,7 +92,7 @@ def test_each_kind_of_unusable_file_is_named(made: Path, tmp_path: Path) -> None
 
     def refused(change: str, role: Role = "worker") -> str:
         folder = tmp_path / str(next(copies))
-        shutil.copytree(made, folder)
+        shutil.copytree(certificates, folder)
         place = folder / "worker"
         match change:
             case "missing":
@@ -123,11 +123,11 @@ def test_each_kind_of_unusable_file_is_named(made: Path, tmp_path: Path) -> None
     assert "is of the role worker, and this needs viewer" in refused("", "viewer")
 
 
-def test_the_end_of_a_certificate_is_announced_30_days_before(made: Path) -> None:
+def test_the_end_of_a_certificate_is_announced_30_days_before(certificates: Path) -> None:
     """Within 30 days the day and the remedy are shown; an expired or not yet valid certificate is
     refused."""
     for role in ("coordinator", "worker"):
-        end = open_end(made, role)  # type: ignore[arg-type]
+        end = open_end(certificates, role)  # type: ignore[arg-type]
         assert checked_identity(end, NOW) == ""
         assert (
             "expires on" in (warning := checked_identity(end, NOW + timedelta(days=350)))
@@ -137,14 +137,14 @@ def test_the_end_of_a_certificate_is_announced_30_days_before(made: Path) -> Non
             checked_identity(end, NOW + timedelta(days=366))
         with pytest.raises(AccessError, match="is this machine's clock right"):
             checked_identity(end, NOW - timedelta(days=3))
-    assert checked_identity(open_end(made, "worker"), NOW - timedelta(hours=20)) == "", (
+    assert checked_identity(open_end(certificates, "worker"), NOW - timedelta(hours=20)) == "", (
         "a clock that is behind"
     )
 
 
 @pytest.mark.engine
 def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another authority on either end, another name, an expired hub, no TLS and no hub are refused;
     a valid hub connects."""
@@ -154,13 +154,13 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
     trusting = tmp_path / "trusting"  # takes the hub for what it is, and is not taken itself
     shutil.copytree(other / "worker", trusting)
     (trusting / "ca.pem").write_bytes(
-        (other / "ca.pem").read_bytes() + (made / "ca.pem").read_bytes()
+        (other / "ca.pem").read_bytes() + (certificates / "ca.pem").read_bytes()
     )
     old = tmp_path / "old"
     make_authority(old, ["localhost"], 5, NOW - timedelta(days=10))
     issue(old, "worker", [], 365)
 
-    def tried(at: str, folder: Path) -> str:
+    def refusal_of(at: str, folder: Path) -> str:
         with (
             pytest.raises(AccessError) as error,
             open_session(Connection(role="worker", connect=at, tls=str(folder))),
@@ -169,26 +169,26 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
         return str(error.value)
 
     at = f"tls/localhost:{free_port()}"
-    listening = Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))
+    listening = Connection(role="coordinator", listen=at, tls=str(certificates / "coordinator"))
     with open_session(listening) as session:
         session.serve("cosim/r/jobs/claim", bytes.upper)
         with open_session(
-            Connection(role="worker", connect=at, tls=str(made / "worker"))
+            Connection(role="worker", connect=at, tls=str(certificates / "worker"))
         ) as worker:
             assert worker.query("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
         monkeypatch.setattr(
             settings, "CONNECTS_WITHIN_S", 0.1
         )  # what is refused is so however long it is tried
         assert (
-            "the certificate of tls/localhost" in (reason := tried(at, other / "worker"))
+            "the certificate of tls/localhost" in (reason := refusal_of(at, other / "worker"))
             and "another authority" in reason
         )
         assert (
-            "refused us" in (reason := tried(at, trusting))
+            "refused us" in (reason := refusal_of(at, trusting))
             and "than the one there trusts" in reason
         )
-        assert "is not for the address 127.0.0.1" in tried(
-            at.replace("localhost", "127.0.0.1"), made / "worker"
+        assert "is not for the address 127.0.0.1" in refusal_of(
+            at.replace("localhost", "127.0.0.1"), certificates / "worker"
         )
     plain = f"tls/localhost:{free_port()}".replace("tls", "tcp")
     with (
@@ -198,7 +198,9 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
     ):
         patch.setattr(identity, "_PATIENCE_S", 0.2)  # who speaks no TLS never answers
         open_session(
-            Connection(role="worker", connect=plain.replace("tcp", "tls"), tls=str(made / "worker"))
+            Connection(
+                role="worker", connect=plain.replace("tcp", "tls"), tls=str(certificates / "worker")
+            )
         )
     expired = Connection(
         role="coordinator", listen=f"tls/localhost:{free_port()}", tls=str(old / "coordinator")
@@ -212,26 +214,32 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
         (other / "ca.pem").read_bytes() + (old / "ca.pem").read_bytes()
     )
     with open_session(expired):
-        assert "has expired" in tried(expired.listen, trusting)
+        assert "has expired" in refusal_of(expired.listen, trusting)
     with pytest.raises(EngineError, match="no hub answers at"):
         open_session(
             Connection(
-                role="worker", connect=f"tls/localhost:{free_port()}", tls=str(made / "worker")
+                role="worker",
+                connect=f"tls/localhost:{free_port()}",
+                tls=str(certificates / "worker"),
             )
         )
 
 
 @pytest.mark.engine
-def test_plain_zenoh_without_our_certificate_cannot_connect(made: Path, tmp_path: Path) -> None:
+def test_plain_zenoh_without_our_certificate_cannot_connect(
+    certificates: Path, tmp_path: Path
+) -> None:
     """No, foreign and self-signed certificates give no link; the same client with ours gets one."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
-    shutil.copy(made / "ca.pem", other / "ca.pem")
+    shutil.copy(certificates / "ca.pem", other / "ca.pem")
     (tmp_path / "none").mkdir()
-    shutil.copy(made / "ca.pem", tmp_path / "none" / "ca.pem")
+    shutil.copy(certificates / "ca.pem", tmp_path / "none" / "ca.pem")
     at = f"tls/localhost:{free_port()}"
-    with open_session(Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))):
+    with open_session(
+        Connection(role="coordinator", listen=at, tls=str(certificates / "coordinator"))
+    ):
         for folder in (other, tmp_path / "none"):
             with pytest.raises(zenoh.ZError), plain_zenoh(at, folder, "worker", wait_ms=400):
                 pass
@@ -240,7 +248,7 @@ def test_plain_zenoh_without_our_certificate_cannot_connect(made: Path, tmp_path
             plain_zenoh(at.replace("tls", "tcp"), None, "", wait_ms=400),
         ):
             pass
-        with plain_zenoh(at, made, "worker"):
+        with plain_zenoh(at, certificates, "worker"):
             pass
 
 

@@ -27,10 +27,10 @@ pytestmark = pytest.mark.engine
 
 ENV = "cosim/r/env/e"
 POLICY = "cosim/r/policy/ours/act"
-TOLD = tuple(f"{ENV}/{topic}" for topic in ("clock", "robot", "crowd", "signals", "events"))
+PUBLISHED = tuple(f"{ENV}/{topic}" for topic in ("clock", "robot", "crowd", "signals", "events"))
 JOBS = tuple(f"cosim/r/jobs/{act}" for act in ("claim", "report"))
 SEEN = (f"{ENV}/status", f"{ENV}/log", f"{ENV}/camera", "cosim/r/status")
-ASKED = (*JOBS, *SEEN, "cosim/r/nets/0", f"{ENV}/inject", f"{ENV}/director", POLICY)
+QUERIED = (*JOBS, *SEEN, "cosim/r/nets/0", f"{ENV}/inject", f"{ENV}/director", POLICY)
 OWN = b"asked by the one who tries"
 GIVEN_UP_S = 2.0
 """What is refused is waited for so long: nothing comes, on any machine."""
@@ -59,10 +59,12 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def replies(session: zenoh.Session, key: str) -> list[str]:
     """Return all replies to a query, errors included."""
-    got = session.get(
+    answers = session.get(
         key, payload=OWN, timeout=PATIENCE_S, consolidation=zenoh.ConsolidationMode.NONE
     )
-    return [answer.payload.to_string() for one in got if (answer := one.ok or one.err) is not None]
+    return [
+        answer.payload.to_string() for one in answers if (answer := one.ok or one.err) is not None
+    ]
 
 
 class Air:
@@ -80,7 +82,7 @@ class Air:
         self.inside = stack.enter_context(plain_zenoh(self.hub.inside.connect, None, ""))
         self.policy = stack.enter_context(plain_zenoh(self.at, certs, "policy"))
         self.seen: list[str] = []
-        for key in ASKED:
+        for key in QUERIED:
             if key != POLICY:
                 end = self.run if key.startswith(ENV) else self.hub
                 end.serve(key, lambda _, key=key: self._saw(key), found=key == f"{ENV}/status")  # type: ignore[misc]
@@ -107,31 +109,31 @@ class Air:
 
 
 class Guest:
-    """A client that tries everything; `heard` are keys of queries and messages that it did not send
+    """A client that tries everything; `received` are keys of queries and messages that it did not send
     itself."""
 
     def __init__(self, air: Air, role: str, stack: ExitStack) -> None:
         self.air = air
         self.session = stack.enter_context(plain_zenoh(air.at, air.certs, role))
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self.session.declare_queryable("cosim/r/policy/theirs/info", self._answer)
         everything = [] if role in ("policy", "") else [POLICY, "cosim/*/policy/**", "cosim/**"]
-        for key in (*JOBS, *SEEN, *TOLD, f"{ENV}/inject", f"{ENV}/director", *everything):
+        for key in (*JOBS, *SEEN, *PUBLISHED, f"{ENV}/inject", f"{ENV}/director", *everything):
             self.session.declare_queryable(key, self._answer)
-        for key in (*TOLD, *JOBS, POLICY, "cosim/r/policy/**", "cosim/**", "**"):
+        for key in (*PUBLISHED, *JOBS, POLICY, "cosim/r/policy/**", "cosim/**", "**"):
             self.session.declare_subscriber(key, self._hear)
         self.token = self.session.liveliness().declare_token("cosim/r/workers/one")
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             if query.payload is None or query.payload.to_bytes() != OWN:
-                self.heard.append(str(query.key_expr))
+                self.received.append(str(query.key_expr))
             query.reply(query.key_expr, b"FORGED")
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        # Nobody else deletes: it hears its own when a thread of its own comes to it.
+        # No other client deletes; its own deletion arrives when its thread runs.
         if sample.kind == zenoh.SampleKind.PUT and sample.payload.to_string() != "FORGED":
-            self.heard.append(str(sample.key_expr))
+            self.received.append(str(sample.key_expr))
 
     def passed(self, may_ask: tuple[str, ...]) -> None:
         """Wait until all that it sent before is at the hub, by sending a query after it."""
@@ -162,7 +164,7 @@ def try_all(
     guest.passed(may_ask)
     # to ask
     air.seen.clear()
-    for key in ASKED:
+    for key in QUERIED:
         if key in may_ask:
             wait_until(lambda key=key: key in replies(guest.session, key))  # type: ignore[misc]
         else:
@@ -176,22 +178,30 @@ def try_all(
     assert {key for key in air.seen if "/mark" not in key} == set(may_ask)
     # to tell, and to take back
     air.seen.clear()
-    for key in (*TOLD, *JOBS, f"{ENV}/inject", POLICY, "cosim/r/status", f"{ENV}/*", "cosim/**"):
+    for key in (
+        *PUBLISHED,
+        *JOBS,
+        f"{ENV}/inject",
+        POLICY,
+        "cosim/r/status",
+        f"{ENV}/*",
+        "cosim/**",
+    ):
         guest.session.put(key, b"FORGED")
         guest.session.delete(key)
     guest.passed(may_ask)
     assert {key for key in air.seen if "/mark" not in key} <= set(may_ask[:1])
     # to receive messages of the run and queries of a policy
-    guest.heard.clear()
-    for key in TOLD:
+    guest.received.clear()
+    for key in PUBLISHED:
         air.run.publish_lossy(key, b"true")
     air.hub.query(POLICY, b"secret", timeout_s=PATIENCE_S)
     if watches:
-        wait_until(lambda: set(TOLD) <= set(guest.heard))
+        wait_until(lambda: set(PUBLISHED) <= set(guest.received))
     guest.passed(may_ask)
     foreign = {"cosim/r/policy/theirs/info"} if answers else set()
-    assert {key for key in guest.heard if key not in TOLD} - foreign == set()
-    assert watches == bool(set(TOLD) & set(guest.heard))
+    assert {key for key in guest.received if key not in PUBLISHED} - foreign == set()
+    assert watches == bool(set(PUBLISHED) & set(guest.received))
     # to answer in the place of others, and as a policy
     for key in (*JOBS, *SEEN, f"{ENV}/inject"):
         assert air.hub.query(key, b"", timeout_s=PATIENCE_S) == key.encode()
@@ -225,7 +235,7 @@ def test_without_certificates_no_client_speaks_for_the_run() -> None:
     hub."""
     with ExitStack() as stack:
         air = Air(None, stack)
-        may = tuple(key for key in ASKED if any(key in theirs for theirs in MAY_ASK.values()))
+        may = tuple(key for key in QUERIED if any(key in theirs for theirs in MAY_ASK.values()))
         try_all(air, Guest(air, "", stack), may, watches=True, answers=True, shows=True)
 
 
@@ -234,12 +244,12 @@ def test_only_runs_may_query_directors_and_policy_servers(certs: Path, hub: Role
     """At the hub of a director or a policy server only workers and coordinators may query, and no
     client may reply."""
     at = f"tls/localhost:{free_port()}"
-    asked: list[bytes] = []
+    queries: list[bytes] = []
     with ExitStack() as stack:
         session = stack.enter_context(
             open_session(Connection(role=hub, listen=at, tls=str(certs / hub)))
         )
-        session.serve(key, lambda payload: asked.append(payload) or b"honest")  # type: ignore[func-returns-value]
+        session.serve(key, lambda payload: queries.append(payload) or b"honest")  # type: ignore[func-returns-value]
         guests = {
             role: stack.enter_context(plain_zenoh(at, certs, role)) for role in get_args(Role)
         }
@@ -248,12 +258,12 @@ def test_only_runs_may_query_directors_and_policy_servers(certs: Path, hub: Role
                 guest.declare_queryable(key, lambda query: query.reply(query.key_expr, b"FORGED"))
         for role in ("worker", "coordinator"):
             wait_until(lambda role=role: "honest" in replies(guests[role], key))  # type: ignore[misc]
-        asked.clear()
+        queries.clear()
         for role in ("director", "policy", "viewer", "injector"):
             assert set(replies(guests[role], key)) <= {"FORGED"}, (
                 "its own answer, and nobody else's"
             )
-        assert asked == []
+        assert queries == []
         assert session.query(key, b"x", timeout_s=PATIENCE_S) == b"honest"
 
 
@@ -307,17 +317,18 @@ def test_only_runs_may_query_the_copied_policy_server(certs: Path) -> None:
 def test_pickled_and_unknown_messages_are_refused(tmp_path: Path, written: str) -> None:
     """A message with a pickled Python object or an unknown type is refused with the types that are
     read."""
-    asked: list[bytes] = []
+    claims: list[bytes] = []
     at = f"unixsock-stream/{tmp_path}/hub.sock"
     with listening_at(at) as hub, plain_zenoh(at, None, "") as guest:
-        hub.serve("cosim/r/jobs/claim", lambda payload: asked.append(payload) or b"taken")  # type: ignore[func-returns-value]
-        got = [
+        hub.serve("cosim/r/jobs/claim", lambda payload: claims.append(payload) or b"taken")  # type: ignore[func-returns-value]
+        refusals = [
             one.err.payload.to_string()
             for one in guest.get("cosim/r/jobs/claim", payload=b"x", encoding=written)
         ]
         assert (
-            got == [f"'{written}' is not read here: send application/msgpack or application/json"]
-            and not asked
+            refusals
+            == [f"'{written}' is not read here: send application/msgpack or application/json"]
+            and not claims
         )
         for fine in ("application/json", "application/msgpack", None):
             (one,) = guest.get("cosim/r/jobs/claim", payload=b"x", encoding=fine)

@@ -183,7 +183,7 @@ def test_the_robot_of_a_run_is_exported_with_its_legs(
 def test_invalid_export_requests_are_refused_before_the_build(tmp_path: Path, cosim: Cosim) -> None:
     """An unknown scenario, a wrong file ending and a missing folder are reported with the valid
     choices."""
-    asked = {
+    requests = {
         ("lh-011-0", "a.glb"): (2, "among them lh-011-00, "),
         ("lh-011-00", "a.obj"): (
             2,
@@ -191,11 +191,11 @@ def test_invalid_export_requests_are_refused_before_the_build(tmp_path: Path, co
         ),
         ("lh-011-00", "no/a.glb"): (3, "no/a.glb: cannot be written: no folder no"),
     }
-    asked |= {
+    requests |= {
         ("lh-011-00", "a.glb", "--at", "3"): (2, "--at needs --run RUN"),
         ("lh-011-00", "a.glb", "--run", "no"): (2, "no"),
     }
-    for words, (code, message) in asked.items():
+    for words, (code, message) in requests.items():
         result = cosim("export", *words, cwd=tmp_path)
         assert (result.returncode, result.stdout) == (code, "") and message in result.stderr, result
     assert not list(tmp_path.iterdir())

@@ -173,12 +173,12 @@ def test_a_table_omits_cameras_and_waypoints_that_a_policy_lacks(
         "plan_points": np.ones((1, 2), np.float32),
         "plan_index": 0,
     }
-    for name, one in (
+    for name, expected in (
         ("commands", log),
         ("waypoints", dataclasses.replace(log, answers=np.ones((1, 4)), **plan)),
     ):
         (tmp_path / name / "episodes/s-0").mkdir(parents=True)
-        (tmp_path / name / "episodes/s-0/trajectory.npz").write_bytes(one.encoded())
+        (tmp_path / name / "episodes/s-0/trajectory.npz").write_bytes(expected.encoded())
         out, output = terminal()
         print_terms(out, table_of([record]), tmp_path / name)
         text = " ".join(output.getvalue().split())

@@ -201,11 +201,11 @@ def test_the_hash_of_a_bundle_covers_all_that_decides_its_answers(tmp_path: Path
     )
     assert first != hash_of(bundle(tmp_path / "b", tiny_graph(), version="2"))
     beside = external(tmp_path / "c")
-    kept = hash_of(beside)
+    before = hash_of(beside)
     data = bytearray((beside / "model.onnx.data").read_bytes())
     data[2] ^= 1
     (beside / "model.onnx.data").write_bytes(data)
-    assert hash_of(beside) != kept
+    assert hash_of(beside) != before
 
 
 def test_weights_are_found_in_a_separate_folder(
@@ -283,12 +283,12 @@ def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
             together.on_reset("b")
             alone["b"].on_reset()
         grey = example_observation(together.manifest)
-        asked = [
+        observations = [
             replace(grey, episode=name, rgb=draws.integers(0, 255, (32, 32, 3)).astype(np.uint8))
             for name in "cab"
         ]
-        answers = together.act_batch(asked)
-        for one, answer in zip(asked, answers, strict=True):
+        answers = together.act_batch(observations)
+        for one, answer in zip(observations, answers, strict=True):
             np.testing.assert_allclose(answer, alone[one.episode].act(one), rtol=1e-6)
     together.ended("a")
 
@@ -297,12 +297,12 @@ def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
 def exemplary(tmp_path: Path) -> Callable[..., OnnxPolicy]:
     """Return a bundle with an example of these arrays."""
 
-    def made(**arrays: np.ndarray[Any, Any]) -> OnnxPolicy:
+    def policy_with_example(**arrays: np.ndarray[Any, Any]) -> OnnxPolicy:
         place = bundle(tmp_path / "net", tiny_graph())
         np.savez(place / "example.npz", **arrays)
         return OnnxPolicy(place)
 
-    return made
+    return policy_with_example
 
 
 def test_the_example_of_a_bundle_is_compared_with_its_graph(

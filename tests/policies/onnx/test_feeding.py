@@ -256,12 +256,12 @@ def test_past_positions_are_relative_to_the_robots_pose() -> None:
 
 def test_a_graphs_memory_is_fed_back_until_a_reset() -> None:
     """It is the output of the previous answer, or the last rows of it."""
-    whole = feeder((1, 2), one={"what": "state", "output": "memory", "begin": 0.5})
-    assert whole.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
-    whole.remember({"memory": np.array([[1.0, 2.0]])})
-    assert whole.feed(SEEN)["one"].tolist() == [[1.0, 2.0]]
-    whole.clear()
-    assert whole.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
+    feeding = feeder((1, 2), one={"what": "state", "output": "memory", "begin": 0.5})
+    assert feeding.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
+    feeding.remember({"memory": np.array([[1.0, 2.0]])})
+    assert feeding.feed(SEEN)["one"].tolist() == [[1.0, 2.0]]
+    feeding.clear()
+    assert feeding.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
     rows = feeder((1, 3, 2), one={"what": "state", "output": "memory", "append": True})
     for number in (1.0, 2.0):
         rows.remember({"memory": np.array([[number, -number]])})

@@ -24,7 +24,7 @@ GOAL = np.array([[1, 0]], np.float32)
 HUGE = 4 << 30
 
 
-def saved(path: Path, **arrays: np.ndarray[Any, Any]) -> None:
+def save_npz(path: Path, **arrays: np.ndarray[Any, Any]) -> None:
     np.savez(
         path,
         **{"obs": OBS, "goal": GOAL, "expected.action": np.zeros((1, 5, 2), np.float32)} | arrays,
@@ -32,12 +32,12 @@ def saved(path: Path, **arrays: np.ndarray[Any, Any]) -> None:
 
 
 def cut_off(path: Path) -> None:
-    saved(path)
+    save_npz(path)
     path.write_bytes(path.read_bytes()[:-100])
 
 
 def flipped(path: Path) -> None:
-    saved(path)
+    save_npz(path)
     data = bytearray(path.read_bytes())
     data[200] ^= 0xFF
     path.write_bytes(bytes(data))
@@ -50,14 +50,14 @@ def sparse(path: Path) -> None:
 
 def zip_bomb(path: Path) -> None:
     """A few bytes that claim to unpack to gigabytes."""
-    with zipfile.ZipFile(path, "w") as held:
-        held.writestr("obs.npy", bytes(64))
-        held.infolist()[0].file_size = HUGE
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("obs.npy", bytes(64))
+        archive.infolist()[0].file_size = HUGE
 
 
 def long_header(path: Path) -> None:
     """An array of a few bytes that claims 10**15 numbers."""
-    with zipfile.ZipFile(path, "w") as held, held.open("obs.npy", "w") as out:
+    with zipfile.ZipFile(path, "w") as archive, archive.open("obs.npy", "w") as out:
         np.lib.format.write_array_header_1_0(
             out, {"descr": "<f4", "fortran_order": False, "shape": (10**15,)}
         )
@@ -73,19 +73,19 @@ EXAMPLES: dict[str, tuple[Callable[[Path], None], str]] = {
         "cannot be read as .npz: File is not a zip",
     ),
     "objects": (
-        lambda path: saved(path, obs=np.array([{}], object)),
+        lambda path: save_npz(path, obs=np.array([{}], object)),
         "'obs' holds objects of Python",
     ),
     "other type": (
-        lambda path: saved(path, obs=OBS.astype(float)),
+        lambda path: save_npz(path, obs=OBS.astype(float)),
         "'obs' is float64 (1, 6, 4, 8), and the graph",
     ),
     "texts": (
-        lambda path: saved(path, **{"expected.action": np.array(["a"])}),
+        lambda path: save_npz(path, **{"expected.action": np.array(["a"])}),
         "'expected.action' is str32 (1,), and",
     ),
     "other shape": (
-        lambda path: saved(path, goal=GOAL[0]),
+        lambda path: save_npz(path, goal=GOAL[0]),
         "'goal' is float32 (2,), and the graph takes float32",
     ),
     "no arrays": (lambda path: np.savez(path), "has no array 'goal'; it has none"),
