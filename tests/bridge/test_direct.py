@@ -190,8 +190,7 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
 
 
 def test_a_director_that_does_not_return_is_reported(tmp_path: Path, cosim: Cosim) -> None:
-    """When it is killed for good, the run says that it waits, and the episode counts as an engine
-    failure."""
+    """When it is killed for good, the run says that it waits, and the episode becomes invalid."""
     write_suite(
         Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json"
     )

@@ -64,7 +64,7 @@ def open_sockets() -> set[str]:
     """The sockets of this process."""
     links = []
     for file in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # the folder's own, closed by now
+        with suppress(OSError):  # a socket that is closed by now
             links.append(str(file.readlink()))
     return {link for link in links if link.startswith("socket:")}
 

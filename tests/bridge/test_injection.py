@@ -344,7 +344,7 @@ class Slow:
             return Command(1.5, 0.6)  # off the sidewalk: that ends the episode
         time.sleep(0.05)
         self.count += 1
-        return Command(0.3 if self.count // 40 % 2 else -0.3, 0.0)  # to and fro, for as long as it takes
+        return Command(0.3 if self.count // 40 % 2 else -0.3, 0.0)  # to and fro until it is ended
 """
 
 CONNECTED = f"""

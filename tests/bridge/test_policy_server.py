@@ -51,7 +51,7 @@ RGB = np.arange(40 * 64 * 3, dtype=np.uint8).reshape(40, 64, 3)
 
 TIMES = ServerTimes()
 SOON = ServerTimes(lost_after_s=0.3)
-"""A server that is not reached for a moment is gone."""
+"""Times that count a server as lost after a short interruption."""
 SIZES = {"most": (50_000, 2), "many": (50_001, 2), "far too many": (2_000_000, 2)}
 
 

@@ -20,7 +20,7 @@ from tests.support.plain import free_port
 
 SECTION = re.search(r"\n## Live injection\n(.*?)\n## ", text_of("docs/viewing.md"), re.DOTALL)
 WRITTEN = "tcp/127.0.0.1:7447"
-"""The address of the examples, in whose place the test has a free one."""
+"""The address in the examples, which the test replaces with a free one."""
 
 
 def examples_in(text: str, name: str, at: str) -> list[list[str]]:

@@ -44,7 +44,7 @@ class Base:
         return Command(1.0, 0.0)
 
 class Held(Base):
-    # waits before a scenario while there is a file hold-SCENARIO
+    # waits before a scenario while the file hold-SCENARIO exists
     def reset(self, episode_id, seed):
         super().reset(episode_id, seed)
         hold = Path(f"hold-{self.scenario}")
@@ -59,7 +59,7 @@ class Unfinished: pass
 DRIVES = "schedule:sprint-1.6"
 """A policy without a camera, whose processes start fast."""
 SEED = "2"
-"""Of runs that go through the suites in their order."""
+"""A seed with which runs keep the order of the suites."""
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,7 @@ CONFLICTING = (
     [(2025.37, 105.45), (2017.41, 104.93), (2017.11, 105.07)],
     3.2,
 )
-"""Another, on which GEOS finds a "side location conflict"."""
+"""Another such case, for which GEOS reports a "side location conflict"."""
 
 
 def test_a_net_with_a_corner_that_geos_cannot_join_is_read(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from cosim.spec.odometry import LEG_NOISE, DriftNoise, GpsNoise, Odometry
 from cosim.spec.robot import DOG
 
 START = Pose(10.0, 20.0, 0.5 * math.pi)
-"""Looking north."""
+"""The start pose, facing north."""
 
 
 def driven(odometer: Odometer, poses: list[Pose]) -> Odometry | None:

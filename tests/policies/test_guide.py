@@ -20,7 +20,7 @@ from cosim.policies.privileged.route_planner import DistanceField, RoutePlanner
 from cosim.spec.robot import COURIER
 
 GAP_M = COURIER.width_m + 0.5
-"""What is left free beside everything that stands on a way."""
+"""Width in metres that remains free beside every obstacle."""
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,9 @@ from cosim.policies.published.openbot.lite_file import (
 
 WEIGHTS = Path(os.environ.get("COSIM_WEIGHTS") or Path(__file__).parents[3] / "shared" / "weights")
 UPSTREAM = {"dronet": "dronet_model_weights.h5", "openbot": "autopilot_float.tflite"}
-"""What the files are called in WEIGHTS."""
+"""Names of the files in WEIGHTS."""
 PACKAGES = {"dronet": "h5py", "openbot": "flatbuffers"}
-"""What each command imports besides onnx."""
+"""The package that each command imports besides onnx."""
 NETWORKS = [
     pytest.param(network, id=network.module.rpartition(".")[2]) for network in (DRONET, OPENBOT)
 ]

@@ -48,7 +48,7 @@ CUT_OFF = """[...document.querySelectorAll('.drawing')].flatMap((plot) => {
   const covered = still.filter((a, k) => still.slice(0, k).some((b) => covers(a, b)));
   return [...texts.filter((t) => !within(box(t))), ...covered].map((t) => t.textContent);
 })"""
-"""The texts of plots that are not whole in their plot, or lie on another."""
+"""Script that lists texts of plots that leave their plot or overlap another."""
 
 
 @pytest.fixture(scope="module")

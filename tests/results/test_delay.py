@@ -36,9 +36,9 @@ def tracks(*ways: list[float]) -> Tracks:
 
 
 WALK = [0.05 * k for k in range(201)]
-"""10 s at 1 m/s."""
+"""Places of a person who walks for 10 s at 1 m/s."""
 HELD_UP = [0.05 * min(k, 100) for k in range(201)]
-"""5 s at 1 m/s, then 5 s of standing."""
+"""Places of a person who walks for 5 s at 1 m/s, then stands for 5 s."""
 
 
 def test_a_person_who_stands_for_5_s_is_delayed_by_5_s() -> None:

@@ -48,9 +48,9 @@ STATIC = short_way("static-000", suite="reactive", structure="static")
 EVERY = (*PAIRS, STATIC)
 """Five events of two kinds, each followed by its decoy; and one scenario without an event."""
 MIXED = [GOAL, GOAL, GOAL, HIT, HIT, GOAL, GOAL, "crashed", "invalid", GOAL]
-"""Of `lateral`: both solved; either unsolved; a decoy that crashed; an event that is invalid."""
+"""Outcomes of pairs of `lateral`: both solved; either unsolved; a decoy that crashed; an event that is invalid."""
 FRONTAL = [GOAL, GOAL] * 3 + [GOAL, "invalid"] + [HIT, HIT]
-"""Of `frontal`: three pairs solved, one with an invalid decoy, one unsolved."""
+"""Outcomes of pairs of `frontal`: three pairs solved, one with an invalid decoy, one unsolved."""
 
 
 @pytest.fixture(scope="module")

@@ -310,8 +310,9 @@ def test_a_reset_keeps_off_obstacles() -> None:
     assert reset_m(*(bin_at(5.0 * k) for k in range(21))) == 20.0
 
 
-def test_a_reset_at_an_obstacle_before_the_goal_is_beyond_it() -> None:
-    """Otherwise the robot would face the same bin until the time limit."""
+def test_the_third_hit_of_an_obstacle_before_the_goal_resets_beyond_it() -> None:
+    """Beyond the last waypoint the robot is put between the bin and the goal, rather than before
+    the bin again."""
     for bin_m, beyond_m in ((96.0, 96.8), (97.4, 98.2)):
         referee = new_referee(
             obstacles=(Obstacle(kind="bin", x_m=bin_m, y_m=0.0, heading_rad=0.0),)

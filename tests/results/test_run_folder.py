@@ -63,7 +63,7 @@ def record(name: str, *, success: float = 1.0, status: str = "done", wall_s: flo
 
 
 LOG = driven(SUITE.scenarios[0], [1.0] * 3).encoded()
-"""Of three ticks, as `record` has."""
+"""A log of three ticks, as in `record`."""
 
 
 def write_files_of(folder: RunFolder, episode_record: Record, under: str = "") -> None:

@@ -34,7 +34,7 @@ def table(*rows: tuple[float, float, float], crashed: int = 0, invalid: int = 0)
 
 
 def test_a_rate_of_a_run_is_all_failures_on_all_metres() -> None:
-    """2 m with 10 failures, 400 m with none and a stuck one with 19 are 29 on 402 m plus its route."""
+    """10, 0 and 19 failures on 2, 400 and 0 m are 29 on 402 m travelled and on 800 m of route."""
     three = table((2.0, 10, 100.0), (400.0, 0, 400.0), (0.0, 19, 300.0))
     summary = summary_of(three, ["failures_per_100m", "failures_per_100m_route"])
     assert summary["mean"].tolist() == pytest.approx([100 * 29 / 402, 100 * 29 / 800])
@@ -93,8 +93,9 @@ def test_a_crash_adds_to_no_count() -> None:
     }
 
 
-def test_invalid_episodes_are_in_no_mean_and_over_2_percent_void_a_table() -> None:
-    """The denominator excludes them, and above 2 % a warning says not to cite the table."""
+def test_invalid_episodes_are_in_no_mean_and_over_2_percent_make_it_inconclusive() -> None:
+    """The denominator excludes them, and above 2 %, or with unfinished episodes, the table is
+    inconclusive."""
     few = table(*[(10.0, 0, 10.0)] * 98, invalid=2)
     assert (
         summary_of(few, ["success"]).loc["success", "n"] == 98 and why_inconclusive(few, 100) == ""

@@ -20,7 +20,7 @@ from scenarios.suites.catalog import SUITES, load_suite
 from tests.support.mutate_suites import fates, mutated, small_suite
 
 PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|nested too deep")
-"""How a refusal says where in the file something is wrong."""
+"""Pattern of the place in the file that a refusal names."""
 
 
 def valid_suite() -> dict[str, Any]:

@@ -35,7 +35,7 @@ FOREIGN = (
     "cosim/r/jobs/claim",
 )
 GIVEN_UP_S = 0.5
-"""What is refused is waited for so long: nothing comes, on any machine."""
+"""Time in seconds after which a refused message counts as not delivered."""
 TOKEN = rmw_token(Endpoint("NN", 3, "ab", "driver"))
 
 

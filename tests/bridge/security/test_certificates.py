@@ -151,7 +151,7 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
-    trusting = tmp_path / "trusting"  # takes the hub for what it is, and is not taken itself
+    trusting = tmp_path / "trusting"  # trusts the hub, but is not trusted by it
     shutil.copytree(other / "worker", trusting)
     (trusting / "ca.pem").write_bytes(
         (other / "ca.pem").read_bytes() + (certificates / "ca.pem").read_bytes()
@@ -178,7 +178,7 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
             assert worker.query("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
         monkeypatch.setattr(
             settings, "CONNECTS_WITHIN_S", 0.1
-        )  # what is refused is so however long it is tried
+        )  # a refused client stays refused for the whole wait
         assert (
             "the certificate of tls/localhost" in (reason := refusal_of(at, other / "worker"))
             and "another authority" in reason
@@ -196,7 +196,7 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
         monkeypatch.context() as patch,
         pytest.raises(EngineError, match="by the same protocol"),
     ):
-        patch.setattr(identity, "_PATIENCE_S", 0.2)  # who speaks no TLS never answers
+        patch.setattr(identity, "_PATIENCE_S", 0.2)  # a peer without TLS never answers
         open_session(
             Connection(
                 role="worker", connect=plain.replace("tcp", "tls"), tls=str(certificates / "worker")
@@ -209,7 +209,7 @@ def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
         open_session(expired)
     monkeypatch.setattr(
         "bridge.session.connection_warnings", lambda _: []
-    )  # one that listened before its certificate's end
+    )  # a hub that listened before its certificate expired
     (trusting / "ca.pem").write_bytes(
         (other / "ca.pem").read_bytes() + (old / "ca.pem").read_bytes()
     )

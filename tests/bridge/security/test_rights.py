@@ -31,9 +31,9 @@ PUBLISHED = tuple(f"{ENV}/{topic}" for topic in ("clock", "robot", "crowd", "sig
 JOBS = tuple(f"cosim/r/jobs/{act}" for act in ("claim", "report"))
 SEEN = (f"{ENV}/status", f"{ENV}/log", f"{ENV}/camera", "cosim/r/status")
 QUERIED = (*JOBS, *SEEN, "cosim/r/nets/0", f"{ENV}/inject", f"{ENV}/director", POLICY)
-OWN = b"asked by the one who tries"
+OWN = b"query of the guest"
 GIVEN_UP_S = 2.0
-"""What is refused is waited for so long: nothing comes, on any machine."""
+"""Time in seconds after which a refused message counts as not delivered."""
 MAY_ASK: dict[str, tuple[str, ...]] = {
     "worker": (*JOBS, "cosim/r/status", "cosim/r/nets/0", f"{ENV}/director", POLICY),
     "viewer": SEEN,
@@ -43,7 +43,7 @@ MAY_ASK: dict[str, tuple[str, ...]] = {
     "director": (),
     "ros2": (),
 }
-"""At a coordinator's hub. A director has no business there: others connect to it."""
+"""Keys that each role may query at a coordinator's hub. Directors have their own hub."""
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def try_all(
 ) -> None:
     """Try all acts; permitted ones work, and no other has any effect."""
     guest.passed(may_ask)
-    # to ask
+    # queries
     air.seen.clear()
     for key in QUERIED:
         if key in may_ask:
@@ -176,7 +176,7 @@ def try_all(
     ]
     assert [one for one in wide if one != "FORGED" and "ask for exactly" not in one] == []
     assert {key for key in air.seen if "/mark" not in key} == set(may_ask)
-    # to tell, and to take back
+    # publications and deletions
     air.seen.clear()
     for key in (
         *PUBLISHED,
@@ -191,7 +191,7 @@ def try_all(
         guest.session.delete(key)
     guest.passed(may_ask)
     assert {key for key in air.seen if "/mark" not in key} <= set(may_ask[:1])
-    # to receive messages of the run and queries of a policy
+    # subscriptions to the run's messages and to queries of a policy
     guest.received.clear()
     for key in PUBLISHED:
         air.run.publish_lossy(key, b"true")
@@ -202,11 +202,11 @@ def try_all(
     foreign = {"cosim/r/policy/theirs/info"} if answers else set()
     assert {key for key in guest.received if key not in PUBLISHED} - foreign == set()
     assert watches == bool(set(PUBLISHED) & set(guest.received))
-    # to answer in the place of others, and as a policy
+    # replies in place of others, and as a policy
     for key in (*JOBS, *SEEN, f"{ENV}/inject"):
         assert air.hub.query(key, b"", timeout_s=PATIENCE_S) == key.encode()
     assert guest.answers() is answers
-    # to be seen as a worker
+    # a token as a worker
     alive = [
         str(one.ok.key_expr)
         for one in air.inside.liveliness().get("cosim/*/workers/*", timeout=PATIENCE_S)
@@ -254,15 +254,13 @@ def test_only_runs_may_query_directors_and_policy_servers(certs: Path, hub: Role
             role: stack.enter_context(plain_zenoh(at, certs, role)) for role in get_args(Role)
         }
         for role, guest in guests.items():
-            if role != "policy" or hub != "policy":  # one policy server may answer beside another
+            if role != "policy" or hub != "policy":  # several policy servers may answer
                 guest.declare_queryable(key, lambda query: query.reply(query.key_expr, b"FORGED"))
         for role in ("worker", "coordinator"):
             wait_until(lambda role=role: "honest" in replies(guests[role], key))  # type: ignore[misc]
         queries.clear()
         for role in ("director", "policy", "viewer", "injector"):
-            assert set(replies(guests[role], key)) <= {"FORGED"}, (
-                "its own answer, and nobody else's"
-            )
+            assert set(replies(guests[role], key)) <= {"FORGED"}, "only its own answer"
         assert queries == []
         assert session.query(key, b"x", timeout_s=PATIENCE_S) == b"honest"
 
@@ -280,8 +278,8 @@ serve(Mine, listen=sys.argv[1], tls=sys.argv[2])
 
 
 def test_only_runs_may_query_the_copied_policy_server(certs: Path) -> None:
-    """At `serve` of a copied policy_server.py only workers and coordinators may query, one server
-    at a time."""
+    """At `serve` of a copied policy_server.py only workers and coordinators may query, and wildcard
+    queries are refused."""
     at = f"tls/localhost:{free_port()}"
     words = [sys.executable, "-c", COPIED, at, str(certs / "policy")]
     with ExitStack() as stack:

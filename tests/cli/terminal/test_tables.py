@@ -30,7 +30,7 @@ from tests.conftest import ROOT
 
 WIDTHS = (60, 80, 120)
 LONG = "sumo-fokr-bs-demo-ped_crossing-003"
-"""As long as the name of an episode is on a map."""
+"""A name as long as those of episodes on maps."""
 
 
 def episodes() -> pd.DataFrame:

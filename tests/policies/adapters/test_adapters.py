@@ -71,7 +71,7 @@ SHAPES: dict[str, Shapes] = {
         "hidden_state": (1, 512),
     },
 }
-"""As far as they are public; what is not is a guess, explained in README.md beside the manifests."""
+"""Input and output shapes, guessed where they are not public: see README.md of the manifests."""
 SAMPLE = ("nomad", "s2e")
 
 
