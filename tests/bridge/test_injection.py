@@ -403,7 +403,7 @@ print(json.dumps(bad))
 """
 
 
-class OnAir(NamedTuple):
+class LiveRun(NamedTuple):
     """A live run in a folder; `way` are points on its sidewalk."""
 
     run: subprocess.Popen[str]
@@ -438,7 +438,7 @@ def wait_for(what: Callable[[], bool]) -> None:
 
 
 @contextmanager
-def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
+def live_run(folder: Path, at: str, *guard: str) -> Iterator[LiveRun]:
     """`cosim run --live` of an episode that lasts until it is ended."""
     from scenarios.places.nets import place
     from scenarios.suites.long_horizon import build_long_horizon
@@ -467,7 +467,7 @@ def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
         [*words, "--out", "run", "--live", at, *guard], cwd=folder, text=True
     ) as run:
         try:
-            yield OnAir(run, folder, at, [(x, y) for x, y in scenario.route[20:26]])
+            yield LiveRun(run, folder, at, [(x, y) for x, y in scenario.route[20:26]])
         finally:
             run.kill()
 
@@ -484,17 +484,21 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     viewer, injector = (
         ("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector")
     )  # type: ignore[arg-type]
-    with on_air(tmp_path, at, "--tls", "certs/coordinator") as air:
-        connection = ("--connect", air.at, "--wait", str(PATIENCE_S))
+    with live_run(tmp_path, at, "--tls", "certs/coordinator") as live_session:
+        connection = ("--connect", live_session.at, "--wait", str(PATIENCE_S))
 
-        def log_on_air() -> dict[str, Any]:
+        def fetch_log() -> dict[str, Any]:
             result = cosim("listen", "events", *connection, *viewer, "--seconds", "0")
             assert result.returncode == 0, result
             return dict(json.loads(result.stdout.splitlines()[0]))
 
-        wait_for(lambda: log_on_air()["tick"] > 0)
+        wait_for(lambda: fetch_log()["tick"] > 0)
         message = json.dumps(
-            {"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"}
+            {
+                "id": "anna",
+                "path": [live_session.way[0], {"ahead": 4, "left": 0.5}],
+                "doing": "stop",
+            }
         )
         sent = cosim("inject", message, *connection, *injector)
         assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
@@ -505,7 +509,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
             swapped.returncode == 2
             and "is of the role viewer, and this needs injector" in swapped.stderr
         )
-        elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9", *injector)
+        elsewhere = ("inject", message, "--connect", live_session.at, "--env", "run/t-9", *injector)
         wait_for(
             lambda: (
                 "Valid choices: run/t-0" in (result := cosim(*elsewhere)).stderr
@@ -513,7 +517,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
             )
         )
         wait_for(
-            lambda: [entry["injection"]["id"] for entry in log_on_air()["injections"]] == ["anna"]
+            lambda: [entry["injection"]["id"] for entry in fetch_log()["injections"]] == ["anna"]
         )
         words = [sys.executable, "-m", "cosim", "listen", "robot", *connection, *viewer]
         for ends, code in (("SIGTERM", 130), ("closed pipe", 141)):
@@ -525,14 +529,14 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
                     listener.wait()
                 listener.stdout.close()
             assert listener.returncode == code and all("x_m" in tick for tick in ticks), ends
-        record = air.record()
+        record = live_session.record()
     (entry,) = record["injections"]
     assert record["status"] == "done" and entry["injection"]["id"] == "anna"
     log = Log.load(tmp_path / "run" / "episodes" / "t-0" / "trajectory.npz")
     robot = Pose(*log.pose[entry["tick"] - 1])
     assert entry["tick"] > 0
     assert entry["injection"]["path"] == [
-        list(air.way[0]),
+        list(live_session.way[0]),
         list(RelativePoint(4.0, 0.5).on_map(robot)),
     ]
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
@@ -549,24 +553,28 @@ def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosi
     """The script of docs/viewing.md injects, a late listener gets all topics and the log, and
     floods are refused."""
     (script,) = blocks("python", "docs/viewing.md")
-    with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
-        text = script.text.replace("tcp/127.0.0.1:7447", air.at)
+    with live_run(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as live_session:
+        text = script.text.replace("tcp/127.0.0.1:7447", live_session.at)
         (tmp_path / "ten.py").write_text(text)
         assert (
             cosim(
-                "listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0"
+                "listen", "--connect", live_session.at, "--wait", str(PATIENCE_S), "--seconds", "0"
             ).returncode
             == 0
         )
-        bob = json.loads(air.python("ten.py").stdout)
-        words = [sys.executable, "-c", CONNECTED + LISTENER, air.at]
+        bob = json.loads(live_session.python("ten.py").stdout)
+        words = [sys.executable, "-c", CONNECTED + LISTENER, live_session.at]
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
             assert listener.stdout is not None and listener.stdout.readline() == "listening\n"
-            vandal = air.python(
-                "-c", CONNECTED + VANDAL, air.at, "cosim/run/env/t-0", json.dumps(air.way[2])
+            vandal = live_session.python(
+                "-c",
+                CONNECTED + VANDAL,
+                live_session.at,
+                "cosim/run/env/t-0",
+                json.dumps(live_session.way[2]),
             )
             assert vandal.returncode == 0, vandal.stderr
-            record = air.record()
+            record = live_session.record()
             received = json.loads(listener.stdout.read())
     assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
     replies = json.loads(vandal.stdout)

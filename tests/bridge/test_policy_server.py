@@ -364,7 +364,7 @@ def test_a_wrong_reply_of_a_server_is_a_policy_crash(hub: Connection) -> None:
         "answered step -1 of 'k1' when it was asked step 0": begin,
     }
     for words, answer in wrong.items():
-        with liar(hub, answer), driver_at(hub, "wrong") as driver:
+        with faulty_server(hub, answer), driver_at(hub, "wrong") as driver:
             driver.reset("k1", 7)
             with pytest.raises(PolicyError, match=f"policy 'wrong' {words}"):
                 driver.act(observation_at(0))
@@ -381,7 +381,7 @@ def begin(request: ActRequest | ResetRequest) -> bytes:
 
 
 @contextmanager
-def liar(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Session]:
+def faulty_server(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Session]:
     """A server that begins correctly and then replies as given."""
     info = PolicyInfo("s", "wrong", {"name": "wrong"})
     below = policy_key("default", "wrong", "s")

@@ -63,13 +63,13 @@ SEED = "2"
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's folder: a suite of three short scenarios, one of four, and a module with
     policies."""
     from scenarios.places.nets import place
     from scenarios.suites.long_horizon import build_long_horizon
 
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("workspace")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
     graph = WalkGraph(street_map)
@@ -103,12 +103,12 @@ def hashes(folder: Path) -> dict[str, str]:
 
 
 @contextmanager
-def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+def running(workspace: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
     """A run in progress, which is killed at the end of the block."""
     command = [sys.executable, "-m", "cosim", "run", *words]
     run = subprocess.Popen(
         command,
-        cwd=desk,
+        cwd=workspace,
         env=os.environ | WIDE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -123,10 +123,10 @@ def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
-def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
+def waits_before(workspace: Path, scenario: str) -> Iterator[Callable[[], bool]]:
     """Return whether the policy Held is already waiting before this scenario."""
-    hold = desk / f"hold-{scenario}"
-    waits = desk / "waits"
+    hold = workspace / f"hold-{scenario}"
+    waits = workspace / "waits"
     hold.touch()
     try:
         yield waits.exists
@@ -136,7 +136,7 @@ def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
 
 
 @pytest.fixture(scope="module")
-def whole_run(desk: Path, cosim: Cosim) -> Path:
+def whole_run(workspace: Path, cosim: Cosim) -> Path:
     """The tiny suite, run without interruption by one process."""
     done = cosim(
         "run",
@@ -147,25 +147,25 @@ def whole_run(desk: Path, cosim: Cosim) -> Path:
         SEED,
         "--out",
         "whole",
-        cwd=desk,
+        cwd=workspace,
     )
     assert done.returncode == 0, done.stderr
-    return desk / "whole"
+    return workspace / "whole"
 
 
 HELD = ("tiny.json", "--policy", "mine:Held", "--episodes", "2", "--seed", SEED, "--out")
 
 
 @pytest.fixture(scope="module")
-def unbroken(desk: Path, cosim: Cosim) -> bytes:
+def uninterrupted_table(workspace: Path, cosim: Cosim) -> bytes:
     """The table of an uninterrupted run of two episodes."""
-    done = cosim("run", *HELD, "unbroken", cwd=desk)
+    done = cosim("run", *HELD, "unbroken", cwd=workspace)
     assert done.returncode == 0, done.stderr
-    return (desk / "unbroken/results.csv").read_bytes()
+    return (workspace / "unbroken/results.csv").read_bytes()
 
 
 def test_a_run_prints_its_table_and_leaves_its_folder(
-    desk: Path, cosim: Cosim, whole_run: Path
+    workspace: Path, cosim: Cosim, whole_run: Path
 ) -> None:
     """The folder has rows, records, trajectories and specs; `show` prints the table again, and
     `score` recomputes it."""
@@ -175,7 +175,7 @@ def test_a_run_prints_its_table_and_leaves_its_folder(
     assert set(table["renderer"]) == {json.loads((whole_run / "run.json").read_text())["renderer"]}
     for name in table.index:
         assert (whole_run / "episodes" / name / "trajectory.npz").exists()
-    shown = cosim("show", "whole", cwd=desk)
+    shown = cosim("show", "whole", cwd=workspace)
     assert (
         shown.returncode == 0
         and "t-2" in shown.stdout
@@ -191,25 +191,25 @@ def test_a_run_prints_its_table_and_leaves_its_folder(
         "--out",
         "whole",
         "--resume",
-        cwd=desk,
+        cwd=workspace,
     )
     assert (
         other.returncode == 2
         and "is 3 of 3 (all), and this command has 2 of 3 (--episodes 2)." in other.stderr
     )
-    again = cosim("score", "whole", cwd=desk)
+    again = cosim("score", "whole", cwd=workspace)
     assert (
         again.returncode == 0
         and "3 episodes" in again.stdout
         and "equal to the bit" in again.stdout
     )
-    result = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
+    result = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=workspace)
     assert result.returncode == 0, result.stderr
-    assert (desk / "above.png").stat().st_size > 5000
+    assert (workspace / "above.png").stat().st_size > 5000
 
 
 def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(
-    desk: Path, cosim: Cosim, whole_run: Path
+    workspace: Path, cosim: Cosim, whole_run: Path
 ) -> None:
     """State hashes and rows are identical for one process and for two."""
     words = (
@@ -224,40 +224,48 @@ def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(
         "--out",
         "two",
     )
-    two = cosim(*words, cwd=desk)
+    two = cosim(*words, cwd=workspace)
     assert two.returncode == 0
     assert (
         "\n3 episodes, " in two.stderr and f"episodes of '{DRIVES}' on this machine" in two.stderr
     )
     assert ": done, 3 of 3\n" in two.stderr
-    assert hashes(desk / "two") == hashes(whole_run)
+    assert hashes(workspace / "two") == hashes(whole_run)
     assert all(len(h) == 32 for h in hashes(whole_run).values())
     assert len(set(hashes(whole_run).values())) == 3
-    assert (desk / "two/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+    assert (workspace / "two/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
 
 
-def test_merged_shards_equal_the_run(desk: Path, cosim: Cosim, whole_run: Path) -> None:
+def test_merged_shards_equal_the_run(workspace: Path, cosim: Cosim, whole_run: Path) -> None:
     """Three episodes in two shards, one run from Python, merge to the same run; each shard says how
     to merge it."""
     words = ("run", "tiny.json", "--policy", DRIVES, "--seed", SEED)
-    result = cosim(*words, "--shard", "1/2", "--out", "shard-1", cwd=desk)
+    result = cosim(*words, "--shard", "1/2", "--out", "shard-1", cwd=workspace)
     assert result.returncode == 0 and "Shard 1/2 of the run: `cosim merge`" in result.stderr
     options = EpisodeOptions(seed=int(SEED))
-    run(str(desk / "tiny.json"), DRIVES, shard="2/2", out=desk / "shard-2", options=options)
-    assert [*hashes(desk / "shard-2")] == ["t-1"]
-    assert cosim("merge", "shard-1", "shard-2", "--out", "merged", cwd=desk).returncode == 0
-    assert (desk / "merged/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
-    assert (desk / "merged/run.json").read_bytes() == (whole_run / "run.json").read_bytes()
+    run(
+        str(workspace / "tiny.json"),
+        DRIVES,
+        shard="2/2",
+        out=workspace / "shard-2",
+        options=options,
+    )
+    assert [*hashes(workspace / "shard-2")] == ["t-1"]
+    assert cosim("merge", "shard-1", "shard-2", "--out", "merged", cwd=workspace).returncode == 0
+    assert (workspace / "merged/results.csv").read_bytes() == (
+        whole_run / "results.csv"
+    ).read_bytes()
+    assert (workspace / "merged/run.json").read_bytes() == (whole_run / "run.json").read_bytes()
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=lambda how: how.name)
 def test_an_interrupted_run_is_finished_by_resume(
-    desk: Path, cosim: Cosim, unbroken: bytes, how: signal.Signals
+    workspace: Path, cosim: Cosim, uninterrupted_table: bytes, how: signal.Signals
 ) -> None:
     """Killed or stopped in the middle, then resumed: no episode is run twice or lost, and the table
     is the same."""
-    out = desk / f"broken-{how.name}"
-    with held_before(desk, "t-1") as waits, running(desk, *HELD, out.name) as run:
+    out = workspace / f"broken-{how.name}"
+    with waits_before(workspace, "t-1") as waits, running(workspace, *HELD, out.name) as run:
         wait_until(waits)
         run.send_signal(how)
         stderr = run.communicate(timeout=PATIENCE_S)[1]
@@ -265,23 +273,23 @@ def test_an_interrupted_run_is_finished_by_resume(
             assert run.returncode == 130 and reports_stop(stderr, out.name), stderr
         written_ns = (out / "episodes/t-0/record.json").stat().st_mtime_ns
         wait_until(lambda: not alive(out))
-    again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
+    again = cosim("run", *HELD, out.name, "--resume", cwd=workspace)
     assert again.returncode == 0, again.stderr
     assert (out / "episodes/t-0/record.json").stat().st_mtime_ns == written_ns
-    assert (out / "results.csv").read_bytes() == unbroken
+    assert (out / "results.csv").read_bytes() == uninterrupted_table
 
 
-def test_sigterm_stops_a_run_as_ctrl_c_does(desk: Path, cosim: Cosim) -> None:
+def test_sigterm_stops_a_run_as_ctrl_c_does(workspace: Path, cosim: Cosim) -> None:
     """SIGTERM gives the same exit code and message, and no environment process is left."""
-    out = desk / "terminated"
-    with held_before(desk, "t-1") as waits, ThreadPoolExecutor(1) as threads:
+    out = workspace / "terminated"
+    with waits_before(workspace, "t-1") as waits, ThreadPoolExecutor(1) as threads:
 
         def terminate() -> None:
             wait_until(waits)
             os.kill(os.getpid(), signal.SIGTERM)
 
         sent = threads.submit(terminate)
-        result = cosim("run", *HELD, out.name, cwd=desk)
+        result = cosim("run", *HELD, out.name, cwd=workspace)
         sent.result()
         assert result.returncode == 130 and reports_stop(result.stderr, out.name), result
         wait_until(lambda: not alive(out))
@@ -293,14 +301,17 @@ def reports_stop(stderr: str, out: str) -> bool:
 
 
 def test_a_run_killed_at_its_start_leaves_no_false_crash(
-    desk: Path, cosim: Cosim, unbroken: bytes
+    workspace: Path, cosim: Cosim, uninterrupted_table: bytes
 ) -> None:
     """A kill during the start of the first environment process, or before its first answer, loses
     nothing on resume."""
-    out = desk / "killed-at-its-start"
+    out = workspace / "killed-at-its-start"
     for when in ("its process starts", "its first episode starts"):
         more = ["--resume"] if out.exists() else []
-        with held_before(desk, "t-0") as waits, running(desk, *HELD, out.name, *more) as run:
+        with (
+            waits_before(workspace, "t-0") as waits,
+            running(workspace, *HELD, out.name, *more) as run,
+        ):
             wait_until(lambda: children(run.pid))
             left = children(run.pid)
             if when == "its first episode starts":
@@ -309,9 +320,9 @@ def test_a_run_killed_at_its_start_leaves_no_false_crash(
             for pid in left:
                 wait_until(lambda pid=pid: not Path(f"/proc/{pid}").exists())
         assert not list(out.glob("episodes/*/record.json")), when
-    again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
+    again = cosim("run", *HELD, out.name, "--resume", cwd=workspace)
     assert again.returncode == 0, again.stderr
-    assert (out / "results.csv").read_bytes() == unbroken
+    assert (out / "results.csv").read_bytes() == uninterrupted_table
 
 
 def accept_interrupts() -> None:
@@ -332,7 +343,7 @@ def children(pid: int) -> list[int]:
 
 
 def test_a_full_disk_ends_the_run_with_the_reason(
-    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """When a record cannot be written, the run stops, gives the reason, and leaves finished
     episodes intact."""
@@ -343,7 +354,7 @@ def test_a_full_disk_ends_the_run_with_the_reason(
             raise OSError(28, "No space left on device")
         write_atomic(path, data)
 
-    out = desk / "full"
+    out = workspace / "full"
     monkeypatch.setattr(run_folder, "write_atomic", full)
     run = cosim(
         "run",
@@ -354,7 +365,7 @@ def test_a_full_disk_ends_the_run_with_the_reason(
         SEED,
         "--out",
         out.name,
-        cwd=desk,
+        cwd=workspace,
     )
     assert (
         run.returncode == 3 and "No space left on device" in run.stderr and "--resume" in run.stderr
@@ -375,19 +386,19 @@ def alive(out: Path) -> bool:
     return False
 
 
-def test_a_second_run_on_the_same_folder_is_refused(desk: Path, cosim: Cosim) -> None:
+def test_a_second_run_on_the_same_folder_is_refused(workspace: Path, cosim: Cosim) -> None:
     """The folder of a run in progress is locked, and that of a finished run is not overwritten."""
-    with held_before(desk, "t-0") as waits, running(desk, *HELD, "held") as run:
+    with waits_before(workspace, "t-0") as waits, running(workspace, *HELD, "held") as run:
         wait_until(waits)
-        second = cosim("run", *HELD, "held", "--resume", cwd=desk)
+        second = cosim("run", *HELD, "held", "--resume", cwd=workspace)
         assert second.returncode == 2
         assert f"in use by process {run.pid}" in second.stderr
-        third = cosim("run", *HELD, "held", cwd=desk)
+        third = cosim("run", *HELD, "held", cwd=workspace)
         assert third.returncode == 2 and "already holds a run. Add --resume" in third.stderr
 
 
 def test_unknown_names_are_answered_with_the_valid_ones(
-    desk: Path, cosim: Cosim, whole_run: Path
+    workspace: Path, cosim: Cosim, whole_run: Path
 ) -> None:
     """Unknown suites, policies, scenarios, runs and episodes give exit code 2, the name, and the
     valid choices."""
@@ -414,32 +425,39 @@ def test_unknown_names_are_answered_with_the_valid_ones(
         ("list", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
     }
     for words, (name, choices) in requests.items():
-        result = cosim(*words, cwd=desk)
+        result = cosim(*words, cwd=workspace)
         assert result.returncode == 2, (words, result.stderr)
         assert name in result.stderr and choices in result.stderr, (words, result.stderr)
         assert "Traceback" not in result.stderr
 
 
-def test_a_suite_without_scenarios_is_refused(desk: Path, cosim: Cosim) -> None:
+def test_a_suite_without_scenarios_is_refused(workspace: Path, cosim: Cosim) -> None:
     """An empty suite is an error that names the file, not a successful run."""
-    suite = json.loads((desk / "tiny.json").read_text())
-    (desk / "empty.json").write_text(json.dumps(suite | {"scenarios": []}))
-    result = cosim("run", "empty.json", "--out", "empty", cwd=desk)
+    suite = json.loads((workspace / "tiny.json").read_text())
+    (workspace / "empty.json").write_text(json.dumps(suite | {"scenarios": []}))
+    result = cosim("run", "empty.json", "--out", "empty", cwd=workspace)
     assert result.returncode == 2 and "empty.json: suite 'tiny' has no scenarios" in result.stderr
 
 
-def test_a_run_with_a_wrong_endpoint_leaves_no_folder(desk: Path, cosim: Cosim) -> None:
+def test_a_run_with_a_wrong_endpoint_leaves_no_folder(workspace: Path, cosim: Cosim) -> None:
     """A wrong endpoint is reported with the remedy, and the same command with a right one is
     accepted."""
     result = cosim(
-        "run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--insecure", "--out", "air", cwd=desk
+        "run",
+        "tiny.json",
+        "--live",
+        "tcp/192.0.2.1:7447",
+        "--insecure",
+        "--out",
+        "air",
+        cwd=workspace,
     )
-    assert result.returncode == 3 and not (desk / "air").exists()
+    assert result.returncode == 3 and not (workspace / "air").exists()
     assert (
         "cannot listen at tcp/192.0.2.1:7447" in result.stderr
         and "Choose an address of this" in result.stderr
     )
-    listening = cosim("listen", "--connect", "7447", cwd=desk)
+    listening = cosim("listen", "--connect", "7447", cwd=workspace)
     assert (
         listening.returncode == 2
         and "--connect '7447': write it as PROTOCOL/ADDRESS:PORT" in listening.stderr
@@ -459,18 +477,18 @@ def test_ctrl_c_during_the_imports_gives_no_traceback(monkeypatch: pytest.Monkey
     assert ended.value.code == 130
 
 
-def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim) -> None:
+def test_a_suite_that_does_not_fit_its_place_is_refused(workspace: Path, cosim: Cosim) -> None:
     """All faults of a suite against its place are reported together before anything runs, and no
     folder is left."""
-    suite = json.loads((desk / "four.json").read_text())
+    suite = json.loads((workspace / "four.json").read_text())
     off, other, robot, unknown = suite["scenarios"]
     off["start"][:2] = off["route"][0] = [-50.0, -50.0]
     other["place"]["net_hash"] = "0" * 16
     robot["robot"] = "tank"
     unknown["place"] = {"kind": "map", "map": "atlantis"}
-    (desk / "odd.json").write_text(json.dumps(suite))
-    result = cosim("run", "odd.json", "--policy", "stop", "--out", "odd", cwd=desk)
-    assert result.returncode == 2 and not (desk / "odd").exists()
+    (workspace / "odd.json").write_text(json.dumps(suite))
+    result = cosim("run", "odd.json", "--policy", "stop", "--out", "odd", cwd=workspace)
+    assert result.returncode == 2 and not (workspace / "odd").exists()
     head, *faults = result.stderr[result.stderr.index("error: ") :].splitlines()
     assert head == "error: suite 'four': 5 faults:" and len(faults) == 5
     for words in (
@@ -484,27 +502,27 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
         assert sum(words in fault for fault in faults) == 1, (words, faults)
 
 
-def test_the_doctor_reports_every_engine_as_working(desk: Path, cosim: Cosim) -> None:
+def test_the_doctor_reports_every_engine_as_working(workspace: Path, cosim: Cosim) -> None:
     """`cosim doctor` draws a frame, moves pedestrians, queries a director, and reports success."""
-    result = cosim("doctor", cwd=desk)
+    result = cosim("doctor", cwd=workspace)
     assert result.returncode == 0, result.stdout
     assert result.stdout.count("ok") >= 6 and "failed" not in result.stdout
 
 
-def test_a_run_without_a_seed_draws_and_records_one(desk: Path, cosim: Cosim) -> None:
+def test_a_run_without_a_seed_draws_and_records_one(workspace: Path, cosim: Cosim) -> None:
     """The drawn seed is printed and is in run.json and every row; --resume uses it and refuses
     another."""
     words = ("run", "tiny.json", "--policy", "schedule:stand", "--episodes", "1", "--out", "one")
-    run = cosim(*words, cwd=desk)
-    seed = json.loads((desk / "one/run.json").read_text())["seed"]
+    run = cosim(*words, cwd=workspace)
+    seed = json.loads((workspace / "one/run.json").read_text())["seed"]
     assert run.returncode == 0 and f"Seed {seed}: " in run.stderr
-    assert list(rows(desk / "one")["run_seed"]) == [seed]
-    record = json.loads((desk / "one/episodes/t-0/record.json").read_text())
-    (scenario,) = read_suite(desk / "one/scenarios.json").scenarios
+    assert list(rows(workspace / "one")["run_seed"]) == [seed]
+    record = json.loads((workspace / "one/episodes/t-0/record.json").read_text())
+    (scenario,) = read_suite(workspace / "one/scenarios.json").scenarios
     drawn = (seed, episode_id_of(seed, scenario).episode)
     assert (record["run_seed"], record["episode"]) == drawn
-    assert f"Seed {seed}: " in cosim(*words, "--resume", cwd=desk).stderr
-    refused = cosim(*words, "--resume", "--seed", "3", cwd=desk)
+    assert f"Seed {seed}: " in cosim(*words, "--resume", cwd=workspace).stderr
+    refused = cosim(*words, "--resume", "--seed", "3", cwd=workspace)
     assert refused.returncode == 2
     assert f"its seed is {seed}, and this command has 3" in refused.stderr
 

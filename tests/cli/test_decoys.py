@@ -14,7 +14,7 @@ from tests.support.event_ways import event_way
 
 
 @pytest.fixture
-def few(tmp_path: Path) -> Path:
+def short_suite(tmp_path: Path) -> Path:
     """Two scenarios in a small city that end after a second, followed by their decoys."""
     events = [
         event_way(kind, f"{kind}-001", at_m=10.0, time_s=1.0) for kind in ("lateral", "overtaking")
@@ -29,11 +29,11 @@ def few(tmp_path: Path) -> Path:
 
 
 @pytest.mark.engine
-def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim) -> None:
+def test_decoys_run_with_their_scenarios(short_suite: Path, tmp_path: Path, cosim: Cosim) -> None:
     """Shards hold pairs and merge to D, an id selects one, --no-decoys none, and resume, score and
     list respect decoys."""
 
-    always = ("run", few.name, "--policy", "schedule:stand", "--seed", "7")
+    always = ("run", short_suite.name, "--policy", "schedule:stand", "--seed", "7")
 
     def run(name: str, *words: str) -> set[str]:
         result = cosim(*always, "--out", name, *words, cwd=tmp_path)
@@ -52,5 +52,5 @@ def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim
     assert run("one", "--scenario", "lateral-001-decoy", "--resume") == {"lateral-001-decoy"}
     result = cosim(*always, "--out", "events", "--resume", cwd=tmp_path)
     assert "2 of 4 (--no-decoys), and this command has 4 of 4 (all)" in result.stderr, result
-    result = cosim("list", few.name, cwd=tmp_path)
+    result = cosim("list", short_suite.name, cwd=tmp_path)
     assert "decoy of" in result.stdout and "lateral-001-decoy" in result.stdout

@@ -30,10 +30,10 @@ class Far:
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite of one short scenario, and a policy in its own folder with a module
     that it imports."""
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("workspace")
     one = msgspec.structs.replace(small_scenario(), id="n-0", time_limit_s=1.0)
     write_suite(Suite(name="one", version="1", scenarios=(one,)), folder / "one.json")
     (folder / "deeper").mkdir()
@@ -146,34 +146,34 @@ def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosi
 
 
 @pytest.mark.engine
-def test_a_policy_by_file_equals_the_policy_by_module(desk: Path, cosim: Cosim) -> None:
+def test_a_policy_by_file_equals_the_policy_by_module(workspace: Path, cosim: Cosim) -> None:
     """Isolated processes load it too, and a run resumes with either spelling until the file is
     edited."""
-    suite, out = str(desk / "one.json"), str(desk / "run")
+    suite, out = str(workspace / "one.json"), str(workspace / "run")
     by_file = ("run", suite, "--policy", "deeper/far.py:Far", "--isolated", "--out", out)
-    result = cosim(*by_file, cwd=desk)
+    result = cosim(*by_file, cwd=workspace)
     assert result.returncode == 0, result.stderr
     assert (
         f"Next:\n  cosim film {out} --failure -o film.mp4\n  cosim report {out} -o report.html\n"
         in result.stderr
     )
-    spec = json.loads((desk / "run/run.json").read_text())
+    spec = json.loads((workspace / "run/run.json").read_text())
     kind = spec["policy_runs"]
     assert kind in ("isolated: namespaces", "isolated: landlock") and spec["policy"] == "far:Far"
     row = f"policy far; sensor track blind; at 4 Hz; goal route_point; odometry wheel; policy {kind}; seed"
     assert row in result.stdout
-    weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=desk)
+    weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=workspace)
     assert (
         weak.returncode == 2
         and f"its policy_runs is {kind}, and this command has isolated: weak" in weak.stderr
     ), weak.stderr
     by_module = ("run", suite, "--policy", "far:Far", "--isolated", "--out", out, "--resume")
-    again = cosim(*by_module, cwd=desk / "deeper")
+    again = cosim(*by_module, cwd=workspace / "deeper")
     assert again.returncode == 0 and "1 of 1 episodes are finished already" in again.stderr, (
         again.stderr
     )
-    (desk / "deeper/far.py").write_text(POLICY + "# edited")
-    edited = cosim(*by_file, "--resume", cwd=desk)
+    (workspace / "deeper/far.py").write_text(POLICY + "# edited")
+    edited = cosim(*by_file, "--resume", cwd=workspace)
     assert (
         edited.returncode == 2
         and "the source of policy 'far:Far' was edited since it began" in edited.stderr
@@ -181,14 +181,14 @@ def test_a_policy_by_file_equals_the_policy_by_module(desk: Path, cosim: Cosim) 
 
 
 def test_the_file_of_a_policy_is_sent_to_a_cluster(
-    desk: Path, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ray gets the named file, as for a module."""
     from scenarios.runs.ray_workers import _own_module
 
-    monkeypatch.chdir(desk)
-    monkeypatch.syspath_prepend(desk)
-    assert _own_module("deeper/far.py:Far") == str(desk / "deeper/far.py")
+    monkeypatch.chdir(workspace)
+    monkeypatch.syspath_prepend(workspace)
+    assert _own_module("deeper/far.py:Far") == str(workspace / "deeper/far.py")
     assert _own_module("orca") == ""
 
 

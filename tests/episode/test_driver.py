@@ -77,7 +77,7 @@ class UnreadableError(Exception):
 
 
 @pytest.fixture
-def deaf() -> object:
+def ctrl_c_ignored() -> object:
     """Ctrl-C is ignored, as in an environment process."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     yield
@@ -99,7 +99,7 @@ def deaf() -> object:
     ids=["error", "exit", "ctrl-c", "generator", "memory", "mute", "odd-text", "long-text"],
 )
 def test_any_exception_of_a_policy_is_its_crash(
-    deaf: None, error: BaseException, expected: str
+    ctrl_c_ignored: None, error: BaseException, expected: str
 ) -> None:
     """Also BaseExceptions and unprintable errors give one message with the policy's name and the
     time."""

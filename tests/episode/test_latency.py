@@ -127,7 +127,7 @@ def test_contradictory_latency_options_are_refused(
         RunConfig(suite="reactive", latency=latency, real_time=real_time)
 
 
-def small_in_two_s() -> Scenario:
+def small_scenario_of_2_s() -> Scenario:
     """Two seconds of a long way in a small city."""
     return msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
 
@@ -149,7 +149,7 @@ class Slow:
 """
 
 
-class Faster:
+class Accelerating:
     """A blind 5 Hz policy that is slow to answer and adds 0.1 m/s to its speed at each observation."""
 
     manifest = Manifest("faster", rate_hz=5.0, camera=None)
@@ -170,7 +170,7 @@ class Faster:
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    return small_in_two_s()
+    return small_scenario_of_2_s()
 
 
 @pytest.mark.engine
@@ -179,7 +179,7 @@ def test_a_fixed_latency_delays_each_command_to_the_tick(
 ) -> None:
     """By hand: 120 ms are three ticks, so commands of observations every 4 ticks begin at 3, 7, 11,
     ..."""
-    result = run_episode(scenario, Faster(), EpisodeOptions(latency_ms=120.0))
+    result = run_episode(scenario, Accelerating(), EpisodeOptions(latency_ms=120.0))
     assert result.log is not None and (
         result.record.setup.latency_ms,
         result.record.setup.real_time,
@@ -198,7 +198,7 @@ def test_real_time_delays_are_recorded_and_replayed(
 ) -> None:
     """For a policy of 0.2 s the recorded delays were applied, queries do not overlap, and the
     replay has the same state hash."""
-    slow = Faster(slow_s=0.2)
+    slow = Accelerating(slow_s=0.2)
     result = run_episode(scenario, slow, EpisodeOptions(real_time=True))
     record, log = result.record, result.log
     assert log is not None and record.setup.real_time

@@ -47,7 +47,7 @@ def scenario() -> Scenario:
     return msgspec.structs.replace(small_scenario(), time_limit_s=6.0)
 
 
-def walked(scenario: Scenario, robot: str, push_ns: float) -> RecordedEpisode:
+def walk_with_push(scenario: Scenario, robot: str, push_ns: float) -> RecordedEpisode:
     """A walk straight ahead, pushed to the left once."""
     stages: list[StagedScenario] = []
 
@@ -80,7 +80,7 @@ def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_continues(
 ) -> None:
     """A push of 30 N s fells the robot, which is reset upright and walks within 2 s; trajectory and
     record agree."""
-    pushed_scenario, record, log, *_ = walked(scenario, robot, 30.0)
+    pushed_scenario, record, log, *_ = walk_with_push(scenario, robot, 30.0)
     assert [failure.kind for failure in record.failures] == ["fall"]
     assert (record.measures["falls"], record.measures["failures"]) == (1.0, 1.0)
     (reset,) = np.flatnonzero(np.isfinite(log.reset_s_m)).tolist()
@@ -93,7 +93,7 @@ def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_continues(
 def test_a_walk_replays_to_the_same_state_hash(scenario: Scenario, robot: str) -> None:
     """Without a push it does not fall, travels from its first to its last pose, and replays to the
     same hash."""
-    episode = walked(scenario, robot, 0.0)
+    episode = walk_with_push(scenario, robot, 0.0)
     straight_m = math.dist(episode.log.pose[0, :2], episode.log.pose[-1, :2])
     assert episode.record.measures["path_length_m"] == pytest.approx(straight_m, rel=0.02)
     assert episode.record.measures["falls"] == 0.0

@@ -239,7 +239,7 @@ def test_the_table_holds_for_isolated_and_served_policies(seen: dict[str, Observ
     lacking = set(re.findall(r"`([\w.]+)`", listed))
     assert len(lacking) == 6
     for protocol, one in seen.items():
-        afar, plain = hosted(one)
+        afar, plain = decoded_elsewhere(one)
         given = dataclasses.replace(one, privileged=None)
         assert paths(afar) == paths(given) and paths(plain) == paths(given) - lacking
         own = [
@@ -253,7 +253,7 @@ def test_the_table_holds_for_isolated_and_served_policies(seen: dict[str, Observ
                 assert np.array_equal(getattr(plain, name), getattr(one, name))
 
 
-def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
+def decoded_elsewhere(seen: Observation) -> tuple[Observation, SimpleNamespace]:
     """Return what a policy gets in another process with cosim, and in one without."""
     fields, arrays = encode_observation(dataclasses.replace(seen, privileged=None))
     laid = {name: pack_array(array) for name, array in arrays.items()}

@@ -263,7 +263,7 @@ def test_the_mirror_exchanges_left_and_right_everywhere(data: Path) -> None:
     torch.testing.assert_close(mirrored.way[0], batch.way[1])
 
 
-def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
+def test_a_run_feeds_the_graph_its_training_inputs(tmp_path: Path) -> None:
     """An observation becomes its row of training numbers with history, at an episode's start and
     for far goals too."""
     draws = np.random.default_rng(5)

@@ -35,7 +35,7 @@ def test_standing_still_before_a_standing_disk_is_permitted_and_driving_into_it_
     assert plane.excess(np.array([2.6, 0.0])) == pytest.approx(-0.1)
 
 
-def test_head_on_the_edge_is_the_leg_of_the_cone() -> None:
+def test_the_edge_of_a_head_on_approach_is_the_leg_of_the_cone() -> None:
     """Two disks 5 m apart that close at 4 m/s must cross the leg at asin(1/5) to the line between
     them."""
     plane = half_plane_for((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0))
@@ -67,7 +67,7 @@ def test_a_permitted_velocity_is_kept_and_a_too_fast_one_is_clipped() -> None:
     assert best_velocity([], np.array([3.0, 4.0]), FASTEST_MPS) == pytest.approx([1.2, 1.6])
 
 
-def test_where_nothing_is_permitted_the_worst_violation_is_least() -> None:
+def test_the_worst_violation_is_minimal_where_nothing_is_permitted() -> None:
     """x >= 1 and x <= -1 meet half way; with y >= 1.5 and y <= -0.5 added, the midpoint of the
     worse pair wins."""
     east = HalfPlane(1.0, 0.0, 1.0)

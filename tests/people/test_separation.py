@@ -10,7 +10,7 @@ from sumo_nets.crowd.separation import SHOULDERS_M, separated_positions
 REACH_M = 2.2 * 0.05
 
 
-def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.ndarray]:
+def tracks_of(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.ndarray]:
     """Return the tracks, tick by tick, of people who walk from (N, 2) to (N, 2) at 1.4 m/s; firm
     ones do not yield."""
     at = start.astype(float)
@@ -30,7 +30,7 @@ def test_two_people_pass_head_on_without_touching(aside_m: float, firm: bool) ->
     step allows."""
     start = np.array([[-4.0, 0.0], [4.0, aside_m]])
     goal = np.array([[4.0, 0.0], [-4.0, aside_m]])
-    track = walked(start, goal, np.array([firm, False]))
+    track = tracks_of(start, goal, np.array([firm, False]))
     assert min(float(np.hypot(*(at[0] - at[1]))) for at in track) > 0.9 * SHOULDERS_M
     assert np.hypot(*(track[-1] - goal).T).max() < 0.05
     steps = np.diff(np.array([start, *track]), axis=0)
@@ -41,7 +41,7 @@ def test_a_firm_person_does_not_give_way() -> None:
     """An event pedestrian walks its line to the millimetre, and the other walks round it."""
     start = np.array([[-4.0, 0.0], [4.0, 0.0]])
     goal = np.array([[4.0, 0.0], [-4.0, 0.0]])
-    track = walked(start, goal, np.array([True, False]))
+    track = tracks_of(start, goal, np.array([True, False]))
     assert all(at[0, 1] == 0.0 for at in track)
     assert max(abs(float(at[1, 1])) for at in track) > 0.8 * SHOULDERS_M
 
@@ -49,7 +49,7 @@ def test_a_firm_person_does_not_give_way() -> None:
 def test_a_crowd_at_one_place_spreads_out() -> None:
     """Eight people with one destination end up side by side without overlap."""
     rng = np.random.default_rng(1)
-    track = walked(rng.uniform(-2.0, 2.0, (8, 2)), np.zeros((8, 2)), np.zeros(8, dtype=bool))
+    track = tracks_of(rng.uniform(-2.0, 2.0, (8, 2)), np.zeros((8, 2)), np.zeros(8, dtype=bool))
     gaps = np.hypot(*(track[-1][:, None] - track[-1][None]).transpose(2, 0, 1)) + 9.0 * np.eye(8)
     assert gaps.min() > 0.3
 

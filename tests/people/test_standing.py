@@ -28,16 +28,18 @@ def standing(*obstacles: Obstacle, area: Polygon = SIDEWALK) -> StandingObstacle
     return standing_obstacles(obstacles, area)
 
 
-def thing(
+def obstacle_at(
     kind: str, x_m: float = 0.0, y_m: float = 0.0, heading_rad: float = 0.3, form: int = 2
 ) -> Obstacle:
     return Obstacle(kind=kind, x_m=x_m, y_m=y_m, heading_rad=heading_rad, form=form)
 
 
-def shown_track(things: StandingObstacles, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
+def shown_track(
+    obstacle_list: StandingObstacles, y_m: float, east: bool, seconds: float = 9.0
+) -> Floats:
     """Return the track (T, 2) of a person whom SUMO moves along x at y_m, straight through every
     obstacle."""
-    poses = PoseFilter(DT_S, things)
+    poses = PoseFilter(DT_S, obstacle_list)
     x = np.arange(-5.0, -5.0 + 1.3 * seconds, 1.3 * DT_S) * (1 if east else -1)
     rows = [
         poses.update(
@@ -59,7 +61,7 @@ def test_cached_distances_do_not_change_a_step() -> None:
     rng = np.random.default_rng(3)
     places = rng.uniform(-15.0, 15.0, (12, 2)).tolist()
     ground = box(-40.0, -40.0, 40.0, 40.0)
-    obstacles = [thing("bin", x_m, y_m) for x_m, y_m in places]
+    obstacles = [obstacle_at("bin", x_m, y_m) for x_m, y_m in places]
     used = standing(*obstacles, area=ground)
     changed = 0
     for count in (30, 45, 1, 45):
@@ -78,7 +80,7 @@ def test_cached_distances_do_not_change_a_step() -> None:
 @pytest.mark.parametrize("kind", sorted(OBSTACLE_SIZES_M))
 def test_the_crowd_walks_round_obstacles(kind: str) -> None:
     """From either side and any offset people pass the obstacle and return to their track."""
-    obstacle = thing(kind)
+    obstacle = obstacle_at(kind)
     for y_m in (-0.5, -0.1, 0.0, 0.3):
         for east in (True, False):
             track = shown_track(standing(obstacle), y_m, east)
@@ -91,26 +93,26 @@ def test_the_crowd_walks_round_obstacles(kind: str) -> None:
 
 def test_an_obstacle_at_the_edge_is_passed_on_the_other_side() -> None:
     """Beside a wall people pass a row of bins on the open side and stay on the sidewalk."""
-    row = [thing("bin", 0.75 * k, 1.15, 1.57) for k in range(3)]
-    things = standing(*row)
-    (body,) = things.bodies
+    row = [obstacle_at("bin", 0.75 * k, 1.15, 1.57) for k in range(3)]
+    obstacle_list = standing(*row)
+    (body,) = obstacle_list.bodies
     assert (body.closed_x, body.closed_y) == pytest.approx((0.0, 1.0), abs=0.05)
     for east in (True, False):
         for y_m in (1.2, 1.0, 0.7):
-            track = shown_track(things, y_m, east)
+            track = shown_track(obstacle_list, y_m, east)
             assert gap_m(track, *row) > -TOUCHES_M and track[:, 1].max() < 1.6
             assert abs(track[-1, 0]) > 6.0
 
 
 def test_people_walk_between_obstacles_where_they_fit() -> None:
     """Obstacles a person's width or more apart are two bodies, nearer ones are one."""
-    apart = standing(thing("bin", 0.0, -0.8, 0.0), thing("bin", 0.0, 0.95, 0.0))
-    near = standing(thing("bin", 0.0, -0.6, 0.0), thing("bin", 0.0, 0.6, 0.0))
+    apart = standing(obstacle_at("bin", 0.0, -0.8, 0.0), obstacle_at("bin", 0.0, 0.95, 0.0))
+    near = standing(obstacle_at("bin", 0.0, -0.6, 0.0), obstacle_at("bin", 0.0, 0.6, 0.0))
     assert len(apart.bodies) == 2 and len(near.bodies) == 1
     assert np.abs(shown_track(apart, 0.1, True)[:, 1]).max() < 0.35
 
 
-def query_with(things: StandingObstacles) -> EventQuery:
+def query_with(obstacle_list: StandingObstacles) -> EventQuery:
     """A query with the robot far away."""
     return EventQuery(
         episode="t",
@@ -125,7 +127,7 @@ def query_with(things: StandingObstacles) -> EventQuery:
         robot_length_m=0.7,
         robot_width_m=0.55,
         events=(),
-        standing=things.bodies,
+        standing=obstacle_list.bodies,
     )
 
 
@@ -134,22 +136,25 @@ def query_with(things: StandingObstacles) -> EventQuery:
 def test_directed_people_walk_round_obstacles_too(kind: str, moves: object) -> None:
     """People of events pass the obstacles in the query and walk on, and without them walk straight
     through."""
-    obstacle = thing(kind, 0.0, 0.05, 1.3)
-    for things in (standing(obstacle), StandingObstacles()):
+    obstacle = obstacle_at(kind, 0.0, 0.05, 1.3)
+    for obstacle_list in (standing(obstacle), StandingObstacles()):
         walker = Walker(x_m=-3.0, y_m=0.0, heading_rad=0.0)
         track = []
         for _ in range(160):
-            walker = moves(walker, 0.0, 1.3, Sight(query_with(things)))  # type: ignore[operator]
+            walker = moves(walker, 0.0, 1.3, Sight(query_with(obstacle_list)))  # type: ignore[operator]
             track.append((walker.x_m, walker.y_m))
         assert walker.x_m > 3.0
-        assert (gap_m(np.array(track), obstacle) > -TOUCHES_M) == bool(things.bodies)
+        assert (gap_m(np.array(track), obstacle) > -TOUCHES_M) == bool(obstacle_list.bodies)
 
 
 def test_a_query_holds_only_nearby_obstacles() -> None:
     """Of two obstacles the one near a person is in the query, and it survives encoding."""
-    things = standing(thing("bin", 0.0), thing("planter", 12.0))
-    (near,) = things.near(np.array([[0.8, 0.0], [5.0, 0.0]]))
-    query = msgspec.structs.replace(query_with(things), standing=(near,))
+    obstacle_list = standing(obstacle_at("bin", 0.0), obstacle_at("planter", 12.0))
+    (near,) = obstacle_list.near(np.array([[0.8, 0.0], [5.0, 0.0]]))
+    query = msgspec.structs.replace(query_with(obstacle_list), standing=(near,))
     assert (near.x_m, near.y_m) == pytest.approx((0.0, 0.0))
     assert msgspec.json.decode(msgspec.json.encode(query), type=EventQuery) == query
-    assert things.near(np.array([[5.0, 0.0]])) == () and things.near(np.zeros((0, 2))) == ()
+    assert (
+        obstacle_list.near(np.array([[5.0, 0.0]])) == ()
+        and obstacle_list.near(np.zeros((0, 2))) == ()
+    )

@@ -19,7 +19,7 @@ ROUTE = Polyline([(-20.0, 5.0), (0.0, 5.0), (0.0, -6.5)])
 CROSSING = RouteCrossing(id=":c0", enter_s_m=21.5, leave_s_m=28.5, signalised=True)
 
 
-def turned_over(y_m: float) -> StreetMap:
+def street_with_turning_car(y_m: float) -> StreetMap:
     """Return the street where a car turns over the northern corner, along x at y."""
     line = np.array([[-4.0, y_m], [4.0, y_m]])
     polygon = shapely.LineString(line).buffer(1.6, cap_style="flat")
@@ -36,7 +36,7 @@ def test_a_robot_waits_directly_before_a_crossing_where_no_car_turns() -> None:
 
 def test_a_robot_waits_outside_the_path_of_a_car_that_turns_over_the_corner() -> None:
     """It has a gap to the car's path, and still counts as waiting at the crossing."""
-    (wait_m,) = waits_before(turned_over(3.6), ROUTE, (CROSSING,), COURIER)
+    (wait_m,) = waits_before(street_with_turning_car(3.6), ROUTE, (CROSSING,), COURIER)
     path = shapely.LineString([(-4.0, 3.6), (4.0, 3.6)]).buffer(CAR_WIDTH_M / 2)
     pose = ROUTE.at(wait_m)
     body = shapely.Point(pose.xy).buffer(COURIER.width_m / 2)

@@ -92,7 +92,7 @@ def test_another_file_makes_no_graph(
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_a_package_that_is_missing_is_named_with_what_installs_it(
+def test_a_missing_package_is_named_with_its_install_command(
     network: Converter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The command needs packages that a run does not, and names the command that installs them."""

@@ -31,12 +31,12 @@ pytestmark = pytest.mark.engine
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
+def workspace(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     """A folder with a suite of one short scenario, and a run of it."""
     from scenarios.places.nets import place
     from scenarios.suites.long_horizon import build_long_horizon
 
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("workspace")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
     scenario = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
@@ -61,7 +61,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
 
 
 def test_a_film_shows_the_requested_seconds(
-    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It has 20 pictures a second of the requested size, all different, playable, with waypoints on
     map and picture from 1 s on."""
@@ -83,20 +83,20 @@ def test_a_film_shows_the_requested_seconds(
         "-o",
         "film.mp4",
     )
-    done = cosim(*words, cwd=desk)
+    done = cosim(*words, cwd=workspace)
     assert done.returncode == 0, done.stderr
-    with av.open(str(desk / "film.mp4")) as film:
+    with av.open(str(workspace / "film.mp4")) as film:
         pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(pictures) == 20 and pictures[0].shape == (180, 320, 3)
     assert all(np.abs(a.astype(int) - b).max() > 10 for a, b in itertools.pairwise(pictures))
-    assert not list(desk.glob("*.part"))
+    assert not list(workspace.glob("*.part"))
     assert len(drawn) == 20
     for area in (Layout.of(320, 180).second, Layout.of(320, 180).map):
         part = slice(area.y, area.y + area.height), slice(area.x, area.x + area.width)
         assert all((image[part] == PLANNED).all(axis=2).sum() > 5 for image in drawn)
 
 
-def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> None:
+def test_a_film_is_from_above_or_from_the_robot(workspace: Path, cosim: Cosim) -> None:
     """--view selects another picture beside the same map, over the same bar."""
     seen = []
     for view in ("above", "robot"):
@@ -113,9 +113,9 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
             "-o",
             f"{view}.mp4",
         )
-        done = cosim(*words, cwd=desk)
+        done = cosim(*words, cwd=workspace)
         assert done.returncode == 0, done.stderr
-        with av.open(str(desk / f"{view}.mp4")) as film:
+        with av.open(str(workspace / f"{view}.mp4")) as film:
             seen.append(next(film.decode(video=0)).to_ndarray(format="rgb24").astype(float))
     layout = Layout.of(320, 180)
     apart = np.abs(seen[0] - seen[1]).mean(axis=2)
@@ -123,7 +123,7 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
     assert apart[layout.map.y + 4 : layout.bar.y - 4, layout.map.x + 4 :].mean() < 3
 
 
-def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
+def test_a_film_of_a_failure_ends_with_it(workspace: Path, cosim: Cosim) -> None:
     """Without an episode the first failed one is filmed, from any view, and time and reason are
     printed."""
     words = (
@@ -139,15 +139,15 @@ def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
         "-o",
         "failure.mp4",
     )
-    done = cosim(*words, cwd=desk)
+    done = cosim(*words, cwd=workspace)
     assert done.returncode == 0, done.stderr
     assert "t-0, 2.0 s: ran out of time after 2 s, with " in done.stdout
-    with av.open(str(desk / "failure.mp4")) as film:
+    with av.open(str(workspace / "failure.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 4
 
 
 def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
-    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Simulation ends with the last picture, nothing is drawn before the first, and progress is
     reported."""
@@ -172,7 +172,7 @@ def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
         "320x180",
         "-o",
         "cut.mp4",
-        cwd=desk,
+        cwd=workspace,
     )
     assert done.returncode == 0, done.stderr
     assert (len(simulated), len(drawn)) == (14, 4)
@@ -182,11 +182,11 @@ def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
 
 @pytest.mark.parametrize("column", ["pose", "person_m", "reset_s_m"])
 def test_a_cut_that_differs_from_its_record_is_not_filmed(
-    desk: Path, cosim: Cosim, column: str
+    workspace: Path, cosim: Cosim, column: str
 ) -> None:
     """One changed bit of a tick is an error with the time and no file; beyond the cut it does not
     matter."""
-    path = desk / "run" / "episodes" / "t-0" / "trajectory.npz"
+    path = workspace / "run" / "episodes" / "t-0" / "trajectory.npz"
     original = path.read_bytes()
     with np.load(path) as arrays:
         changed = dict(arrays)
@@ -196,35 +196,44 @@ def test_a_cut_that_differs_from_its_record_is_not_filmed(
     words = ("film", "run", "t-0", "--size", "320x180", "--speed", "4")
     try:
         until, beyond = (
-            cosim(*words, "--to", "0.2", "-o", "until.mp4", cwd=desk),
-            cosim(*words, "--to", "0.5", "-o", "beyond.mp4", cwd=desk),
+            cosim(*words, "--to", "0.2", "-o", "until.mp4", cwd=workspace),
+            cosim(*words, "--to", "0.5", "-o", "beyond.mp4", cwd=workspace),
         )
     finally:
         path.write_bytes(original)
-    assert until.returncode == 0 and (desk / "until.mp4").exists(), until.stderr
+    assert until.returncode == 0 and (workspace / "until.mp4").exists(), until.stderr
     assert (
         beyond.returncode == 2
         and "not the same when it was replayed (from 0.25 s on)" in beyond.stderr
     )
-    assert not list(desk.glob("beyond*"))
+    assert not list(workspace.glob("beyond*"))
     assert "of the same versions: of other code" in beyond.stderr
 
 
-def test_a_record_that_does_not_replay_is_not_filmed(desk: Path, cosim: Cosim) -> None:
+def test_a_record_that_does_not_replay_is_not_filmed(workspace: Path, cosim: Cosim) -> None:
     """A record of another episode is an error, without a file."""
-    path = desk / "run" / "episodes" / "t-0" / "record.json"
+    path = workspace / "run" / "episodes" / "t-0" / "record.json"
     original = path.read_bytes()
     record = json.loads(original)
     path.write_text(json.dumps(record | {"state_hash": "0" * len(record["state_hash"])}))
     try:
         done = cosim(
-            "film", "run", "t-0", "--from", "1.9", "--size", "320x180", "-o", "wrong.mp4", cwd=desk
+            "film",
+            "run",
+            "t-0",
+            "--from",
+            "1.9",
+            "--size",
+            "320x180",
+            "-o",
+            "wrong.mp4",
+            cwd=workspace,
         )
     finally:
         path.write_bytes(original)
     assert done.returncode == 2 and "not the same when it was replayed" in done.stderr
     assert "of the same versions: of other code" in done.stderr
-    assert not list(desk.glob("wrong*"))
+    assert not list(workspace.glob("wrong*"))
 
 
 @pytest.mark.parametrize(
@@ -264,10 +273,10 @@ def test_a_record_that_does_not_replay_is_not_filmed(desk: Path, cosim: Cosim) -
     ],
 )
 def test_invalid_film_and_look_requests_are_refused(
-    desk: Path, cosim: Cosim, words: tuple[str, ...], expected: str
+    workspace: Path, cosim: Cosim, words: tuple[str, ...], expected: str
 ) -> None:
     """The exit code is 2, or 3 for the machine's faults, with one message and no traceback."""
-    done = cosim(*words, cwd=desk)
+    done = cosim(*words, cwd=workspace)
     assert (
         done.returncode == (3 if "written" in expected else 2)
         and expected in done.stderr
@@ -276,7 +285,7 @@ def test_invalid_film_and_look_requests_are_refused(
     assert "starting" not in done.stderr or words[0] == "film"
 
 
-def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
+def test_a_look_is_a_picture_of_its_moment(workspace: Path, cosim: Cosim) -> None:
     """From the robot or from above the picture has the requested size and content, and progress is
     printed."""
     seen = {}
@@ -294,7 +303,7 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
             "160x90",
             "-o",
             f"{name}.png",
-            cwd=desk,
+            cwd=workspace,
         )
         assert done.returncode == 0, done.stderr
         driven = ["simulating to 1 s"] if name == "above" else []
@@ -307,30 +316,32 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
         ]
         lines = done.stderr.splitlines()
         assert len(lines) == len(stages) and all(map(str.startswith, lines, stages))
-        seen[name] = cv2.imread(str(desk / f"{name}.png"))
+        seen[name] = cv2.imread(str(workspace / f"{name}.png"))
         assert seen[name].shape == (90, 160, 3) and seen[name].std() > 10
     assert (seen["start"] != seen["above"]).mean() > 0.5
 
 
-def test_a_look_at_a_scenario_file_needs_no_suite(desk: Path, cosim: Cosim) -> None:
+def test_a_look_at_a_scenario_file_needs_no_suite(workspace: Path, cosim: Cosim) -> None:
     """Of a sweep only the first, named or numbered scenario is built, and its faults are listed."""
     text = (
         'name = "mine"\nseeds = 2\n[place]\ncity = 1\nsize_m = 500\n[way]\nkind = '
         '"straight"\nlength_m = 30\n'
     )
     text += '[[events]]\nkind = "frontal"\nat_m = [25, 2]\n'
-    (desk / "mine.toml").write_text(text)
+    (workspace / "mine.toml").write_text(text)
     for words, expected in {
         (): "mine-at_m25-s0 at 0.00 s, robot; 1 of 4 scenarios: --scenario chooses another)",
         ("--scenario", "2"): "mine-at_m25-s1 at",
         ("--scenario", "mine-at_m25-s1"): "mine-at_m25-s1 at",
     }.items():
-        done = cosim("look", "mine.toml", *words, "--size", "160x90", "-o", "mine.png", cwd=desk)
+        done = cosim(
+            "look", "mine.toml", *words, "--size", "160x90", "-o", "mine.png", cwd=workspace
+        )
         assert done.returncode == 0 and expected in done.stdout, done.stderr
-        assert cv2.imread(str(desk / "mine.png")).std() > 10
-    done = cosim("look", "mine.toml", "--scenario", "3", "-o", "none.png", cwd=desk)
+        assert cv2.imread(str(workspace / "mine.png")).std() > 10
+    done = cosim("look", "mine.toml", "--scenario", "3", "-o", "none.png", cwd=workspace)
     assert done.returncode == 2 and "mine.toml: events[0]: at_m 2 does not do" in done.stderr
-    done = cosim("look", "mine.toml", "--scenario", "mine", "-o", "none.png", cwd=desk)
+    done = cosim("look", "mine.toml", "--scenario", "mine", "-o", "none.png", cwd=workspace)
     assert (
         done.returncode == 2
         and "unknown scenario 'mine'. Valid choices: mine-at_m2-s0, mine-" in done.stderr

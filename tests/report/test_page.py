@@ -67,7 +67,7 @@ class Elements(HTMLParser):
             self._json = False
 
 
-def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
+def test_a_policys_cell_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     """A policy's cell is the summary of its episodes; rows of the paper are marked and appear only
     with its suites."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])

@@ -189,7 +189,7 @@ def test_a_phone_and_paper_show_the_whole_page(page: Page) -> None:
 
 
 @pytest.fixture(scope="module")
-def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def crowded_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A page of six runs with long names of policies and scenarios, without replays."""
     folder = tmp_path_factory.mktemp("crowded")
     rng = np.random.default_rng(1)
@@ -225,11 +225,11 @@ def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_no_text_is_cut_off_or_covered(crowded: Path, browser: Page) -> None:
+def test_no_text_is_cut_off_or_covered(crowded_page: Path, browser: Page) -> None:
     """At 1280 and 400 px texts of plots, also of touched points, fit without overlap, and names
     take under half of a table."""
     browser.size(1280, 900)
-    browser.open(crowded)
+    browser.open(crowded_page)
     plots = "[...document.querySelectorAll('.drawing')]"
     for wide in (1280, 400):
         browser.size(wide, 900, phone=wide == 400)

@@ -67,7 +67,7 @@ def test_another_person_of_the_same_name_is_not_compared() -> None:
     assert (found.compared, found.unmatched, found.delay_s) == (0, 1, 0.0)
 
 
-def test_a_person_who_stands_anyway_is_not_delayed() -> None:
+def test_a_standing_person_is_not_delayed() -> None:
     """Without a pace there is no delay."""
     found = delay_of([(5.0, 1.0)] * 201, tracks([1.0] * 201), tracks([1.0] * 201), 0.05)
     assert (found.compared, found.delay_s) == (0, 0.0)

@@ -35,7 +35,7 @@ from tests.results.test_referee import (
 from tests.support.driven_runs import driven, episode_of, failure_at, short_way
 
 
-def down(upright: Step) -> Step:
+def as_fallen(upright: Step) -> Step:
     return dataclasses.replace(upright, motion=dataclasses.replace(upright.motion, down=True))
 
 
@@ -44,21 +44,21 @@ def test_a_robot_that_is_down_for_a_tenth_of_a_second_has_fallen_once(ends: bool
     """Two ticks are a stumble; the third is a fall, which ends a short episode and resets the robot
     on a long route."""
     referee = new_referee(ends_on_failure=ends)
-    ticks = [step(0, 20.0), *(down(step(t, 20.0)) for t in (1, 2)), step(3, 20.0)]
-    ticks += [down(step(t, 23.0)) for t in (4, 5, 6)]
+    ticks = [step(0, 20.0), *(as_fallen(step(t, 20.0)) for t in (1, 2)), step(3, 20.0)]
+    ticks += [as_fallen(step(t, 23.0)) for t in (4, 5, 6)]
     verdicts = judge_all(referee, ticks)
     assert [failure.kind for v in verdicts for failure in v.failures] == ["fall"]
     assert (verdicts[-1].ended == "failure", verdicts[-1].reset is None) == (ends, ends)
     if not ends:
-        assert not judge_all(referee, [down(step(t, 25.0)) for t in (7, 8)])[-1].failures
+        assert not judge_all(referee, [as_fallen(step(t, 25.0)) for t in (7, 8)])[-1].failures
 
 
 def test_a_fall_that_follows_from_a_collision_is_not_counted() -> None:
     """The collision resets the robot, which then has to be down for 0.1 s again."""
     referee = new_referee(ends_on_failure=False)
-    hit = down(step(1, 20.0, contacts=[touch("bin", "object")]))
+    hit = as_fallen(step(1, 20.0, contacts=[touch("bin", "object")]))
     verdicts = judge_all(
-        referee, [down(step(0, 20.0)), hit, *(down(step(t, 20.0)) for t in (2, 3))]
+        referee, [as_fallen(step(0, 20.0)), hit, *(as_fallen(step(t, 20.0)) for t in (2, 3))]
     )
     assert [failure.kind for v in verdicts for failure in v.failures] == ["collision"]
 
@@ -71,7 +71,7 @@ def test_a_robot_that_a_person_pushes_over_has_not_failed(ends: bool) -> None:
     stand_still(referee, 19)
     assert referee.judge(step(19, 20.0, speed=0.0, contacts=[touch("c0")], crowd=crowd)).walked_into
     verdict = judge_all(
-        referee, [down(step(t, 20.0, speed=0.0, crowd=crowd)) for t in (25, 26, 27)]
+        referee, [as_fallen(step(t, 20.0, speed=0.0, crowd=crowd)) for t in (25, 26, 27)]
     )[-1]
     assert [(into.kind, into.other) for into in verdict.walked_into] == [("fall", "c0")]
     assert (verdict.failures, verdict.ended) == ((), None) and verdict.reset is not None
@@ -82,7 +82,9 @@ def pushed_over(referee: Referee, from_tick: int, ticks: int = 3) -> Verdict:
     crowd = people((20.5, 0.0), heading=math.pi, speed=1.3)
     stand_still(referee, from_tick)
     referee.judge(step(from_tick, 20.0, speed=0.0, contacts=[touch("c0")], crowd=crowd))
-    lying = (down(step(from_tick + k, 20.0, speed=0.0, crowd=crowd)) for k in range(1, ticks + 1))
+    lying = (
+        as_fallen(step(from_tick + k, 20.0, speed=0.0, crowd=crowd)) for k in range(1, ticks + 1)
+    )
     return judge_all(referee, [*lying])[-1]
 
 
@@ -90,7 +92,7 @@ def test_a_fall_after_a_reset_is_not_a_push() -> None:
     """A fall right after the reset that follows a push is the robot's own."""
     referee = new_referee(ends_on_failure=False)
     assert pushed_over(referee, 19).reset is not None
-    verdict = judge_all(referee, [down(step(t, 15.0)) for t in (23, 24, 25)])[-1]
+    verdict = judge_all(referee, [as_fallen(step(t, 15.0)) for t in (23, 24, 25)])[-1]
     assert [failure.kind for failure in verdict.failures] == ["fall"]
 
 
@@ -105,7 +107,7 @@ def test_a_push_lasts_as_long_as_the_person_touches_the_robot(contact_ends: int,
         contacts = [touch("c0")] if tick <= contact_ends else []
         referee.judge(step(tick, 20.0, speed=0.0, contacts=contacts, crowd=crowd))
     verdict = judge_all(
-        referee, [down(step(t, 20.0, speed=0.0, crowd=crowd)) for t in (60, 61, 62)]
+        referee, [as_fallen(step(t, 20.0, speed=0.0, crowd=crowd)) for t in (60, 61, 62)]
     )[-1]
     assert bool(verdict.failures) == (kind == "failed")
     assert bool(verdict.walked_into) == (kind == "pushed")
@@ -114,7 +116,7 @@ def test_a_push_lasts_as_long_as_the_person_touches_the_robot(contact_ends: int,
 def test_a_robot_that_is_down_reaches_no_goal() -> None:
     """When it slides into the goal while it falls, the fall is counted and no goal is reached."""
     referee = new_referee(ends_on_failure=True)
-    verdicts = judge_all(referee, [down(step(t, 99.8 + 0.1 * t)) for t in range(3)])
+    verdicts = judge_all(referee, [as_fallen(step(t, 99.8 + 0.1 * t)) for t in range(3)])
     assert [verdict.ended for verdict in verdicts] == [None, None, "failure"]
 
 
@@ -124,7 +126,7 @@ def test_a_robot_that_is_down_makes_no_stop() -> None:
     referee = new_referee(ends_at="stop", ends_on_failure=True, events=(event,))
     before = [step(t, 9.2, speed=0.0, events=reply) for t in range(39)]
     assert judge_all(referee, before)[-1].ended is None
-    assert referee.judge(down(step(39, 9.2, speed=0.0, events=reply))).ended is None
+    assert referee.judge(as_fallen(step(39, 9.2, speed=0.0, events=reply))).ended is None
     later = [step(40 + t, 9.2, speed=0.0, events=reply) for t in range(40)]
     ended = [verdict.ended for verdict in judge_all(referee, later)]
     assert ended == [None] * 39 + ["stop"]
@@ -142,14 +144,14 @@ def test_a_push_gains_no_progress(x_m: float) -> None:
             referee.judge(step(tick, x_m, speed=0.0, crowd=people((50.0, 0.0))))
         hit = [touch("c0")]
         referee.judge(step(begin + 25, x_m, speed=0.0, contacts=hit, crowd=crowd))
-        ticks = [down(step(begin + k, x_m, speed=0.0, crowd=crowd)) for k in (26, 27, 28)]
+        ticks = [as_fallen(step(begin + k, x_m, speed=0.0, crowd=crowd)) for k in (26, 27, 28)]
         verdict = judge_all(referee, ticks)[-1]
         assert not verdict.failures and verdict.reset is not None
         assert x_m - 0.7 < verdict.reset.route_s_m <= x_m - 0.5
         far = people((60.0, 0.0))
         for tick in range(begin + 29, begin + 40):
             referee.judge(step(tick, x_m, speed=0.0, crowd=far))
-    own = judge_all(referee, [down(step(160 + t, x_m)) for t in range(3)])[-1]
+    own = judge_all(referee, [as_fallen(step(160 + t, x_m)) for t in range(3)])[-1]
     assert own.failures and own.reset is not None and abs(own.reset.route_s_m - x_m) < 2.6
 
 
@@ -171,7 +173,7 @@ def test_a_state_hash_holds_the_attitude_of_the_trunk() -> None:
 
     upright = walking(0.0, 0.0, 0.0)
     others = [walking(*row) for row in np.eye(3).tolist()]
-    assert len({hash_of(robot_step) for robot_step in (upright, down(upright), *others)}) == 5
+    assert len({hash_of(robot_step) for robot_step in (upright, as_fallen(upright), *others)}) == 5
     assert hash_of(step(0, 20.0)) == "d1c778b35eb57669455504ff5ec1cef4"
 
 

@@ -71,7 +71,7 @@ def test_the_gap_is_the_least_of_all_gaps() -> None:
         )
 
 
-def test_at_the_time_to_collision_they_touch() -> None:
+def test_bodies_touch_at_the_time_to_collision() -> None:
     """For random motions the distance at that time is the radius, and before it is larger."""
     rng = np.random.default_rng(1)
     offset, velocity = rng.uniform(-5.0, 5.0, (500, 2)), rng.uniform(-2.0, 2.0, (500, 2))

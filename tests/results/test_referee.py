@@ -163,7 +163,7 @@ def test_a_person_who_walks_into_a_standing_robot_is_at_fault(
     assert (verdict.ended == "failure", verdict.reset is None) == (ends, ends)
 
 
-def test_beside_a_turning_robot_the_one_who_moves_is_at_fault() -> None:
+def test_a_contact_beside_a_turning_robot_is_the_movers_fault() -> None:
     """A walker is; the robot is when its corner swings into a standing person, or before 1 s of
     turning."""
     corner = {"contacts": [touch("c0")], "speed": 0.0}
@@ -218,7 +218,7 @@ def test_several_contacts_in_one_tick_are_several_collisions_and_one_reset() -> 
     assert len(ended.failures) == 3 and ended.ended == "failure"
 
 
-def test_waiting_is_no_failure_where_an_episode_ends_on_one() -> None:
+def test_waiting_is_no_failure_in_an_episode_that_ends_on_failure() -> None:
     """Before its goal a robot may stand until the time limit, and on a long way it freezes."""
     for ends, ended in ((True, "timeout"), (False, "timeout")):
         referee = new_referee(ends_on_failure=ends, time_limit_s=60.0)

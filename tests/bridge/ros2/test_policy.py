@@ -60,7 +60,7 @@ def endpoint() -> str:
 
 
 @contextmanager
-def driven(endpoint: str, **more: Any) -> Iterator[Ros2Driver]:
+def open_driver(endpoint: str, **more: Any) -> Iterator[Ros2Driver]:
     """The driver of `ros2:` that listens at an endpoint."""
     settings = Ros2Settings(
         connection=Connection(role="coordinator", listen=endpoint, guests=("ros2",)),
@@ -77,7 +77,7 @@ def driven(endpoint: str, **more: Any) -> Iterator[Ros2Driver]:
 def test_a_node_drives_in_lockstep(endpoint: str) -> None:
     """Each observation is answered by the node's command for it; /clock rises every 50 ms before
     stamps of its time; a new episode sets it back and is announced."""
-    with driven(endpoint) as driver, Peer(endpoint) as peer:
+    with open_driver(endpoint) as driver, Peer(endpoint) as peer:
         for episode in ("k1", "k2"):
             driver.reset(episode, 7)
             for tick in (0, 2, 4):
@@ -103,7 +103,7 @@ def test_a_monotonic_clock_never_goes_back(endpoint: str) -> None:
     clock = []
     for episodes in (("k1", "k2"), ("k3",)):
         with (
-            driven(endpoint, clock="monotonic", domain=7) as driver,
+            open_driver(endpoint, clock="monotonic", domain=7) as driver,
             Peer(endpoint, network=Network(7)) as peer,
         ):
             for episode in episodes:
@@ -126,7 +126,10 @@ def test_stamped_waits_for_the_command_of_the_picture(endpoint: str) -> None:
         ):
             peer.node.publish(CMD_VEL, stamped(command, time_ns))
 
-    with driven(endpoint, wait="stamped") as driver, Peer(endpoint, late, type_name=TWIST_STAMPED):
+    with (
+        open_driver(endpoint, wait="stamped") as driver,
+        Peer(endpoint, late, type_name=TWIST_STAMPED),
+    ):
         driver.reset("k1", 7)
         assert [driver.act(observation_at(tick)).v_mps for tick in (0, 2)] == [0.3, 0.3]
 
@@ -139,7 +142,7 @@ def test_rate_holds_a_command_for_half_a_second(endpoint: str) -> None:
         if len(peer.seen["/odom"]) == 1:
             answers(peer, seen)
 
-    with driven(endpoint, wait="rate", rate_hz=20.0) as driver, Peer(endpoint, once):
+    with open_driver(endpoint, wait="rate", rate_hz=20.0) as driver, Peer(endpoint, once):
         driver.reset("k1", 7)
         speeds = [driver.act(observation_at(tick)).v_mps for tick in (0, 5, 10, 11)]
         assert speeds == [1.0, 1.0, 1.0, 0.0]
@@ -152,7 +155,7 @@ def test_rate_takes_the_newest_command(endpoint: str) -> None:
         if len(peer.seen["/odom"]) == 1:
             answers(peer, seen)
 
-    with driven(endpoint, wait="rate") as driver, Peer(endpoint, once) as peer:
+    with open_driver(endpoint, wait="rate") as driver, Peer(endpoint, once) as peer:
         driver.reset("k1", 7)
         driver.act(observation_at(0))
         inbox = driver.policy._inbox  # type: ignore[attr-defined]
@@ -170,7 +173,7 @@ def test_rate_waits_for_a_first_command_and_notices_that_a_node_left(endpoint: s
             answers(peer, seen)
 
     more = {"wait": "rate", "answer_s": 0.4, "start_s": 30.0}
-    with driven(endpoint, **more) as driver, Peer(endpoint, slow) as peer:
+    with open_driver(endpoint, **more) as driver, Peer(endpoint, slow) as peer:
         driver.reset("k1", 7)
         assert [driver.act(observation_at(tick)).v_mps for tick in range(0, 14, 2)] == 6 * [0.0] + [
             1.0
@@ -200,7 +203,7 @@ def test_an_invalid_command_crashes_with_a_description(
     printed once."""
     type_name = TWIST if words == "finite" else TWIST_STAMPED
     with (
-        driven(endpoint, start_s=1.5) as driver,
+        open_driver(endpoint, start_s=1.5) as driver,
         Peer(
             endpoint,
             lambda peer, seen: [peer.node.publish(CMD_VEL, sends(seen)) for _ in range(3)] and None,
@@ -234,7 +237,7 @@ def test_a_node_that_cannot_drive_is_described(
     the run waits."""
     shown: list[str] = []
     with (
-        driven(endpoint, start_s=1.2) as driver,
+        open_driver(endpoint, start_s=1.2) as driver,
         Peer(endpoint, network=network, type_name=type_name),
         pytest.raises(PolicyError, match="is missing after") as error,
     ):
@@ -247,7 +250,7 @@ def test_a_node_that_cannot_drive_is_described(
 def test_without_a_node_the_crash_says_how_nodes_connect(endpoint: str) -> None:
     """Without a node, the message has the endpoint, the mode and the other dialect."""
     with (
-        driven(endpoint, start_s=1.0) as driver,
+        open_driver(endpoint, start_s=1.0) as driver,
         pytest.raises(
             PolicyError,
             match=f"no ROS 2 node is at {endpoint}.*mode client and this endpoint.*ros2dds",
@@ -286,7 +289,7 @@ def test_a_node_without_commands_is_described(
     shown while waiting."""
     monkeypatch.setattr(ros2_policy, "SETTLED_S", 0.6)
     shown: list[str] = []
-    with driven(endpoint, start_s=1.6) as driver, Peer(endpoint, reads=False) as peer:
+    with open_driver(endpoint, start_s=1.6) as driver, Peer(endpoint, reads=False) as peer:
         for topic, name in reads.items():
             peer.node.subscribe(topic, (name,), lambda got: None)
         driver.on_reason(shown.append)
@@ -300,7 +303,7 @@ def test_a_node_without_commands_is_described(
 def test_humble_nodes_drive_with_their_distribution(endpoint: str) -> None:
     """With --ros2-distro humble the keys have no hash on either side."""
     with (
-        driven(endpoint, distro="humble", domain=3, namespace="/env") as driver,
+        open_driver(endpoint, distro="humble", domain=3, namespace="/env") as driver,
         Peer(endpoint, network=Network(3, "/env", "humble")),
     ):
         driver.reset("k1", 7)
@@ -310,7 +313,7 @@ def test_humble_nodes_drive_with_their_distribution(endpoint: str) -> None:
 def test_nodes_behind_the_dds_bridge_drive(endpoint: str) -> None:
     """With --ros2-dialect ros2dds the keys are bare topic names, and commands need no attachment."""
     with (
-        driven(endpoint, dialect="ros2dds") as driver,
+        open_driver(endpoint, dialect="ros2dds") as driver,
         Peer(endpoint, network=Network(dialect="ros2dds")),
     ):
         driver.reset("k1", 7)
@@ -325,7 +328,7 @@ def test_a_lost_node_is_a_crash_and_a_new_one_drives_the_next_episode(endpoint: 
         if seen.time_ns == 10**9:
             answers(peer, seen)
 
-    with driven(endpoint, answer_s=30.0) as driver:
+    with open_driver(endpoint, answer_s=30.0) as driver:
         with Peer(endpoint, silent) as peer:
             driver.reset("k1", 7)
             driver.act(observation_at(0))
@@ -343,7 +346,7 @@ def test_two_nodes_do_not_drive_together(endpoint: str, capfd: Any) -> None:
     """Two publishers are reported and shown at the start; their commands crash the episode."""
     both = r"two publishers of /cmd_vel, /(one|two) and /(one|two): stop one"
     shown: list[str] = []
-    with driven(endpoint) as driver, Peer(endpoint, name="one"), Peer(endpoint, name="two"):
+    with open_driver(endpoint) as driver, Peer(endpoint, name="one"), Peer(endpoint, name="two"):
         driver.on_reason(shown.append)
         driver.reset("k1", 7)
         assert len(shown) == 1 and re.match(f"there are {both}", shown[0])
@@ -358,7 +361,7 @@ def test_two_nodes_behind_dds_bridges_do_not_drive(endpoint: str, monkeypatch: A
     without a command, crashes it."""
     monkeypatch.setattr(ros2_policy, "SETTLED_S", 0.5)
     network = Network(dialect="ros2dds")
-    with driven(endpoint, dialect="ros2dds") as driver, Peer(endpoint, network=network):
+    with open_driver(endpoint, dialect="ros2dds") as driver, Peer(endpoint, network=network):
         driver.reset("k1", 7)
         driver.act(observation_at(0))
         with Peer(endpoint, lambda *_: None, network=network):
@@ -392,7 +395,7 @@ def test_a_restarted_node_is_not_two_nodes(
         if when == "between" or seen.time_ns == 10**9:
             answers(peer, seen)
 
-    with driven(endpoint, dialect=dialect, answer_s=60.0) as driver:
+    with open_driver(endpoint, dialect=dialect, answer_s=60.0) as driver:
         old = Peer(endpoint, once, network=network)
         driver.reset("k1", 7)
         driver.act(observation_at(0))
@@ -429,7 +432,7 @@ def test_a_kind_of_fault_is_reported_once_in_an_episode(endpoint: str, capfd: An
             peer.node.publish(CMD_VEL, twist(Command(math.inf, float(next(bad)))))
         answers(peer, seen)
 
-    with driven(endpoint) as driver, Peer(endpoint, sends):
+    with open_driver(endpoint) as driver, Peer(endpoint, sends):
         for episode in ("k1", "k2"):
             driver.reset(episode, 7)
             for tick in (0, 2):
@@ -458,7 +461,7 @@ def test_a_long_plan_is_recorded_and_one_too_long_is_reported(endpoint: str, cap
             peer.node.publish(PLAN, one)
         answers(peer, seen)
 
-    with driven(endpoint, answer_s=30.0) as driver, Peer(endpoint, sends) as peer:
+    with open_driver(endpoint, answer_s=30.0) as driver, Peer(endpoint, sends) as peer:
         peer.node.advertise(PLAN, PATH)
         driver.reset("k1", 7)
         ticks = iter(range(0, 2000, 2))
@@ -471,7 +474,7 @@ def test_a_long_plan_is_recorded_and_one_too_long_is_reported(endpoint: str, cap
 
 def test_an_episode_starts_when_a_node_reads(endpoint: str) -> None:
     """A node that publishes first and subscribes later does not miss the first observation."""
-    with driven(endpoint, start_s=30.0) as driver, Peer(endpoint, reads=False) as peer:
+    with open_driver(endpoint, start_s=30.0) as driver, Peer(endpoint, reads=False) as peer:
         threading.Timer(1.0, peer.subscribe).start()
         driver.reset("k1", 7)
         assert driver.act(observation_at(0)).v_mps == 1.0
@@ -487,7 +490,7 @@ def test_a_flood_of_commands_and_long_messages_does_not_stop_the_drive(endpoint:
         for size_b in (1 << 20, 3 << 20):
             peer.session.publish(peer.node._publishers[CMD_VEL].key, bytes(size_b))
 
-    with driven(endpoint) as driver, Peer(endpoint, flood):
+    with open_driver(endpoint) as driver, Peer(endpoint, flood):
         driver.reset("k1", 7)
         assert {driver.act(observation_at(tick)).v_mps for tick in range(0, 20, 2)} == {1.0}
 
@@ -495,7 +498,7 @@ def test_a_flood_of_commands_and_long_messages_does_not_stop_the_drive(endpoint:
 def test_a_late_node_gets_the_latched_topics(endpoint: str) -> None:
     """Constant transforms, goal and episode reach a node that requests the history within a second."""
     late: dict[str, bytes] = {}
-    with driven(endpoint) as driver, Peer(endpoint):
+    with open_driver(endpoint) as driver, Peer(endpoint):
         driver.reset("k1", 7)
         driver.act(observation_at(0))
         with open_session(Connection(role="worker", connect=endpoint)) as session:

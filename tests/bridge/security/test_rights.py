@@ -67,7 +67,7 @@ def replies(session: zenoh.Session, key: str) -> list[str]:
     ]
 
 
-class Air:
+class Peers:
     """A hub, its run's own process, and a policy server; `seen` are keys of queries and messages,
     `alive` those of tokens."""
 
@@ -112,9 +112,9 @@ class Guest:
     """A client that tries everything; `received` are keys of queries and messages that it did not send
     itself."""
 
-    def __init__(self, air: Air, role: str, stack: ExitStack) -> None:
-        self.air = air
-        self.session = stack.enter_context(plain_zenoh(air.at, air.certs, role))
+    def __init__(self, peers: Peers, role: str, stack: ExitStack) -> None:
+        self.air = peers
+        self.session = stack.enter_context(plain_zenoh(peers.at, peers.certs, role))
         self.received: list[str] = []
         self.session.declare_queryable("cosim/r/policy/theirs/info", self._answer)
         everything = [] if role in ("policy", "") else [POLICY, "cosim/*/policy/**", "cosim/**"]
@@ -152,18 +152,24 @@ class Guest:
 
 
 @pytest.fixture(scope="module")
-def air(certs: Path) -> Iterator[Air]:
+def peers(certs: Path) -> Iterator[Peers]:
     with ExitStack() as stack:
-        yield Air(certs, stack)
+        yield Peers(certs, stack)
 
 
 def try_all(
-    air: Air, guest: Guest, may_ask: tuple[str, ...], *, watches: bool, answers: bool, shows: bool
+    peers: Peers,
+    guest: Guest,
+    may_ask: tuple[str, ...],
+    *,
+    watches: bool,
+    answers: bool,
+    shows: bool,
 ) -> None:
     """Try all acts; permitted ones work, and no other has any effect."""
     guest.passed(may_ask)
     # queries
-    air.seen.clear()
+    peers.seen.clear()
     for key in QUERIED:
         if key in may_ask:
             wait_until(lambda key=key: key in replies(guest.session, key))  # type: ignore[misc]
@@ -175,9 +181,9 @@ def try_all(
         for one in replies(guest.session, key)
     ]
     assert [one for one in wide if one != "FORGED" and "ask for exactly" not in one] == []
-    assert {key for key in air.seen if "/mark" not in key} == set(may_ask)
+    assert {key for key in peers.seen if "/mark" not in key} == set(may_ask)
     # publications and deletions
-    air.seen.clear()
+    peers.seen.clear()
     for key in (
         *PUBLISHED,
         *JOBS,
@@ -190,12 +196,12 @@ def try_all(
         guest.session.put(key, b"FORGED")
         guest.session.delete(key)
     guest.passed(may_ask)
-    assert {key for key in air.seen if "/mark" not in key} <= set(may_ask[:1])
+    assert {key for key in peers.seen if "/mark" not in key} <= set(may_ask[:1])
     # subscriptions to the run's messages and to queries of a policy
     guest.received.clear()
     for key in PUBLISHED:
-        air.run.publish_lossy(key, b"true")
-    air.hub.query(POLICY, b"secret", timeout_s=PATIENCE_S)
+        peers.run.publish_lossy(key, b"true")
+    peers.hub.query(POLICY, b"secret", timeout_s=PATIENCE_S)
     if watches:
         wait_until(lambda: set(PUBLISHED) <= set(guest.received))
     guest.passed(may_ask)
@@ -204,24 +210,24 @@ def try_all(
     assert watches == bool(set(PUBLISHED) & set(guest.received))
     # replies in place of others, and as a policy
     for key in (*JOBS, *SEEN, f"{ENV}/inject"):
-        assert air.hub.query(key, b"", timeout_s=PATIENCE_S) == key.encode()
+        assert peers.hub.query(key, b"", timeout_s=PATIENCE_S) == key.encode()
     assert guest.answers() is answers
     # a token as a worker
     alive = [
         str(one.ok.key_expr)
-        for one in air.inside.liveliness().get("cosim/*/workers/*", timeout=PATIENCE_S)
+        for one in peers.inside.liveliness().get("cosim/*/workers/*", timeout=PATIENCE_S)
     ]
     assert (alive == ["cosim/r/workers/one"]) is shows
 
 
 @pytest.mark.parametrize("role", MAY_ASK)
-def test_a_role_has_its_own_rights_and_no_others(air: Air, role: str) -> None:
+def test_a_role_has_its_own_rights_and_no_others(peers: Peers, role: str) -> None:
     """Each role, with its certificate, tries to query, publish, subscribe, reply, declare tokens
     and use wildcards."""
     with ExitStack() as stack:
-        guest = Guest(air, role, stack)
+        guest = Guest(peers, role, stack)
         try_all(
-            air,
+            peers,
             guest,
             MAY_ASK[role],
             watches=role == "viewer",
@@ -234,9 +240,9 @@ def test_without_certificates_no_client_speaks_for_the_run() -> None:
     """On loopback a client has the rights of all roles together, but not those of the run or its
     hub."""
     with ExitStack() as stack:
-        air = Air(None, stack)
+        peers = Peers(None, stack)
         may = tuple(key for key in QUERIED if any(key in theirs for theirs in MAY_ASK.values()))
-        try_all(air, Guest(air, "", stack), may, watches=True, answers=True, shows=True)
+        try_all(peers, Guest(peers, "", stack), may, watches=True, answers=True, shows=True)
 
 
 @pytest.mark.parametrize(("hub", "key"), [("director", f"{ENV}/director"), ("policy", POLICY)])

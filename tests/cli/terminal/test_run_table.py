@@ -90,7 +90,7 @@ def test_tables_of_success_name_events_with_their_own_ending() -> None:
     )
 
 
-def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
+def test_a_misspelt_name_gets_a_few_similar_ones() -> None:
     """A misspelt scenario name gets five similar ones and the total count, not all 1,700."""
     names = [scenario.id for scenario in load_suite("reactive").scenarios]
     assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))

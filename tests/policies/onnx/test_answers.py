@@ -51,7 +51,7 @@ def test_waypoints_are_read_by_their_columns(name: str) -> None:
     np.testing.assert_allclose(answered(WAYPOINTS | fields, plan=expected), wanted, atol=1e-6)
 
 
-def test_of_several_modes_the_one_with_the_highest_score_is_followed() -> None:
+def test_the_mode_with_the_highest_score_is_followed() -> None:
     """Scores are another output, or follow each mode's numbers and scales."""
     modes = np.stack([ROWS[0], -ROWS[0], 2 * ROWS[0]])[None]
     best = answered({**WAYPOINTS, "scores": "probs"}, plan=modes, probs=[[0.1, 0.2, 0.7]])

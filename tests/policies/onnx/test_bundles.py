@@ -262,7 +262,7 @@ def test_a_provider_that_the_runtime_lacks_is_refused(
         load_policy(f"onnx:{bundle(tmp_path, tiny_graph())}")
 
 
-def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
+def test_a_graph_off_the_cpu_answers_for_many_episodes_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each has its own history and answer; with a fixed first axis, and on the CPU, they are
@@ -294,7 +294,7 @@ def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
 
 
 @pytest.fixture
-def exemplary(tmp_path: Path) -> Callable[..., OnnxPolicy]:
+def bundle_with_example(tmp_path: Path) -> Callable[..., OnnxPolicy]:
     """Return a bundle with an example of these arrays."""
 
     def policy_with_example(**arrays: np.ndarray[Any, Any]) -> OnnxPolicy:
@@ -306,21 +306,21 @@ def exemplary(tmp_path: Path) -> Callable[..., OnnxPolicy]:
 
 
 def test_the_example_of_a_bundle_is_compared_with_its_graph(
-    exemplary: Callable[..., OnnxPolicy],
+    bundle_with_example: Callable[..., OnnxPolicy],
 ) -> None:
     """The largest difference of each output is reported, and so is an example that does not fit."""
     obs = np.ones((1, 6, 4, 8), np.float32)
     goal = np.array([[1, 0]], np.float32)
-    right = exemplary(obs=obs, goal=goal)
+    right = bundle_with_example(obs=obs, goal=goal)
     answer = right.graph.run({"obs": obs, "goal": goal}, ["action"])["action"]
     expected = {"expected.action": answer + np.float32(0.5)}
-    assert example_differences(exemplary(obs=obs, goal=goal, **expected)) == pytest.approx(
-        {"action": 0.5}
-    )
+    assert example_differences(
+        bundle_with_example(obs=obs, goal=goal, **expected)
+    ) == pytest.approx({"action": 0.5})
     with pytest.raises(UsageError, match=r"example\.npz: has no array 'goal'"):
-        example_differences(exemplary(obs=obs, **expected))
+        example_differences(bundle_with_example(obs=obs, **expected))
     with pytest.raises(UsageError, match="does not fit the graph"):
-        example_differences(exemplary(obs=obs[:, :3], goal=goal, **expected))
+        example_differences(bundle_with_example(obs=obs[:, :3], goal=goal, **expected))
 
 
 def test_the_hash_of_a_bundle_depends_on_the_processors_rounding(
