@@ -12,7 +12,7 @@ from cosim.spec.connection import Connection
 from tests.conftest import Cosim
 from tests.support.plain import free_port
 
-DOORS = {
+ENDPOINT_COMMANDS = {
     "run --live": ("run", "no-such-suite", "--live"),
     "run --director": ("run", "no-such-suite", "--director"),
     "coordinator": ("coordinator", "no-such-suite", "--listen"),
@@ -33,13 +33,13 @@ DOORS = {
 }
 
 
-@pytest.mark.parametrize("door", DOORS)
+@pytest.mark.parametrize("command", ENDPOINT_COMMANDS)
 def test_no_endpoint_is_open_to_other_machines_by_default(
-    door: str, cosim: Cosim, tmp_path: Path
+    command: str, cosim: Cosim, tmp_path: Path
 ) -> None:
     """Beyond this machine an endpoint is refused without TLS, with TLS but no files, with files but
     no TLS, and with missing files."""
-    words = DOORS[door]
+    words = ENDPOINT_COMMANDS[command]
     beyond = "tcp/10.0.0.7:7447"
     guarded = "tls/10.0.0.7:7447"
     files = str(tmp_path / "none")
