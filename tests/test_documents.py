@@ -33,7 +33,7 @@ from tests.support.documents import PAGES, Block, blocks, shell_lines, text_of
 
 RUN_ELSEWHERE = {
     "from policy_server import serve": "scenarios/test_remote.py",
-    "import json, zenoh": "bridge/test_step_in.py",
+    "import json, zenoh": "bridge/test_live_examples.py",
 }
 """Beginnings of Python blocks that need a run at the other end, and the tests that run them as
 written."""

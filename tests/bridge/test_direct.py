@@ -103,21 +103,21 @@ class Blind:
 
 
 def frontal(scenario_id: str) -> Scenario:
-    """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the
-    robot."""
+    """A reactive scenario of a few seconds: a small city, few people, and a pedestrian who walks at
+    the robot."""
     from scenarios.places.nets import place
     from scenarios.suites.reactive import build_reactive
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_reactive(
+    scenario = build_reactive(
         EVENT_KINDS["frontal"], city, street_map, WalkGraph(street_map), 1, scenario_id
     )
-    return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
+    return msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
 
 
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
-    """A process that has said its first line."""
+    """A process that has printed its first line."""
     process = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None and process.stdout.readline()
     return process
@@ -136,8 +136,8 @@ def recorded(folder: Path, scenario_id: str) -> dict[str, Any]:
 
 @contextmanager
 def directing(folder: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
-    """Starts `cosim direct` in a folder, as often as called; the policy Killer knows of the last
-    one."""
+    """Return a function that starts `cosim direct` in a folder; the policy Killer knows the last
+    one started."""
     started_here: list[subprocess.Popen[str]] = []
 
     def start() -> subprocess.Popen[str]:
@@ -158,7 +158,8 @@ def at_socket(folder: Path) -> str:
 
 
 def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> None:
-    """Killed and started again the episode comes to the hash of an undisturbed one."""
+    """When the director is killed and started again, the episode has the state hash of an
+    undisturbed one."""
     from scenarios.episodes.run_episode import run_episode
 
     write_suite(
@@ -190,16 +191,15 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
         finally:
             run.kill()
             run.wait()
-    kept = recorded(tmp_path, "t-0")
+    record = recorded(tmp_path, "t-0")
     assert (
         undisturbed.status == "done" and (undisturbed.events[0].triggered_at_s or PATIENCE_S) < 4.0
     )
-    assert kept["status"] == "done" and kept["state_hash"] == undisturbed.state_hash
+    assert record["status"] == "done" and record["state_hash"] == undisturbed.state_hash
 
 
-def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> None:
-    """Killed for good while an episode runs: the run says that it waits, and that the simulator
-    owes it."""
+def test_a_director_that_does_not_return_is_reported(tmp_path: Path, cosim: Cosim) -> None:
+    """When it is killed for good, the run says that it waits, and the episode becomes invalid."""
     write_suite(
         Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json"
     )
@@ -223,11 +223,9 @@ def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> Non
     assert "t-1: waits at tick" in run.stderr and "5 s at most" in run.stderr
 
 
-def test_a_director_that_lies_spoils_its_episodes_and_no_other(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """The last tick's answer, too many states, noise, other code, an exception: each a record with
-    its reason."""
+def test_a_faulty_director_invalidates_only_its_own_episodes(tmp_path: Path, cosim: Cosim) -> None:
+    """A stale answer, too many states, noise, other code and an exception each give a record with
+    the reason."""
     says = {
         "late": "it answered tick 2 of 'late'",
         "many": "it answered with 1000 states for 1 events",
@@ -267,7 +265,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     from scenarios.episodes.director import remote_director
 
     at = f"unixsock-stream/{tmp_path}/director.sock"
-    there = Connection(role="coordinator", connect=at)
+    address = Connection(role="coordinator", connect=at)
     query = EventQuery(
         episode="e",
         tick=0,
@@ -282,13 +280,15 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
         robot_width_m=0.55,
         events=(),
     )
-    told: list[str] = []
+    notes: list[str] = []
     with (
         pytest.raises(
             DirectorLost,
             match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct",
         ),
-        remote_director(DirectorAddress(connection=there, run="r", wait_s=0.5), told.append, "e"),
+        remote_director(
+            DirectorAddress(connection=address, run="r", wait_s=0.5), notes.append, "e"
+        ),
     ):
         pass
     directors: list[subprocess.Popen[str]] = []
@@ -298,7 +298,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     late.start()
     try:
         with remote_director(
-            DirectorAddress(connection=there, run="r", wait_s=PATIENCE_S), told.append, "e"
+            DirectorAddress(connection=address, run="r", wait_s=PATIENCE_S), notes.append, "e"
         ) as director:
             assert director.react(query).tick == 0
         late.join()
@@ -315,8 +315,9 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     assert bad.returncode == 2 and "--listen '7448': write it as PROTOCOL/ADDRESS" in bad.stderr
 
 
-def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> None:
-    """The modules whose source is hashed hold all that a fresh process has loaded with them."""
+def test_the_version_of_the_behaviours_covers_every_module_they_load() -> None:
+    """The modules whose source is hashed include every module of the project that a fresh process
+    loads with them."""
     from scenarios.episodes.director import behaviour_version, imported_sources
 
     code = "import sys, scenarios.events; print(*sys.modules)"

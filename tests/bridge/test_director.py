@@ -52,8 +52,8 @@ def query(tick: int = 0) -> EventQuery:
     )
 
 
-def echo(asked: EventQuery) -> EventReply:
-    return EventReply(episode=asked.episode, tick=asked.tick, states=(), actors=())
+def echo(sent: EventQuery) -> EventReply:
+    return EventReply(episode=sent.episode, tick=sent.tick, states=(), actors=())
 
 
 def endpoint(folder: Path) -> str:
@@ -64,19 +64,18 @@ def open_sockets() -> set[str]:
     """The sockets of this process."""
     links = []
     for file in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # the folder's own, closed by now
+        with suppress(OSError):  # a socket that is closed by now
             links.append(str(file.readlink()))
     return {link for link in links if link.startswith("socket:")}
 
 
-def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
-    """Over a Zenoh session that has no socket: what it says is what the pure function says, tick by
-    tick."""
+def test_an_episodes_own_director_answers_in_the_calling_thread() -> None:
+    """Over a Zenoh session without a socket its replies equal the pure function's, tick by tick."""
     before, threads = open_sockets(), set()
 
-    def seen(asked: EventQuery) -> EventReply:
+    def seen(sent: EventQuery) -> EventReply:
         threads.add(threading.get_ident())
-        return echo(asked)
+        return echo(sent)
 
     with LocalSession() as session:
         serve_director(session, KEY, seen, version="cafe")
@@ -91,15 +90,14 @@ def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
             RemoteDirector(session, keys.director("test", "nobody"), wait_s=0.5).react(query())
 
 
-def test_ctrl_c_while_the_own_director_answers_is_not_lost() -> None:
-    """An interrupt ends the query; an exception is an engine error, not a lost director; the next
-    query works."""
+def test_ctrl_c_during_a_query_of_the_own_director_is_not_lost() -> None:
+    """An interrupt ends the query, an exception is an engine error, and the next query works."""
     raised: list[BaseException] = [KeyboardInterrupt(), RuntimeError("no idea")]
 
-    def broken(asked: EventQuery) -> EventReply:
+    def broken(sent: EventQuery) -> EventReply:
         if raised:
             raise raised.pop(0)
-        return echo(asked)
+        return echo(sent)
 
     with LocalSession() as session:
         serve_director(session, KEY, broken)
@@ -112,10 +110,10 @@ def test_ctrl_c_while_the_own_director_answers_is_not_lost() -> None:
         assert director.react(query(3)).tick == 3
 
 
-def test_a_director_that_raises_is_reported_with_its_words(tmp_path: Path) -> None:
+def test_a_director_that_raises_is_reported_with_its_message(tmp_path: Path) -> None:
     """An exception in the director comes back as the reason, not as silence."""
 
-    def broken(asked: EventQuery) -> EventReply:
+    def broken(sent: EventQuery) -> EventReply:
         raise RuntimeError("no idea")
 
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
@@ -149,7 +147,7 @@ def test_an_answer_to_another_tick_is_refused(tmp_path: Path) -> None:
         serve_director(
             hub,
             KEY,
-            lambda asked: EventReply(episode="t", tick=asked.tick + 1, states=(), actors=()),
+            lambda sent: EventReply(episode="t", tick=sent.tick + 1, states=(), actors=()),
         )
         with pytest.raises(DirectorLost, match="answered tick 1"):
             RemoteDirector(client, KEY).react(query(0))
@@ -194,27 +192,27 @@ STRANGER = msgspec.structs.replace(SHOWN, id="e7")
         ({"actors": (SHOWN, SHOWN)}, "people of no event, or twice"),
     ],
 )
-def test_a_reply_that_cannot_be_meant_is_refused_in_words(
+def test_an_invalid_reply_is_refused_with_a_reason(
     tmp_path: Path, fields: dict[str, Any], words: str
 ) -> None:
-    """The last tick's, another episode's, too many states, people of nobody, places that are
-    none."""
-    asked = msgspec.structs.replace(query(5), events=(event(),))
+    """Replies to another tick or episode, with too many states, unknown people or impossible places
+    are refused."""
+    sent = msgspec.structs.replace(query(5), events=(event(),))
     sane = EventReply(episode="t", tick=5, states=(SANE,), actors=(SHOWN,))
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(
-            hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if asked.states else {})
+            hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if sent.states else {})
         )
         director = RemoteDirector(client, KEY)
-        assert director.react(asked) == sane
-        asked = msgspec.structs.replace(asked, states=sane.states)
+        assert director.react(sent) == sane
+        sent = msgspec.structs.replace(sent, states=sane.states)
         with pytest.raises(DirectorLost, match=f"tick 5 of 't'.*{words}"):
-            director.react(asked)
+            director.react(sent)
 
 
 @pytest.mark.parametrize("theirs", ["feed", ""])
 def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) -> None:
-    """Whatever it would do: both ends sign with their version, and each refuses the other's."""
+    """Both ends sign with the version of their behaviours, and each refuses another version."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo, version=theirs)
         with pytest.raises(
@@ -230,7 +228,7 @@ def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) 
 
 
 def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
-    """Served on a key with wildcards it answers any concrete one, and still no wildcard query."""
+    """Served on a key with wildcards it answers any concrete key, and still no wildcard query."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, keys.EVERY_DIRECTOR, echo)
         for run, env in (("a", "x"), ("b", "y")):
@@ -266,7 +264,7 @@ def test_a_wildcard_query_does_not_reach_a_director(tmp_path: Path) -> None:
             client.query("cosim/*/env/*/director", encode(query()), timeout_s=PATIENCE_S)
 
 
-def test_nobody_to_connect_to_is_an_error_with_the_endpoint(
+def test_a_missing_hub_is_an_error_with_the_endpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A client without a hub fails and names the endpoint."""
@@ -275,17 +273,18 @@ def test_nobody_to_connect_to_is_an_error_with_the_endpoint(
         connected_to(endpoint(tmp_path))
 
 
-def test_names_that_cannot_stand_in_a_key_are_refused() -> None:
-    """Slashes, wildcards and empty names are no chunk of a key; `chunk` makes any name fit."""
+def test_names_that_do_not_fit_a_key_are_refused() -> None:
+    """Slashes, wildcards and empty names are refused as a chunk of a key; `chunk` makes any name
+    fit."""
     for bad in ("", "a/b", "*", "a b", "x" * 65):
         with pytest.raises(SpecError, match="cannot name a run or environment"):
             keys.director("run", bad)
     assert keys.chunk("lh 011/00") == "lh-011-00"
 
 
-def test_a_query_holds_its_own_events_however_often_others_are_asked_between() -> None:
-    """Two episodes in turns, and one that changes its events; events that cannot be are refused
-    every time."""
+def test_interleaved_queries_hold_the_events_of_their_episode() -> None:
+    """Two alternating episodes and one that changes its events get their own; impossible events are
+    refused every time."""
     queries = [
         msgspec.structs.replace(query(k), events=(event(route_s_m=5.0 + k % 2),) * (k % 3))
         for k in range(12)

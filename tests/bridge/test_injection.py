@@ -34,7 +34,7 @@ from tests.support.plain import free_port
 TICK_MS = 50
 
 
-class Nobody:
+class EmptyDirector:
     """A director without events."""
 
     def react(self, query: EventQuery) -> EventReply:
@@ -46,12 +46,12 @@ START = Pose(90.0, 90.0, -math.pi / 2)
 
 
 def injected_people(*script: Injected, director: Director | None = None) -> InjectedPeople:
-    """Injected people on a map that is the square of 100 m at the origin, along ROUTE."""
+    """Injected people on a map that is a square of 100 m at the origin, walking along ROUTE."""
 
     def on_map(x_m: float, y_m: float) -> bool:
         return 0.0 <= x_m <= 100.0 and 0.0 <= y_m <= 100.0
 
-    return InjectedPeople(director or Nobody(), TICK_MS, on_map, ROUTE, START, script)
+    return InjectedPeople(director or EmptyDirector(), TICK_MS, on_map, ROUTE, START, script)
 
 
 def query(tick: int, robot_x_m: float = 90.0) -> EventQuery:
@@ -81,28 +81,28 @@ def anna(**fields: object) -> Injection:
     return Injection(**known | fields)  # type: ignore[arg-type]
 
 
-def test_an_injected_person_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> None:
-    """Accepted between ticks 2 and 3 it is there at 3, 3 m at 1.5 m/s later it stands, a second
-    later it is gone."""
-    one = injected_people()
+def test_an_injected_person_enters_at_its_tick_walks_its_path_and_leaves() -> None:
+    """Accepted between ticks 2 and 3 it appears at 3, stands after 3 m at 1.5 m/s, and is gone a
+    second later."""
+    pedestrians = injected_people()
     for tick in range(3):
-        assert not one.react(query(tick)).actors
-    ack = one.offer(anna(doing="look"))
+        assert not pedestrians.react(query(tick)).actors
+    ack = pedestrians.offer(anna(doing="look"))
     assert ack == Ack(id="anna", status="accepted", tick=3, time_s=0.15, x_m=10.0, y_m=10.0)
-    seen = {tick: one.react(query(tick)).actors for tick in range(3, 80)}
+    seen = {tick: pedestrians.react(query(tick)).actors for tick in range(3, 80)}
     assert (seen[3][0].id, seen[3][0].x_m, seen[3][0].y_m) == ("ei-anna", 10.0, 10.0)
     assert seen[23][0].x_m == pytest.approx(11.5) and seen[23][0].speed_mps == pytest.approx(1.5)
     assert seen[43][0].x_m == pytest.approx(13.0) and seen[45][0].doing == "look"
-    gone = min(tick for tick, actors in seen.items() if not actors)
-    assert gone == pytest.approx(43 + 20, abs=1)
-    assert one.log == (Injected(tick=3, injection=anna(doing="look")),)
+    left_tick = min(tick for tick, actors in seen.items() if not actors)
+    assert left_tick == pytest.approx(43 + 20, abs=1)
+    assert pedestrians.log == (Injected(tick=3, injection=anna(doing="look")),)
 
 
-def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
-    """Who is to sit at its end is shown to stand as it appears, and to walk; it sits where its path
-    ends only."""
-    one = injected_people(Injected(tick=0, injection=anna(doing="sit")))
-    shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
+def test_a_final_posture_is_shown_only_at_the_end_of_the_path() -> None:
+    """A person who is to sit at its end is shown standing as it appears, then walking, and sits
+    only at the end."""
+    pedestrians = injected_people(Injected(tick=0, injection=anna(doing="sit")))
+    shown = [actor for tick in range(60) for actor in pedestrians.react(query(tick)).actors]
     assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
     assert {actor.doing for actor in shown if actor.speed_mps == 0.0 and actor.x_m == 13.0} == {
         "sit"
@@ -110,22 +110,24 @@ def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
 
 
 @pytest.mark.parametrize("off_m", [(0.0, 0.0), (0.4, 0.3), (-0.7, 0.0), (0.7, 0.0)])
-def test_an_injected_person_whose_end_the_robot_stands_on_stays_beside_it(
+def test_an_injected_person_whose_end_the_robot_blocks_stops_near_it(
     off_m: tuple[float, float],
 ) -> None:
-    """It comes within a metre, stays for its time, and is gone, instead of walking round the robot
+    """It comes within a metre, stays for its time, and leaves, instead of walking round the robot
     for ever."""
     end = (90.0 + off_m[0], 90.0 + off_m[1])
-    one = injected_people(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
-    shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
+    pedestrians = injected_people(
+        Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0))
+    )
+    shown = [actor for tick in range(300) for actor in pedestrians.react(query(tick)).actors]
     assert len(shown) < 240
     assert {(actor.speed_mps, actor.doing) for actor in shown[-38:]} == {(0.0, "stand")}
     assert math.dist((shown[-1].x_m, shown[-1].y_m), end) < 1.0
 
 
-def test_the_log_alone_replays_the_injected_people() -> None:
-    """Two of them, injected at different ticks: a director that only has the log shows the same,
-    tick by tick."""
+def test_injected_people_are_replayed_from_the_log_alone() -> None:
+    """A director that only has the log shows two people, injected at different ticks, at the same
+    places tick by tick."""
     live = injected_people()
     shown = []
     for tick in range(60):
@@ -137,15 +139,15 @@ def test_the_log_alone_replays_the_injected_people() -> None:
     assert [entry.tick for entry in live.log] == [4, 20]
 
 
-def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters() -> None:
-    """Ahead and left of its pose at that tick, beside points of the map; the log holds the map's
-    alone, and replays."""
-    one = injected_people()
+def test_points_relative_to_the_robot_are_resolved_when_the_pedestrian_enters() -> None:
+    """Points ahead and left of its pose at that tick mix with map points; the log holds map points
+    only, and replays."""
+    pedestrians = injected_people()
     robot = Pose(50.0, 50.0, math.pi / 2)
-    one.react(query(0))
-    one.set_robot(RobotOnRoute(1, robot, 40.0))
+    pedestrians.react(query(0))
+    pedestrians.set_robot(RobotOnRoute(1, robot, 40.0))
     ack = answer_injection(
-        b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', one.offer
+        b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', pedestrians.offer
     )
     assert (ack.status, ack.tick, ack.x_m, ack.y_m) == (
         "accepted",
@@ -153,8 +155,8 @@ def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters(
         pytest.approx(49.0),
         pytest.approx(65.0),
     )
-    shown = [one.react(query(tick)).actors for tick in range(1, 100)]
-    (entry,) = msgspec.json.decode(msgspec.json.encode(one.log), type=tuple[Injected, ...])
+    shown = [pedestrians.react(query(tick)).actors for tick in range(1, 100)]
+    (entry,) = msgspec.json.decode(msgspec.json.encode(pedestrians.log), type=tuple[Injected, ...])
     path = [(49.0, 65.0), (60.0, 60.0), (50.0, 47.5)]
     assert [number for point in entry.injection.path for number in point] == pytest.approx(
         sum(path, ())
@@ -164,17 +166,17 @@ def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters(
     assert [again.react(query(tick)).actors for tick in range(1, 100)] == shown
 
 
-def test_a_tick_that_does_not_end_refuses_points_from_the_robot(
+def test_a_hanging_tick_refuses_points_relative_to_the_robot(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An engine that hangs holds no client up: points of the map are taken, the others are to be
-    sent again."""
+    """While an engine hangs, map points are accepted, and clients must send the others
+    again."""
     monkeypatch.setattr(injected, "TICK_TIMEOUT_S", 0.01)
-    one = injected_people()
-    one.react(query(0))
-    ack = one.offer(InjectionRequest(id="a", path=(RelativePoint(10.0),)))
+    pedestrians = injected_people()
+    pedestrians.react(query(0))
+    ack = pedestrians.offer(InjectionRequest(id="a", path=(RelativePoint(10.0),)))
     assert ack.status == "refused" and "send it again" in ack.reason
-    assert one.offer(anna()).status == "accepted"
+    assert pedestrians.offer(anna()).status == "accepted"
 
 
 @pytest.mark.parametrize(
@@ -187,14 +189,13 @@ def test_a_tick_that_does_not_end_refuses_points_from_the_robot(
     ["[[10,10],[170,252]]", '[[10,10],{"ahead":-3,"left":-200}]'],
     ids=["of the map", "from the robot"],
 )
-def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
+def test_a_refusal_has_the_robots_place_and_a_valid_point(
     robot: tuple[float, float, float, float], path: str
 ) -> None:
-    """At the start, in a turn and near the goal: the message with either form of the point in it is
-    accepted."""
-    one = injected_people()
-    one.set_robot(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
-    reason = answer_injection(f'{{"id":"a","path":{path}}}'.encode(), one.offer).reason
+    """At the start, in a turn and near the goal, either form of the suggested point is accepted."""
+    pedestrians = injected_people()
+    pedestrians.set_robot(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
+    reason = answer_injection(f'{{"id":"a","path":{path}}}'.encode(), pedestrians.offer).reason
     assert reason.startswith("path[1] is ") and "not on this map" in reason
     assert f"The robot is at [{robot[0]:.1f}, {robot[1]:.1f}]" in reason
     found = re.search(
@@ -202,7 +203,8 @@ def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
     )
     assert found is not None
     acks = [
-        answer_injection(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), one.offer) for i in (1, 2)
+        answer_injection(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), pedestrians.offer)
+        for i in (1, 2)
     ]
     assert [ack.status for ack in acks] == ["accepted", "accepted"]
     assert (
@@ -284,40 +286,44 @@ def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
         "empty",
     ],
 )
-def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
-    """Nothing of it reaches the simulation."""
-    one = injected_people()
-    ack = answer_injection(message, one.offer)
+def test_an_invalid_message_is_refused_with_a_reason(message: bytes, reason: str) -> None:
+    """An invalid message is refused with its reason, and nothing of it reaches the simulation."""
+    pedestrians = injected_people()
+    ack = answer_injection(message, pedestrians.offer)
     assert ack.status == "refused" and ack.tick is None and reason in ack.reason
-    assert not one.react(query(0)).actors and one.log == ()
+    assert not pedestrians.react(query(0)).actors and pedestrians.log == ()
 
 
-def test_the_same_name_twice_is_refused() -> None:
-    """Also when the first one is gone: the log knows everybody by name."""
-    one = injected_people()
-    assert one.offer(anna()).status == "accepted"
-    assert "of this id" in one.offer(anna()).reason
+def test_a_repeated_name_is_refused() -> None:
+    """A name is refused the second time even after the first person left, because the log
+    identifies people by name."""
+    pedestrians = injected_people()
+    assert pedestrians.offer(anna()).status == "accepted"
+    assert "of this id" in pedestrians.offer(anna()).reason
     for tick in range(120):
-        one.react(query(tick))
-    assert not one.react(query(120)).actors and one.offer(anna()).status == "refused"
+        pedestrians.react(query(tick))
+    assert (
+        not pedestrians.react(query(120)).actors and pedestrians.offer(anna()).status == "refused"
+    )
 
 
-def test_a_flood_is_bounded() -> None:
-    """Of 100,000 messages so many are taken as may be there at once; the rest is told why not."""
-    one = injected_people()
-    acks = [one.offer(anna(id=f"p{i}")) for i in range(100_000)]
+def test_a_flood_of_messages_is_bounded() -> None:
+    """Of 100,000 messages as many are accepted as people may exist at once; the rest are refused
+    with the reason."""
+    pedestrians = injected_people()
+    acks = [pedestrians.offer(anna(id=f"p{i}")) for i in range(100_000)]
     assert sum(ack.status == "accepted" for ack in acks) == MAX_INJECTED
     assert "are here already" in acks[-1].reason
-    assert len(one.react(query(0)).actors) == MAX_INJECTED
+    assert len(pedestrians.react(query(0)).actors) == MAX_INJECTED
 
 
 def test_an_injected_person_does_not_walk_through_the_robot() -> None:
-    """With the robot on its path it goes round and arrives."""
-    one = injected_people()
-    one.offer(anna(path=((80.0, 90.0), (99.0, 90.0)), stay_s=60.0))
+    """With the robot on its path the person walks round it and arrives."""
+    pedestrians = injected_people()
+    pedestrians.offer(anna(path=((80.0, 90.0), (99.0, 90.0)), stay_s=60.0))
     gaps = []
     for tick in range(400):
-        actor = one.react(query(tick)).actors[0]
+        actor = pedestrians.react(query(tick)).actors[0]
         gaps.append(max(abs(actor.x_m - 90.0) - 0.35, abs(actor.y_m - 90.0) - 0.275))
     assert min(gaps) > 0.2 and actor.x_m == pytest.approx(99.0)
 
@@ -338,7 +344,7 @@ class Slow:
             return Command(1.5, 0.6)  # off the sidewalk: that ends the episode
         time.sleep(0.05)
         self.count += 1
-        return Command(0.3 if self.count // 40 % 2 else -0.3, 0.0)  # to and fro, for as long as it takes
+        return Command(0.3 if self.count // 40 % 2 else -0.3, 0.0)  # to and fro until it is ended
 """
 
 CONNECTED = f"""
@@ -371,17 +377,17 @@ with zenoh.open(config) as session:
     def ask(key, payload=b""):
         replies = session.get(key, payload=payload, timeout=PATIENCE_S)
         return next(((r.ok or r.err).payload.to_bytes() for r in replies), b"")
-    def said(message, key=f"{below}/inject"):
+    def reply_to(message, key=f"{below}/inject"):
         return ask(key, message).decode(errors="replace")
     bad = {
-        "10 MB": said(b'{"id":"' + b"x" * 10_000_000 + b'"}'),
-        "10 MB of nothing": said(bytes(10_000_000)),
-        "NaN": said(b'{"id":"a","path":[[1,NaN]]}'),
-        "outside": said(b'{"id":"a","path":[[1e6,0]]}'),
-        "too fast": said(json.dumps({"id": "a", "path": [[x, y]], "speed_mps": 30}).encode()),
-        "twice": said(json.dumps({"id": "bob", "path": [[x, y]]}).encode()),
-        "every run": said(b"{}", "cosim/*/env/*/inject"),
-        "wrong run": said(b"{}", "cosim/other/env/t-0/inject"),
+        "10 MB": reply_to(b'{"id":"' + b"x" * 10_000_000 + b'"}'),
+        "10 MB of nothing": reply_to(bytes(10_000_000)),
+        "NaN": reply_to(b'{"id":"a","path":[[1,NaN]]}'),
+        "outside": reply_to(b'{"id":"a","path":[[1e6,0]]}'),
+        "too fast": reply_to(json.dumps({"id": "a", "path": [[x, y]], "speed_mps": 30}).encode()),
+        "twice": reply_to(json.dumps({"id": "bob", "path": [[x, y]]}).encode()),
+        "every run": reply_to(b"{}", "cosim/*/env/*/inject"),
+        "wrong run": reply_to(b"{}", "cosim/other/env/t-0/inject"),
     }
     many = 2000
     for i in range(many):
@@ -397,8 +403,8 @@ print(json.dumps(bad))
 """
 
 
-class OnAir(NamedTuple):
-    """A run on the air in a folder. way: points on its sidewalk."""
+class LiveRun(NamedTuple):
+    """A live run in a folder; `way` are points on its sidewalk."""
 
     run: subprocess.Popen[str]
     folder: Path
@@ -417,14 +423,14 @@ class OnAir(NamedTuple):
         )
 
     def record(self) -> dict[str, Any]:
-        """The record, when the episode has been told to end."""
+        """Return the record, after the episode was ended."""
         (self.folder / "enough").touch()
         assert self.run.wait(timeout=PATIENCE_S) == 0
         return json.loads((self.folder / "run" / "episodes" / "t-0" / "record.json").read_bytes())
 
 
-def once(what: Callable[[], bool]) -> None:
-    """Wait until something is so: who asks a busy run may get no answer at first."""
+def wait_for(what: Callable[[], bool]) -> None:
+    """Wait until a condition holds; a busy run may not reply to the first query."""
     deadline = time.monotonic() + PATIENCE_S
     while not what():
         assert time.monotonic() < deadline
@@ -432,17 +438,17 @@ def once(what: Callable[[], bool]) -> None:
 
 
 @contextmanager
-def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
-    """`cosim run --live` of an episode that lasts until it is told to end."""
+def live_run(folder: Path, at: str, *guard: str) -> Iterator[LiveRun]:
+    """`cosim run --live` of an episode that lasts until it is ended."""
     from scenarios.places.nets import place
     from scenarios.suites.long_horizon import build_long_horizon
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
+    scenario = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     crowd = CrowdSpec(persons=6, radius_m=50.0, vehicles=2)
     short = msgspec.structs.replace(
-        whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=()
+        scenario, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=()
     )
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
     (folder / "slow.py").write_text(SLOW)
@@ -461,7 +467,7 @@ def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
         [*words, "--out", "run", "--live", at, *guard], cwd=folder, text=True
     ) as run:
         try:
-            yield OnAir(run, folder, at, [(x, y) for x, y in whole.route[20:26]])
+            yield LiveRun(run, folder, at, [(x, y) for x, y in scenario.route[20:26]])
         finally:
             run.kill()
 
@@ -470,45 +476,51 @@ def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
 def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(
     tmp_path: Path, cosim: Cosim
 ) -> None:
-    """`cosim inject` and `listen` beside `cosim run --live`, each with its own certificate alone;
-    `cosim replay` comes to the same state hash, given the injection."""
+    """`cosim inject` and `listen` each use their own certificate; `cosim replay` with the injection
+    has the same state hash."""
     certs = tmp_path / "certs"
     at = f"tls/localhost:{free_port()}"
     make_authority(certs, ["localhost"], 1)
     viewer, injector = (
         ("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector")
     )  # type: ignore[arg-type]
-    with on_air(tmp_path, at, "--tls", "certs/coordinator") as air:
-        there = ("--connect", air.at, "--wait", str(PATIENCE_S))
+    with live_run(tmp_path, at, "--tls", "certs/coordinator") as live_session:
+        connection = ("--connect", live_session.at, "--wait", str(PATIENCE_S))
 
-        def log_on_air() -> dict[str, Any]:
-            told = cosim("listen", "events", *there, *viewer, "--seconds", "0")
-            assert told.returncode == 0, told
-            return dict(json.loads(told.stdout.splitlines()[0]))
+        def fetch_log() -> dict[str, Any]:
+            result = cosim("listen", "events", *connection, *viewer, "--seconds", "0")
+            assert result.returncode == 0, result
+            return dict(json.loads(result.stdout.splitlines()[0]))
 
-        once(lambda: log_on_air()["tick"] > 0)
+        wait_for(lambda: fetch_log()["tick"] > 0)
         message = json.dumps(
-            {"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"}
+            {
+                "id": "anna",
+                "path": [live_session.way[0], {"ahead": 4, "left": 0.5}],
+                "doing": "stop",
+            }
         )
-        sent = cosim("inject", message, *there, *injector)
+        sent = cosim("inject", message, *connection, *injector)
         assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
-        again = cosim("inject", message, *there, *injector)
+        again = cosim("inject", message, *connection, *injector)
         assert again.returncode == 2 and "of this id" in again.stderr
-        swapped = cosim("inject", message, *there, *viewer)
+        swapped = cosim("inject", message, *connection, *viewer)
         assert (
             swapped.returncode == 2
             and "is of the role viewer, and this needs injector" in swapped.stderr
         )
-        elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9", *injector)
-        once(
+        elsewhere = ("inject", message, "--connect", live_session.at, "--env", "run/t-9", *injector)
+        wait_for(
             lambda: (
-                "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr
-                and said.returncode == 2
+                "Valid choices: run/t-0" in (result := cosim(*elsewhere)).stderr
+                and result.returncode == 2
             )
         )
-        once(lambda: [one["injection"]["id"] for one in log_on_air()["injections"]] == ["anna"])
-        words = [sys.executable, "-m", "cosim", "listen", "robot", *there, *viewer]
-        for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
+        wait_for(
+            lambda: [entry["injection"]["id"] for entry in fetch_log()["injections"]] == ["anna"]
+        )
+        words = [sys.executable, "-m", "cosim", "listen", "robot", *connection, *viewer]
+        for ends, code in (("SIGTERM", 130), ("closed pipe", 141)):
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
                 assert listener.stdout is not None
                 ticks = [json.loads(listener.stdout.readline()) for _ in range(4)]
@@ -517,14 +529,14 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
                     listener.wait()
                 listener.stdout.close()
             assert listener.returncode == code and all("x_m" in tick for tick in ticks), ends
-        record = air.record()
+        record = live_session.record()
     (entry,) = record["injections"]
     assert record["status"] == "done" and entry["injection"]["id"] == "anna"
     log = Log.load(tmp_path / "run" / "episodes" / "t-0" / "trajectory.npz")
     robot = Pose(*log.pose[entry["tick"] - 1])
     assert entry["tick"] > 0
     assert entry["injection"]["path"] == [
-        list(air.way[0]),
+        list(live_session.way[0]),
         list(RelativePoint(4.0, 0.5).on_map(robot)),
     ]
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
@@ -537,33 +549,35 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
 
 
 @pytest.mark.engine
-def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(
-    tmp_path: Path, cosim: Cosim
-) -> None:
+def test_plain_zenoh_scripts_inject_and_listen_without_harm(tmp_path: Path, cosim: Cosim) -> None:
     """The script of docs/viewing.md injects, a late listener gets all topics and the log, and
-    floods bounce."""
+    floods are refused."""
     (script,) = blocks("python", "docs/viewing.md")
-    with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
-        text = script.text.replace("tcp/127.0.0.1:7447", air.at)
+    with live_run(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as live_session:
+        text = script.text.replace("tcp/127.0.0.1:7447", live_session.at)
         (tmp_path / "ten.py").write_text(text)
         assert (
             cosim(
-                "listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0"
+                "listen", "--connect", live_session.at, "--wait", str(PATIENCE_S), "--seconds", "0"
             ).returncode
             == 0
         )
-        bob = json.loads(air.python("ten.py").stdout)
-        words = [sys.executable, "-c", CONNECTED + LISTENER, air.at]
+        bob = json.loads(live_session.python("ten.py").stdout)
+        words = [sys.executable, "-c", CONNECTED + LISTENER, live_session.at]
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
             assert listener.stdout is not None and listener.stdout.readline() == "listening\n"
-            vandal = air.python(
-                "-c", CONNECTED + VANDAL, air.at, "cosim/run/env/t-0", json.dumps(air.way[2])
+            vandal = live_session.python(
+                "-c",
+                CONNECTED + VANDAL,
+                live_session.at,
+                "cosim/run/env/t-0",
+                json.dumps(live_session.way[2]),
             )
             assert vandal.returncode == 0, vandal.stderr
-            record = air.record()
-            heard = json.loads(listener.stdout.read())
+            record = live_session.record()
+            received = json.loads(listener.stdout.read())
     assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
-    said = json.loads(vandal.stdout)
+    replies = json.loads(vandal.stdout)
     for name, words in {
         "10 MB": f"at most {MAX_MESSAGE_B}",
         "10 MB of nothing": f"at most {MAX_MESSAGE_B}",
@@ -573,23 +587,25 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(
         "twice": "of this id",
         "every run": "ask for exactly 'cosim/run/env/t-0/inject'",
     }.items():
-        assert words in said[name], said[name]
-    assert said["wrong run"] == "" and said["camera"] == b"\x89PNG\r\n\x1a\n".hex()
-    taken_in = [one["injection"]["id"] for one in record["injections"]]
-    for ack in said["flood"]:
+        assert words in replies[name], replies[name]
+    assert replies["wrong run"] == "" and replies["camera"] == b"\x89PNG\r\n\x1a\n".hex()
+    taken_in = [entry["injection"]["id"] for entry in record["injections"]]
+    for ack in replies["flood"]:
         assert (ack["id"] in taken_in) is (ack["status"] == "accepted"), ack
         assert ack["status"] == "accepted" or "are here already" in ack["reason"]
-    assert len(said["flood"]) <= 2000 and taken_in[0] == "bob"
+    assert len(replies["flood"]) <= 2000 and taken_in[0] == "bob"
     assert len(taken_in) == len(set(taken_in)) >= MAX_INJECTED
-    assert [one["injection"]["id"] for one in said["log"]["injections"]] == taken_in
-    injected_people = [sum(one["kind"] == "injected" for one in crowd) for crowd in heard["crowd"]]
+    assert [entry["injection"]["id"] for entry in replies["log"]["injections"]] == taken_in
+    injected_people = [
+        sum(person["kind"] == "injected" for person in crowd) for crowd in received["crowd"]
+    ]
     assert MAX_INJECTED // 2 < max(injected_people) <= MAX_INJECTED
     assert (
-        set(heard) == {"clock", "robot", "crowd", "signals", "events"}
-        and heard["events"][-1][-1] == "ended: failure"
+        set(received) == {"clock", "robot", "crowd", "signals", "events"}
+        and received["events"][-1][-1] == "ended: failure"
     )
-    assert heard["clock"][-1]["tick"] > bob["tick"]
-    assert any(one["id"] == "ei-bob" for crowd in heard["crowd"] for one in crowd)
+    assert received["clock"][-1]["tick"] > bob["tick"]
+    assert any(person["id"] == "ei-bob" for crowd in received["crowd"] for person in crowd)
     assert record["status"] == "done"
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr

@@ -1,5 +1,4 @@
-"""PolicyDesk: one place that queries a policy for any number of episodes, whatever carries
-requests."""
+"""PolicyDesk: queries one policy for any number of episodes, whatever carries the requests."""
 
 from __future__ import annotations
 
@@ -37,8 +36,8 @@ from tests.conftest import without_lines
 MANIFEST = Manifest("mine", camera=None, waypoints=WaypointRule(index=1))
 
 
-class Notes:
-    """A policy for one episode that notes what it is called for."""
+class RecordsCalls:
+    """A policy for one episode that records its calls."""
 
     manifest = MANIFEST
 
@@ -54,8 +53,8 @@ class Notes:
         return self.does(observation)
 
 
-class NotesMany(Notes):
-    """The same for many episodes at once."""
+class RecordsBatchCalls(RecordsCalls):
+    """A policy for many episodes that records its calls."""
 
     def on_reset(self, episode_id: str) -> None:
         self.calls.append(("on_reset", episode_id))
@@ -76,8 +75,8 @@ def act(episode: str, tick: int = 0, step: int = 0, *, reset: bool = False) -> A
     return ActRequest("r", episode, "a", step, tick, tick / 20.0, 0.0, 0.0, reset)
 
 
-def began(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
-    """A desk at which these episodes are under way."""
+def desk_with(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
+    """Return a desk at which these episodes are under way."""
     desk = PolicyDesk(policy, timer=timer)
     for episode in episodes:
         assert desk.replies([ResetRequest("r", episode, "a", 7)]) == [
@@ -86,9 +85,9 @@ def began(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
     return desk
 
 
-def of_two(does: Callable[[Sequence[Any]], Any]) -> list[PolicyReply]:
+def replies_of_two(does: Callable[[Sequence[Any]], Any]) -> list[PolicyReply]:
     """The replies to "a" and "b", which are queried together."""
-    return began(NotesMany(does), "a", "b").replies([act("a", 2), act("b", 4)])
+    return desk_with(RecordsBatchCalls(does), "a", "b").replies([act("a", 2), act("b", 4)])
 
 
 def without_line(reply: PolicyReply) -> PolicyReply:
@@ -100,28 +99,29 @@ def without_line(reply: PolicyReply) -> PolicyReply:
 
 
 def test_a_batch_is_answered_in_its_order() -> None:
-    """With the command of each, or its waypoints."""
-    assert of_two(lambda two: [Command(0.1 * one.tick, 9.0) for one in two]) == [
+    """Each episode of a batch gets its own command or waypoints."""
+    assert replies_of_two(lambda two: [Command(0.1 * one.tick, 9.0) for one in two]) == [
         ActReply("r", "a", "a", 0, 0.2, 9.0),
         ActReply("r", "b", "a", 0, 0.4, 9.0),
     ]
     rows = np.array([[[0.1, 0.0]] * 3, [[0.2, 0.0]] * 3])
-    for row, reply in zip(rows, of_two(lambda _: rows), strict=True):
+    for row, reply in zip(rows, replies_of_two(lambda _: rows), strict=True):
         assert isinstance(reply, ActReply) and reply.waypoints is not None and not reply.planned
         assert bytes(reply.waypoints.data) == row.tobytes()
 
 
-def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
-    """The other one has its answer; numbers that raise when they are read count as bad answers."""
+def test_a_bad_answer_in_a_batch_crashes_only_its_episode() -> None:
+    """The other episode gets its answer; numbers that raise when they are read count as bad
+    answers."""
 
     class Pretends(float):
         def __float__(self) -> float:
             raise SystemExit(9)
 
-    good, bad = of_two(lambda _: [STILL, Command(Pretends(1.0), 0.0)])
+    good, bad = replies_of_two(lambda _: [STILL, Command(Pretends(1.0), 0.0)])
     assert isinstance(good, ActReply)
     assert without_line(bad) == Refusal("policy", "raised SystemExit: 9")
-    good, bad = of_two(lambda _: [STILL, "left"])
+    good, bad = replies_of_two(lambda _: [STILL, "left"])
     assert isinstance(good, ActReply)
     assert bad == Refusal("policy", "answered 'left': neither a Command nor waypoints")
 
@@ -153,18 +153,18 @@ def raising(error: BaseException) -> Callable[[Any], NoReturn]:
     ],
     ids=["error", "exit", "one-too-few", "generator", "nothing"],
 )
-def test_what_is_no_answer_to_a_batch_is_the_crash_of_all_of_it(
+def test_an_invalid_batch_answer_crashes_every_episode_of_it(
     does: Callable[[Any], Any], words: str
 ) -> None:
-    """Each of them says for how many episodes the policy was queried."""
-    refused = [without_line(reply) for reply in of_two(does)]
+    """Each crash says for how many episodes the policy was queried."""
+    refused = [without_line(reply) for reply in replies_of_two(does)]
     assert refused == [Refusal("policy", words, together=2)] * 2
 
 
 def test_a_policy_for_many_episodes_gets_resets_and_ends_of_each() -> None:
-    """`on_reset` comes before the act that follows, `ended` once."""
-    policy = NotesMany(lambda some: [STILL for _ in some])
-    desk = began(policy, "a", "b")
+    """`on_reset` is called before the following act of its episode, and `ended` once."""
+    policy = RecordsBatchCalls(lambda some: [STILL for _ in some])
+    desk = desk_with(policy, "a", "b")
     policy.calls.clear()
     desk.replies([act("a", 5, reset=True), act("b", 10)])
     desk.replies([EndRequest("r", "a", "a"), EndRequest("r", "a", "a")])
@@ -172,12 +172,12 @@ def test_a_policy_for_many_episodes_gets_resets_and_ends_of_each() -> None:
     assert desk.under_way == 1
 
 
-def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(
+def test_an_on_reset_that_raises_crashes_only_its_episode(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """The others of the batch are answered; an `ended` that raises is printed and no crash."""
-    policy = NotesMany(lambda some: [STILL for _ in some])
-    desk = began(policy, "a", "bad", "c")
+    """The others of the batch are answered; an `ended` that raises is printed and is no crash."""
+    policy = RecordsBatchCalls(lambda some: [STILL for _ in some])
+    desk = desk_with(policy, "a", "bad", "c")
     first, bad, last = desk.replies([act(name, 5, reset=True) for name in ("a", "bad", "c")])
     assert (
         isinstance(first, ActReply)
@@ -191,34 +191,34 @@ def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(
     assert "LookupError: no such episode" in capfd.readouterr().err
 
 
-def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> None:
-    """The second episode finds an object busy; of a class there is one for each, which is
-    reused."""
-    made: list[Notes] = []
+def test_an_object_serves_one_episode_at_a_time_and_a_class_many() -> None:
+    """The second episode finds an object busy; a class has one instance for each, which is reused."""
+    made: list[RecordsCalls] = []
 
-    class Made(Notes):
+    class Made(RecordsCalls):
         def __init__(self) -> None:
             super().__init__()
             made.append(self)
 
-    one = began(Notes(), "a")
+    one = desk_with(RecordsCalls(), "a")
     again, other = one.replies([ResetRequest("r", name, "a", 7) for name in ("a", "b")])
     assert isinstance(again, EpisodeReply) and isinstance(other, Refusal) and other.why == "busy"
-    many = began(Made, "a", "b")
+    many = desk_with(Made, "a", "b")
     assert len(made) == 2
     many.replies([EndRequest("r", "a", "a")])
     many.replies([ResetRequest("r", "c", "a", 7)])
     assert len(made) == 2 and made[0].calls[-1] == ("reset", "c", 7)
     rgb = {"rgb": pack_array(np.zeros((2, 2, 3), np.uint8))}
-    asked = ActRequest("r", "b", "a", 0, 0, 0.0, 0.0, 0.0, arrays=rgb)
-    first, repeated, later = many.replies([asked] * 3)
+    request = ActRequest("r", "b", "a", 0, 0, 0.0, 0.0, 0.0, arrays=rgb)
+    first, repeated, later = many.replies([request] * 3)
     assert first == repeated == later and made[1].calls.count("b") == 1
 
 
 def test_a_request_that_cannot_be_decoded_is_refused() -> None:
-    """Garbage, arrays of no memory or of wrong sizes: the policy is not queried, others are."""
-    policy = Notes()
-    desk = began(policy, "a")
+    """For garbage and arrays of missing or wrong sizes the policy is not queried, and other
+    requests are answered."""
+    policy = RecordsCalls()
+    desk = desk_with(policy, "a")
     garbage = read_request(b"\x91" * 100_000)
     assert isinstance(garbage, Refusal) and desk.replies([garbage]) == [garbage]
     for array in (
@@ -226,7 +226,7 @@ def test_a_request_that_cannot_be_decoded_is_refused() -> None:
         PackedArray("|u1", (9, 9)),
         PackedArray("<f8", (1,)),
     ):
-        desk = began(policy, "a")
+        desk = desk_with(policy, "a")
         (refused,) = desk.replies(
             [ActRequest("r", "a", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": array})]
         )
@@ -235,7 +235,7 @@ def test_a_request_that_cannot_be_decoded_is_refused() -> None:
 
 
 class ToDesk:
-    """Carries requests to a desk of this process."""
+    """Carries requests to a desk in this process."""
 
     can_lose_episodes = True
 
@@ -262,15 +262,15 @@ def hosted(policy: Any) -> HostedCaller:
     return HostedCaller(HostedPolicy(MANIFEST, ToDesk(policy), "r"), "remote", "")
 
 
-def seen(tick: int, *, reset: bool = False) -> Observation:
+def observation_at(tick: int, *, reset: bool = False) -> Observation:
     return Observation(tick, tick / 20.0, None, 0.5, 0.0, COURIER, episode="bad", reset=reset)
 
 
-def test_a_plan_with_its_command_stays_one() -> None:
-    """An answer that is a command with the waypoints it follows keeps both, as in this process."""
+def test_a_command_keeps_the_waypoints_that_it_follows() -> None:
+    """An answer that is a command with its waypoints keeps both, as in this process."""
     plan = np.array([[1.0, 0.0], [2.0, 0.5]], np.float32)
-    driver = hosted(Notes(lambda _: WaypointCommand(0.5, 0.1, plan, 1)))
+    driver = hosted(RecordsCalls(lambda _: WaypointCommand(0.5, 0.1, plan, 1)))
     driver.reset("a", 0)
-    command = driver.act(seen(0))
+    command = driver.act(observation_at(0))
     assert isinstance(command, WaypointCommand) and (command.v_mps, command.w_radps) == (0.5, 0.1)
     assert command.waypoints.tobytes() == plan.tobytes() and command.index == 1

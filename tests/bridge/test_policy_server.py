@@ -1,5 +1,4 @@
-"""Policies behind Zenoh: questions and answers over real sessions, without an engine of the
-street."""
+"""Policies behind Zenoh: queries and replies over real sessions, without an engine of the street."""
 
 from __future__ import annotations
 
@@ -52,13 +51,13 @@ RGB = np.arange(40 * 64 * 3, dtype=np.uint8).reshape(40, 64, 3)
 
 TIMES = ServerTimes()
 SOON = ServerTimes(lost_after_s=0.3)
-"""A server that is not reached for a moment is gone."""
+"""Times that count a server as lost after a short interruption."""
 SIZES = {"most": (50_000, 2), "many": (50_001, 2), "far too many": (2_000_000, 2)}
 
 
 class Counting:
-    """Its speed is the number of the question in its episode, in tenths; in some it does what they
-    are called."""
+    """A policy whose speed is the number of the query in its episode, in tenths; named episodes
+    misbehave as their names say."""
 
     manifest: ClassVar = {
         "name": "counting",
@@ -68,14 +67,14 @@ class Counting:
     }
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
+        self.queried: list[str] = []
 
     def reset(self, episode_id: str, seed: int) -> None:
         self.count = 0
 
     def act(self, seen: Any) -> Any:
         self.count += 1
-        self.asked.append(seen.episode)
+        self.queried.append(seen.episode)
         self.seen = seen
         if seen.episode == "raises":
             raise KeyError("no such weight")
@@ -91,7 +90,7 @@ class Counting:
 
 
 class Together(Counting):
-    """The same for many episodes at once; notes how many it was asked for."""
+    """The same for many episodes at once; records the batch sizes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -111,7 +110,7 @@ class Together(Counting):
         return [np.full((3, 2), [self.counts[one.episode] / 40.0, 0.0]) for one in observations]
 
 
-def seen_at(tick: int, episode: str = "k1") -> Observation:
+def observation_at(tick: int, episode: str = "k1") -> Observation:
     return Observation(
         tick,
         tick / 20.0,
@@ -139,7 +138,7 @@ def hub(tmp_path: Path) -> Iterator[Connection]:
 def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> Iterator[None]:
     """A policy served by a thread of this process, until the block ends."""
     session = open_session(at)
-    heard: list[Any] = []
+    handlers: list[Any] = []
 
     class Ending:
         """The session, whose end ends the serving thread, too."""
@@ -147,7 +146,7 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
         def declare_queryable(
             self, key: str, handler: Callable[[Any], None], complete: bool
         ) -> Any:
-            heard.append(handler)
+            handlers.append(handler)
             return session.zenoh_session.declare_queryable(key, handler, complete=complete)
 
     def run() -> None:
@@ -157,10 +156,10 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        wait_until(lambda: len(heard) == 4)
+        wait_until(lambda: len(handlers) == 4)
         yield
     finally:
-        heard[1](None)  # no query: the end
+        handlers[1](None)  # no query: the end
         thread.join(PATIENCE_S)
         session.close()
 
@@ -177,14 +176,14 @@ def driver_at(
 
 
 @pytest.mark.engine
-def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
-    """It is given the picture, goal and calibration to the bit; what it raises or answers wrongly
-    is its crash, in the words of one in this process; and how long it took is told."""
+def test_a_remote_policy_is_queried_like_a_local_one(hub: Connection) -> None:
+    """Picture, goal and calibration arrive to the bit, exceptions and bad answers crash with the
+    same messages, and durations are reported."""
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver:
         assert (driver.runs, driver.manifest.camera, driver.at_once) == ("remote", SPEC, 1)
         driver.reset("k1", 7)
-        assert [driver.act(seen_at(tick)) for tick in (0, 5)] == [
+        assert [driver.act(observation_at(tick)) for tick in (0, 5)] == [
             Command(0.1, 0.0),
             Command(0.2, 0.0),
         ]
@@ -199,7 +198,7 @@ def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
             and policy.seen.robot.v_max_mps == COURIER.v_max_mps
         )
         assert driver.clock.keys() == {"answer_median_ms", "answer_p95_ms"}
-        told = {
+        expected = {
             "raises": r"'counting' raised KeyError: 'no such weight' in test_policy_server\.py:\d+ \(act at 0\.25 s\)",
             "nan": "answered Command.v_mps=nan, w_radps=0.0.: both must be finite",
             "words": "answered 'left': neither a Command nor waypoints",
@@ -208,30 +207,30 @@ def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
         }
         driver.ended()
         driver.reset("most", 7)
-        assert driver.act(seen_at(5, "most")).v_mps == 0.0
+        assert driver.act(observation_at(5, "most")).v_mps == 0.0
         driver.ended()
-        for name, words in told.items():
+        for name, words in expected.items():
             driver.reset(name, 7)
             with pytest.raises(PolicyError, match=words):
-                driver.act(seen_at(5, name))
+                driver.act(observation_at(5, name))
             driver.ended()
 
 
 @pytest.mark.engine
-def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(hub: Connection) -> None:
+def test_a_repeated_step_is_answered_from_the_cache(hub: Connection) -> None:
     """A repeated query of a step is answered from the cache."""
     policy = Counting()
     with served(hub, policy), driver_at(hub, times=ServerTimes(try_s=0.2)) as driver:
         driver.reset("slow", 7)
-        assert [driver.act(seen_at(tick, "slow")) for tick in (0, 5)] == [
+        assert [driver.act(observation_at(tick, "slow")) for tick in (0, 5)] == [
             Command(0.1, 0.0),
             Command(0.2, 0.0),
         ]
-    assert policy.asked == ["slow", "slow"]
+    assert policy.queried == ["slow", "slow"]
 
 
 @pytest.mark.engine
-def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
+def test_a_link_cut_during_a_long_query_is_waited_for(
     hub: Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server is lost a fixed time after its link was cut, however long its answer took before."""
@@ -248,36 +247,36 @@ def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
     with served(hub, Counting()), driver_at(hub, times=SOON) as driver:
         driver.reset("k1", 7)
         monkeypatch.setattr(Session, "query_once", cut_once)
-        assert driver.act(seen_at(0)) == Command(0.1, 0.0)
+        assert driver.act(observation_at(0)) == Command(0.1, 0.0)
 
 
 @pytest.mark.engine
 def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None:
-    """Eight environments ask one policy with act_batch: each gets the answers of its own episode,
-    some were asked together, and nothing is remembered of those that have ended."""
+    """Eight environments share one policy with act_batch; each gets its own answers, some in one
+    batch, and ended episodes are forgotten."""
     policy = Together()
 
-    def drive(name: str, came: list[float]) -> None:
+    def drive(name: str, speeds_of: list[float]) -> None:
         with driver_at(hub, "together", run=name) as driver:
             driver.reset(name, 1)
-            came += [driver.act(seen_at(tick, name)).v_mps for tick in range(6)]
+            speeds_of += [driver.act(observation_at(tick, name)).v_mps for tick in range(6)]
             driver.ended()
 
-    came: list[list[float]] = [[] for _ in range(8)]
+    speeds_of: list[list[float]] = [[] for _ in range(8)]
     with served(hub, policy, "together"):
-        threads = [threading.Thread(target=drive, args=(f"k{i}", came[i])) for i in range(8)]
+        threads = [threading.Thread(target=drive, args=(f"k{i}", speeds_of[i])) for i in range(8)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join(PATIENCE_S)
-    assert all(speeds == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]) for speeds in came)
+    assert all(speeds == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]) for speeds in speeds_of)
     assert sum(policy.batches) == 48 and max(policy.batches) > 1 and not policy.counts
 
 
 @pytest.mark.engine
-def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Connection) -> None:
-    """Of two, the one with less to do takes the next episode; runs of the same seed are kept apart;
-    one that is of another policy is refused."""
+def test_servers_of_one_name_share_the_episodes(hub: Connection) -> None:
+    """The less busy of two servers takes the next episode; runs of one seed stay separate; a server
+    of another policy is refused."""
     one, other = Together(), Together()
     with served(hub, one, "together"):
         with (
@@ -287,7 +286,7 @@ def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Conn
         ):
             for driver in (a, b):
                 driver.reset("k1", 1)
-                driver.act(seen_at(0))
+                driver.act(observation_at(0))
             assert (len(one.batches), len(other.batches)) == (1, 1)
             for driver in (a, b):
                 driver.ended()
@@ -299,45 +298,48 @@ def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Conn
 
 
 @pytest.mark.engine
-def test_a_server_begun_anew_has_lost_the_episode(hub: Connection) -> None:
+def test_a_restarted_server_has_lost_its_episode(hub: Connection) -> None:
     """A restarted server has lost its episode, which starts again."""
     with driver_after(hub) as driver:
         with served(hub, Counting()):
             driver.reset("k1", 7)
-            driver.act(seen_at(0))
+            driver.act(observation_at(0))
         with pytest.raises(PolicyServerLost, match="is gone"):
-            driver.act(seen_at(5))
+            driver.act(observation_at(5))
         with served(hub, Counting()):
             with pytest.raises(PolicyServerLost, match="is gone"):
-                driver.act(seen_at(5))
+                driver.act(observation_at(5))
             driver.reset("k1", 7)
-            assert driver.act(seen_at(0)) == Command(0.1, 0.0)
+            assert driver.act(observation_at(0)) == Command(0.1, 0.0)
 
 
 @pytest.mark.engine
-def test_a_server_that_listens_has_lost_its_episode_as_soon_as_another_listens_there(
+def test_a_listening_server_is_lost_as_soon_as_another_takes_its_endpoint(
     tmp_path: Path,
 ) -> None:
-    """However long a link may be cut: nobody answers in its place any more."""
+    """The episode is lost at once, without waiting for the time that a cut link is allowed."""
     times = ServerTimes(lost_after_s=PATIENCE_S)
-    there = Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")
+    address = Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")
     with ExitStack() as stack:
-        with open_session(there) as first, served(first.inside, Counting(), listen=there.listen):
-            run = Connection(role="coordinator", connect=there.listen)
+        with (
+            open_session(address) as first,
+            served(first.inside, Counting(), listen=address.listen),
+        ):
+            run = Connection(role="coordinator", connect=address.listen)
             driver = remote_caller(
                 "zenoh:counting", PolicyHost(servers=(run,), run="run1"), times=times
             )
             stack.callback(driver.close)
             driver.reset("k1", 7)
-            driver.act(seen_at(0))
-        stack.enter_context(open_session(there))
+            driver.act(observation_at(0))
+        stack.enter_context(open_session(address))
         with pytest.raises(PolicyServerLost, match="is gone"):
-            driver.act(seen_at(5))
+            driver.act(observation_at(5))
 
 
 @contextmanager
 def driver_after(hub: Connection) -> Iterator[RemoteCaller]:
-    """A driver that has seen a server, which is gone again."""
+    """A driver that has seen a server that is now gone."""
     with served(hub, Counting()):
         driver = remote_caller("zenoh:counting", PolicyHost(servers=(hub,), run="run1"), times=SOON)
     try:
@@ -347,9 +349,9 @@ def driver_after(hub: Connection) -> Iterator[RemoteCaller]:
 
 
 @pytest.mark.engine
-def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection) -> None:
-    """Garbage, another step, another attempt, another kind of answer: in words, and never taken for
-    an answer."""
+def test_a_wrong_reply_of_a_server_is_a_policy_crash(hub: Connection) -> None:
+    """Garbage, another step, attempt or kind of reply is reported with a reason, and never taken
+    for an answer."""
     wrong: dict[str, Callable[[ActRequest], bytes]] = {
         "sent what is no answer": lambda one: b"\xc1 no message",
         "answered step 7 of 'k1' instead of step 0": lambda one: answer_to(one, step=7),
@@ -362,42 +364,43 @@ def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection)
         "answered step -1 of 'k1' instead of step 0": begin,
     }
     for words, answer in wrong.items():
-        with liar(hub, answer), driver_at(hub, "wrong") as driver:
+        with faulty_server(hub, answer), driver_at(hub, "wrong") as driver:
             driver.reset("k1", 7)
             with pytest.raises(PolicyError, match=f"policy 'wrong' {words}"):
-                driver.act(seen_at(0))
+                driver.act(observation_at(0))
 
 
-def answer_to(one: ActRequest, **other: Any) -> bytes:
+def answer_to(request: ActRequest, **other: Any) -> bytes:
     return encode_message(
-        msgspec.structs.replace(ActReply(*one.signature, one.step, 1.0, 0.0), **other)
+        msgspec.structs.replace(ActReply(*request.signature, request.step, 1.0, 0.0), **other)
     )
 
 
-def begin(one: ActRequest | ResetRequest) -> bytes:
-    return encode_message(EpisodeReply(*one.signature))
+def begin(request: ActRequest | ResetRequest) -> bytes:
+    return encode_message(EpisodeReply(*request.signature))
 
 
 @contextmanager
-def liar(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Session]:
-    """A server that begins as it should, and answers as it likes."""
+def faulty_server(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Session]:
+    """A server that begins correctly and then replies as given."""
     info = PolicyInfo("s", "wrong", {"name": "wrong"})
     below = policy_key("default", "wrong", "s")
     with open_session(hub) as session:
         session.serve(f"{below}/info", lambda _: encode_message(info), found=True)
         session.serve(
-            f"{below}/reset", lambda asked: begin(msgspec.msgpack.decode(asked, type=ResetRequest))
+            f"{below}/reset",
+            lambda payload: begin(msgspec.msgpack.decode(payload, type=ResetRequest)),
         )
         session.serve(
-            f"{below}/act", lambda asked: answer(msgspec.msgpack.decode(asked, type=ActRequest))
+            f"{below}/act", lambda payload: answer(msgspec.msgpack.decode(payload, type=ActRequest))
         )
         yield session
 
 
 @pytest.mark.engine
-def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -> None:
-    """Garbage, depth without end, an episode that did not begin, a question to everybody: refused;
-    a run goes on."""
+def test_foreign_messages_are_refused_and_change_nothing(hub: Connection) -> None:
+    """Garbage, endless nesting, unknown episodes and wildcard queries are refused, and a run
+    continues."""
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver, open_session(hub) as stranger:
         driver.reset("k1", 7)
@@ -412,19 +415,19 @@ def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -
             b"\x91" * 100_000,
             encode_message(ActRequest(*sign, 0, 0, 0.0, 0.0, 0.0)),
         ):
-            heard = stranger.query_once(key, payload, timeout_s=PATIENCE_S)
-            assert heard.outcome == "refused" and isinstance(decode_reply(heard.payload), Refusal)
+            reply = stranger.query_once(key, payload, timeout_s=PATIENCE_S)
+            assert reply.outcome == "refused" and isinstance(decode_reply(reply.payload), Refusal)
         everybody = key.rpartition("/")[0].rpartition("/")[0] + "/**"
         assert stranger.query_once(everybody, b"", timeout_s=PATIENCE_S).outcome in (
             "refused",
             "answered",
         )
-        assert driver.act(seen_at(0)) == Command(0.1, 0.0) and policy.asked == ["k1"]
+        assert driver.act(observation_at(0)) == Command(0.1, 0.0) and policy.queried == ["k1"]
 
 
 @pytest.mark.engine
-def test_pictures_come_as_jpeg_to_who_asks_for_that(hub: Connection) -> None:
-    """Nearly the same pixels, and every row will say so."""
+def test_pictures_come_as_jpeg_on_request(hub: Connection) -> None:
+    """Pixels are nearly the same, and every row records the compression."""
     policy = Counting()
     smooth = np.tile(np.linspace(0, 255, 64, dtype=np.uint8)[None, :, None], (40, 1, 3))
     with served(hub, policy, jpeg=True), driver_at(hub) as driver:
@@ -438,9 +441,9 @@ def test_pictures_come_as_jpeg_to_who_asks_for_that(hub: Connection) -> None:
 
 
 @pytest.mark.engine
-def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> None:
-    """Nobody there, no endpoint, one that knows everything, too many jobs for an object: before
-    anything is started."""
+def test_an_unusable_policy_server_is_refused_with_a_reason(hub: Connection) -> None:
+    """No server, no endpoint, a privileged policy and too many jobs for an object are refused
+    before anything starts."""
     at = PolicyHost(servers=(hub,))
     with pytest.raises(MachineError, match="no server of policy 'counting' at unixsock"):
         remote_caller("zenoh:counting", at, times=ServerTimes(first_found_s=0.2))
@@ -478,8 +481,9 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
         inspected_caller("zenoh:counting", at)
 
 
-def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:
-    """`serve` refuses it, and no endpoint, and two, and a name that cannot stand in a key."""
+def test_a_server_beyond_this_machine_needs_tls_or_insecure() -> None:
+    """`serve` refuses open endpoints without either, no endpoint, two endpoints, and a name that
+    does not fit a key."""
     with pytest.raises(
         ValueError, match="is beyond this machine and unguarded: anyone who can reach it may query"
     ):
@@ -496,9 +500,9 @@ def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() 
 
 
 @pytest.mark.engine
-def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) -> None:
-    """Two processes, one listening and one connecting to it, answer for one policy with what cosim
-    gives policies; one that is told what the simulator knows is refused."""
+def test_several_cosim_serve_processes_answer_for_one_policy(tmp_path: Path) -> None:
+    """One process listens and another connects to it; a policy with privileged knowledge is
+    refused."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     words = [
         sys.executable,
@@ -529,7 +533,7 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
             servers.close()
             driver = remote_caller("zenoh:both", PolicyHost(servers=(at,), run="r"))
             driver.reset("k1", 1)
-            assert driver.act(seen_at(0)).v_mps == pytest.approx(1.0 + RGB.mean() / 1e4)
+            assert driver.act(observation_at(0)).v_mps == pytest.approx(1.0 + RGB.mean() / 1e4)
             driver.close()
             one.send_signal(signal.SIGINT)
             assert one.wait(PATIENCE_S) == 130
@@ -538,14 +542,14 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
             other.kill()
 
 
-def test_a_policy_that_knows_everything_is_not_served(cosim: Cosim) -> None:
-    """Nor is there an endpoint for a policy of this machine: in a line."""
-    said = cosim("serve", "route")
-    assert said.returncode == 2 and "a remote one gets only observations" in said.stderr
-    said = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
+def test_a_privileged_policy_is_not_served(cosim: Cosim) -> None:
+    """`serve` refuses it, and a run refuses an endpoint for a local policy, each in one line."""
+    result = cosim("serve", "route")
+    assert result.returncode == 2 and "a remote one gets only observations" in result.stderr
+    result = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
     assert (
-        said.returncode == 2
-        and "--policy-at goes with --policy zenoh:NAME, not with 'stop'" in said.stderr
+        result.returncode == 2
+        and "--policy-at goes with --policy zenoh:NAME, not with 'stop'" in result.stderr
     )
-    said = cosim("serve", "stop", "--listen", "tcp/0.0.0.0:7449")
-    assert said.returncode == 2 and "is beyond this machine and unguarded" in said.stderr
+    result = cosim("serve", "stop", "--listen", "tcp/0.0.0.0:7449")
+    assert result.returncode == 2 and "is beyond this machine and unguarded" in result.stderr

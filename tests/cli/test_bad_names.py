@@ -1,5 +1,4 @@
-"""Names of files and folders that cannot be: one clear line, exit code 2, before any work is
-done."""
+"""Impossible names of files and folders: one clear line and exit code 2 before any work."""
 
 from __future__ import annotations
 
@@ -41,13 +40,13 @@ READS: tuple[tuple[str, ...], ...] = (
 def test_a_name_that_is_too_long_is_refused_in_one_line(
     tmp_path: Path, cosim: Cosim, words: tuple[str, ...]
 ) -> None:
-    """Whatever it names, to be written or read: exit code 2, no traceback, and nothing is left."""
+    """Any too long name, read or written, gives exit code 2, no traceback, and leaves no file."""
     (tmp_path / "mine.toml").write_text(
         'name = "mine"\n[place]\ncity = 1\n[way]\nkind = "straight"\n'
     )
-    said = cosim(*words, cwd=tmp_path)
-    assert said.returncode == 2, said
-    assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
+    result = cosim(*words, cwd=tmp_path)
+    assert result.returncode == 2, result
+    assert result.stderr.strip().splitlines()[-1].startswith("error: "), result
     assert {path.name for path in tmp_path.iterdir()} == {"mine.toml"}
 
 
@@ -65,11 +64,11 @@ FOLDERS: tuple[tuple[str, ...], ...] = (
 def test_a_file_in_the_place_of_a_folder_is_refused_in_one_line(
     tmp_path: Path, cosim: Cosim, words: tuple[str, ...]
 ) -> None:
-    """Of certificates, of a run, of data: the file stays as it was."""
+    """A file in place of a folder of certificates, of a run or of data stays as it was."""
     (tmp_path / "file").write_text("mine")
-    said = cosim(*words, cwd=tmp_path)
-    assert said.returncode in (2, 3), said
-    assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
+    result = cosim(*words, cwd=tmp_path)
+    assert result.returncode in (2, 3), result
+    assert result.stderr.strip().splitlines()[-1].startswith("error: "), result
     assert {path.name for path in tmp_path.iterdir()} == {"file"} and (
         tmp_path / "file"
     ).read_text() == "mine"

@@ -1,4 +1,4 @@
-"""Exit codes of the command line: one meaning each."""
+"""Exit codes of the command line, each with one meaning."""
 
 from __future__ import annotations
 
@@ -37,8 +37,7 @@ def ended(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
 
 
 def test_every_error_has_its_exit_code() -> None:
-    """Each class of the tree has one code, and the tree in the module's docstring tells the
-    same."""
+    """Each error class has one code, and the tree in the module's docstring agrees."""
     assert {name: vars(errors)[name].exit_code for name in CODES} == CODES
     classes = {
         name
@@ -76,8 +75,8 @@ def test_every_error_has_its_exit_code() -> None:
 def test_wrong_use_is_2_and_the_machine_is_3(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], code: int
 ) -> None:
-    """A name, an option, a suite file, a map, a run folder: 2; a place that cannot be written: 3;
-    else 0."""
+    """A wrong name, option, suite file, map or run folder gives 2, an unwritable place 3, and
+    success 0."""
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     Path("broken.json").write_text(json.dumps({"name": 3}))
@@ -91,11 +90,10 @@ def test_wrong_use_is_2_and_the_machine_is_3(
     [(CosimError("x"), 3), (errors.PolicyError("x"), 1), (KeyboardInterrupt(), 130)],
     ids=["an-engine", "a-policy", "ctrl-c"],
 )
-def test_what_a_command_raises_is_its_exit_code(
+def test_a_raised_error_decides_the_exit_code(
     monkeypatch: pytest.MonkeyPatch, raised: BaseException, code: int
 ) -> None:
-    """An error that reaches the command line ends it with the code of its class; Ctrl-C with
-    130."""
+    """An error that reaches the command line gives the code of its class, and Ctrl-C 130."""
 
     def raises(*_: object) -> None:
         raise raised
@@ -107,7 +105,7 @@ def test_what_a_command_raises_is_its_exit_code(
 def test_a_run_with_fewer_records_than_scenarios_is_no_success(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """However it came about, the scenarios without a record are named and the exit code is 1."""
+    """Scenarios without a record are named and the exit code is 1, whatever the cause."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("scenarios.runs.run.run_all", lambda *_, **__: None)
     words = ("run", "reactive", "--policy", "orca", "--episodes", "2", "--out", "run")

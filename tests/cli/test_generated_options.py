@@ -1,5 +1,5 @@
-"""Options that commands make from the fields of a config, and what a run refuses before it builds
-anything."""
+"""Options that commands generate from the fields of a config, and the checks of a run before it
+builds anything."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _SOME = Fields(
 )
 
 
-def said(*words: str) -> tuple[int, str, list[RunConfig]]:
-    """Exit code, output and configs of a command with some of the options of a run."""
+def output_of(*words: str) -> tuple[int, str, list[RunConfig]]:
+    """Return exit code, output and configs of a command with some options of a run."""
     taken: list[RunConfig] = []
 
     @configured
     def command(config: Annotated[RunConfig, _SOME], more: int = 0) -> None:
-        """Do it."""
+        """Run it."""
         taken.append(config)
 
     app = typer.Typer(add_completion=False)
@@ -42,18 +42,19 @@ def said(*words: str) -> tuple[int, str, list[RunConfig]]:
     return done.exit_code, done.output, taken
 
 
-def test_a_command_has_the_fields_it_takes_with_its_own_words_and_defaults() -> None:
-    """Others are left out or hidden, what is required says so, and its own options are kept."""
-    code, text, _ = said("--help")
+def test_a_command_has_its_fields_with_its_own_help_and_defaults() -> None:
+    """Other fields are omitted or hidden, required ones are marked, and the command's own options
+    remain."""
+    code, text, _ = output_of("--help")
     assert code == 0 and "Somewhere." in text and "--more" in text and "[default: orca]" in text
     assert "--latency" not in text and "--seed" not in text and "[required]" in text
-    assert said("unit")[0] == 2
+    assert output_of("unit")[0] == 2
 
 
-def test_what_was_typed_is_the_config() -> None:
-    """Repeated options are a tuple, flags are truth values, what is not an option has its
+def test_typed_options_become_the_config() -> None:
+    """Repeated options are a tuple, flags are booleans, and fields without an option have their
     default."""
-    code, text, taken = said(
+    code, text, taken = output_of(
         "unit", "--event", "a", "--event", "b", "--out", "x", "--real-time", "--seed", "7"
     )
     assert code == 0, text
@@ -64,7 +65,7 @@ def test_what_was_typed_is_the_config() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "told"),
+    ("fields", "expected"),
     [
         ({"resume": True}, "--resume needs --out"),
         ({"shard": "1/2", "latency": "measured"}, "--shard with --latency measured"),
@@ -72,16 +73,14 @@ def test_what_was_typed_is_the_config() -> None:
     ],
     ids=["resume", "shard", "roughness"],
 )
-def test_values_that_contradict_each_other_are_refused(
-    fields: dict[str, object], told: str
-) -> None:
-    """Before anything is loaded, by the names of the options."""
-    with pytest.raises(UsageError, match=told):
+def test_contradictory_values_are_refused(fields: dict[str, object], expected: str) -> None:
+    """The options are named before anything is loaded."""
+    with pytest.raises(UsageError, match=expected):
         RunConfig(suite="unit", **fields)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "expected"),
     [
         ((), "used already holds a run. Add --resume to finish it"),
         (("--resume",), "used is of another run: its suite is s, and this command has reactive"),
@@ -90,11 +89,15 @@ def test_values_that_contradict_each_other_are_refused(
     ids=["new", "resumed", "on a map"],
 )
 def test_a_folder_of_another_run_is_refused_before_a_city_is_built(
-    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...], told: str
+    tmp_path: Path,
+    cosim: Cosim,
+    monkeypatch: pytest.MonkeyPatch,
+    more: tuple[str, ...],
+    expected: str,
 ) -> None:
-    """At once: the cache in which cities are built stays empty."""
+    """The refusal comes while the cache in which cities are built is still empty."""
     run_of(tmp_path / "used", ["goal"])
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     refused = cosim("run", "reactive", "--policy", "straight", "--out", "used", *more, cwd=tmp_path)
-    assert refused.returncode == 2 and told in refused.stderr, refused
+    assert refused.returncode == 2 and expected in refused.stderr, refused
     assert not [*(tmp_path / "cache").glob("**/*.net.xml*")]

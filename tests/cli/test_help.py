@@ -1,5 +1,4 @@
-"""What the command line says of itself: help with examples, versions; no engine is started for
-it."""
+"""Help and versions of the command line, which start no engine."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from tests.conftest import PATIENCE_S
 
 
 def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Every command below a group, with the words that call it."""
+    """Yield every command below a group, with the words that call it."""
     for name, command in getattr(group, "commands", {}).items():
         if hasattr(command, "commands"):
             yield from commands(command, (*words, name))
@@ -32,8 +31,8 @@ def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[st
 COMMANDS = dict(commands(get_command(app)))
 
 
-def said(*words: str) -> str:
-    """What `cosim WORDS` prints in a terminal of 80 columns."""
+def output_of(*words: str) -> str:
+    """Return what `cosim WORDS` prints in a terminal of 80 columns."""
     result = CliRunner().invoke(
         app, list(words), terminal_width=80, color=False, env={"COLUMNS": "80"}
     )
@@ -43,8 +42,7 @@ def said(*words: str) -> str:
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_every_command_has_an_example_of_itself(words: tuple[str, ...]) -> None:
-    """The help ends with an example that begins with the command, and each example's options
-    exist."""
+    """The help ends with an example that begins with the command and uses only existing options."""
     epilog = COMMANDS[words].epilog or ""
     examples = re.findall(r"`(cosim [^`]+)`", epilog)
     own = [example for example in examples if example.startswith(" ".join(("cosim", *words)))]
@@ -55,27 +53,25 @@ def test_every_command_has_an_example_of_itself(words: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize("words", [(), ("city",), ("map",), *COMMANDS], ids=" ".join)
-def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
-    """No line is longer, nothing is cut, and no list of choices is broken in the middle of a
-    word."""
-    lines = said(*words, "--help").splitlines()
+def test_help_fits_80_columns(words: tuple[str, ...]) -> None:
+    """No line is longer, nothing is cut, and no list of choices is broken within a word."""
+    lines = output_of(*words, "--help").splitlines()
     assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)
     assert not re.findall(r"<[a-z0-9_|-]*[|][a-z0-9_|-]*(?![a-z0-9_|>-])", "\n".join(lines))
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_maps_in_examples_are_there_or_imported_by_them(words: tuple[str, ...]) -> None:
+def test_maps_in_examples_exist_or_are_imported_by_them() -> None:
     """Every map in an example comes with SUMO or is imported by an example."""
-    named = re.findall(
-        r"(?:--map|map check|map endure) ([a-z][\w-]*)", COMMANDS[words].epilog or ""
-    )
+    examples = "\n".join(command.epilog or "" for command in COMMANDS.values())
+    named = re.findall(r"(?:--map|map check|map endure) ([a-z][\w-]*)", examples)
     imported = re.findall(r"map import ([\w-]+)[.]", COMMANDS["map", "import"].epilog)
-    assert all(name.startswith("sumo-") or name in imported for name in named), named
+    assert named and imported
+    assert [name for name in named if name not in imported and not name.startswith("sumo-")] == []
 
 
-def test_the_version_is_said_without_an_engine() -> None:
-    """`cosim --version` names the project, Python and the engines; it imports no engine and no
+def test_the_version_is_printed_without_an_engine() -> None:
+    """`cosim --version` names the project, Python and the engines without importing any engine or
     pandas."""
     code = (
         "import sys\nfrom typer.testing import CliRunner\nfrom cosim.cli.app import "
@@ -101,10 +97,10 @@ def test_the_version_is_said_without_an_engine() -> None:
         assert f"{name} {version(package)}" in text
 
 
-def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(
+def test_the_version_of_a_missing_engine_is_shown_as_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """`cosim --version` is for a broken machine too."""
+    """`cosim --version` also works on a broken machine."""
     from importlib.metadata import PackageNotFoundError
 
     from cosim.core import versions
@@ -115,7 +111,7 @@ def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(
         return "1.2"
 
     monkeypatch.setattr(versions, "version", without)
-    assert "PyBullet missing" in said("--version") and "SUMO 1.2" in said("--version")
+    assert "PyBullet missing" in output_of("--version") and "SUMO 1.2" in output_of("--version")
 
 
 @pytest.mark.parametrize(
@@ -130,8 +126,8 @@ def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(
         "ftp/a:1",
     ],
 )
-def test_an_endpoint_that_can_be_none_is_refused_with_an_example(endpoint: str) -> None:
-    """Before anything is tried: a protocol, an address, a port from 1 to 65535."""
+def test_an_invalid_endpoint_is_refused_with_an_example(endpoint: str) -> None:
+    """An endpoint needs a protocol, an address, and a port from 1 to 65535, which is checked first."""
     with pytest.raises(UsageError, match=r"like tcp/127\.0\.0\.1:7447"):
         checked_endpoint(endpoint, "--connect")
 
@@ -139,6 +135,6 @@ def test_an_endpoint_that_can_be_none_is_refused_with_an_example(endpoint: str) 
 @pytest.mark.parametrize(
     "endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:1", "tls/host:65535", "unixsock-stream//tmp/a"]
 )
-def test_an_endpoint_that_may_be_one_is_taken(endpoint: str) -> None:
-    """Names, addresses of both kinds, sockets in the file system."""
+def test_a_valid_endpoint_is_accepted(endpoint: str) -> None:
+    """Names, IPv4 and IPv6 addresses, and sockets in the file system are accepted."""
     assert checked_endpoint(endpoint, "--connect") == endpoint

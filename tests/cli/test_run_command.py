@@ -1,4 +1,4 @@
-"""`cosim run` as a newcomer uses it: a policy by its file, what is printed, what to do next."""
+"""`cosim run` as a newcomer uses it: a policy from its file, the output, and the next steps."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Far:
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a suite of one short scenario, and a policy in a folder of its own, beside what
-    it imports."""
-    folder = tmp_path_factory.mktemp("desk")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a suite of one short scenario, and a policy in its own folder with a module
+    that it imports."""
+    folder = tmp_path_factory.mktemp("workspace")
     one = msgspec.structs.replace(small_scenario(), id="n-0", time_limit_s=1.0)
     write_suite(Suite(name="one", version="1", scenarios=(one,)), folder / "one.json")
     (folder / "deeper").mkdir()
@@ -64,8 +64,8 @@ limits = {time_s = 1}
 
 @pytest.mark.engine
 def test_every_command_that_runs_a_policy_can_isolate_it(tmp_path: Path, cosim: Cosim) -> None:
-    """It cannot read beyond its folder in runs, checks and collections; --policy-data shows it
-    more."""
+    """In runs, checks and collections it cannot read beyond its folder; --policy-data adds a
+    folder."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/peeks.py").write_text(PEEKS)
     (tmp_path / "secret.txt").write_text("secret")
@@ -78,15 +78,15 @@ def test_every_command_that_runs_a_policy_can_isolate_it(tmp_path: Path, cosim: 
         "collect": ("collect", "s.json", "--policy", name, "--unsolved", "--out", "demos"),
     }
     for command in commands.values():
-        said = cosim(*command, "--isolated", cwd=tmp_path)
-        assert said.returncode == 2 and "--policy-data" in said.stderr, (command, said.stderr)
+        result = cosim(*command, "--isolated", cwd=tmp_path)
+        assert result.returncode == 2 and "--policy-data" in result.stderr, (command, result.stderr)
     shown = ("--isolated", "--policy-data", "secret.txt")
-    said = cosim(*commands["own"], *shown, cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim(*commands["own"], *shown, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     spec = json.loads((tmp_path / "own/run.json").read_text())
     assert spec["policy_runs"] in ("isolated: namespaces", "isolated: landlock")
-    said = cosim(*commands["check"], *shown, cwd=tmp_path)
-    assert said.returncode in (0, 1) and "peeks" in said.stdout, said.stderr
+    result = cosim(*commands["check"], *shown, cwd=tmp_path)
+    assert result.returncode in (0, 1) and "peeks" in result.stdout, result.stderr
 
 
 MEMORY = """
@@ -119,7 +119,8 @@ first one."""
 
 @pytest.mark.engine
 def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosim: Cosim) -> None:
-    """A policy that remembers does not recognize a decoy, with one process per half of the run."""
+    """A policy with memory cannot recognize a decoy, because each half of the run has its own
+    process."""
     (tmp_path / "memory.py").write_text(MEMORY)
     nobody = CrowdSpec(persons=0, vehicles=0)
     small = msgspec.structs.replace(small_scenario(), time_limit_s=0.5, crowd=nobody)
@@ -135,8 +136,8 @@ def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosi
         halves = [{one.id: drives_second(seed, one) for one in those} for those in (events, decoys)]
         assert all(halves[0][one.decoy_of] != halves[1][one.id] for one in decoys)
     words = ("--policy", "memory.py:Memory", "--seed", "1", "--jobs", "1", "--out", "run")
-    said = cosim("run", "pairs.json", *words, cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim("run", "pairs.json", *words, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     rows = [line.split() for line in (tmp_path / "seen.txt").read_text().splitlines()]
     places = Counter(place for place, _, _ in rows)
     assert sorted(places.values()) == [2, 2, 2]
@@ -145,34 +146,34 @@ def test_no_process_of_a_policy_runs_both_members_of_a_pair(tmp_path: Path, cosi
 
 
 @pytest.mark.engine
-def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim) -> None:
-    """Also in processes that only inherit where it is: isolated ones. The run goes on by any
-    spelling, until edited."""
-    suite, out = str(desk / "one.json"), str(desk / "run")
+def test_a_policy_by_file_equals_the_policy_by_module(workspace: Path, cosim: Cosim) -> None:
+    """Isolated processes load it too, and a run resumes with either spelling until the file is
+    edited."""
+    suite, out = str(workspace / "one.json"), str(workspace / "run")
     by_file = ("run", suite, "--policy", "deeper/far.py:Far", "--isolated", "--out", out)
-    said = cosim(*by_file, cwd=desk)
-    assert said.returncode == 0, said.stderr
+    result = cosim(*by_file, cwd=workspace)
+    assert result.returncode == 0, result.stderr
     assert (
         f"Next:\n  cosim film {out} --failure -o film.mp4\n  cosim report {out} -o report.html\n"
-        in said.stderr
+        in result.stderr
     )
-    spec = json.loads((desk / "run/run.json").read_text())
+    spec = json.loads((workspace / "run/run.json").read_text())
     kind = spec["policy_runs"]
     assert kind in ("isolated: namespaces", "isolated: landlock") and spec["policy"] == "far:Far"
     row = f"policy far; sensor track blind; at 4 Hz; goal route_point; odometry wheel; policy {kind}; seed"
-    assert row in said.stdout
-    weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=desk)
+    assert row in result.stdout
+    weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=workspace)
     assert (
         weak.returncode == 2
         and f"its policy_runs is {kind}, and this command has isolated: weak" in weak.stderr
     ), weak.stderr
     by_module = ("run", suite, "--policy", "far:Far", "--isolated", "--out", out, "--resume")
-    again = cosim(*by_module, cwd=desk / "deeper")
+    again = cosim(*by_module, cwd=workspace / "deeper")
     assert again.returncode == 0 and "1 of 1 episodes are finished already" in again.stderr, (
         again.stderr
     )
-    (desk / "deeper/far.py").write_text(POLICY + "# edited")
-    edited = cosim(*by_file, "--resume", cwd=desk)
+    (workspace / "deeper/far.py").write_text(POLICY + "# edited")
+    edited = cosim(*by_file, "--resume", cwd=workspace)
     assert (
         edited.returncode == 2
         and "the source of policy 'far:Far' was edited since it began" in edited.stderr
@@ -180,19 +181,22 @@ def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim)
 
 
 def test_the_file_of_a_policy_is_sent_to_a_cluster(
-    desk: Path, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ray is given the file that its name says, as for a module."""
+    """Ray gets the named file, as for a module."""
     from scenarios.runs.ray_workers import _own_module
 
-    monkeypatch.chdir(desk)
-    monkeypatch.syspath_prepend(desk)
-    assert _own_module("deeper/far.py:Far") == str(desk / "deeper/far.py")
+    monkeypatch.chdir(workspace)
+    monkeypatch.syspath_prepend(workspace)
+    assert _own_module("deeper/far.py:Far") == str(workspace / "deeper/far.py")
     assert _own_module("orca") == ""
 
 
-def test_what_is_of_one_machine_is_refused_in_words(cosim: Cosim, tmp_path: Path) -> None:
-    """Before anything is loaded, listened to or written; its help does not offer it."""
+def test_options_of_a_single_machine_are_refused_with_a_reason(
+    cosim: Cosim, tmp_path: Path
+) -> None:
+    """They are refused before anything is loaded, opened or written, and the help does not offer
+    them."""
     for words in (
         ("--shared-renderer",),
         ("--real-time",),
@@ -200,15 +204,19 @@ def test_what_is_of_one_machine_is_refused_in_words(cosim: Cosim, tmp_path: Path
         ("--live", "tcp/127.0.0.1:7448"),
         ("--director", "x"),
     ):
-        said = cosim("coordinator", "reactive", *words, cwd=tmp_path)
-        assert said.returncode == 2 and f"{words[0]} is of one machine" in said.stderr, said.stderr
-        assert "leave it out, or use `cosim run`" in said.stderr
-    assert "--live" not in (told := cosim("coordinator", "--help").stdout) and "--shard" in told
+        result = cosim("coordinator", "reactive", *words, cwd=tmp_path)
+        assert result.returncode == 2 and f"{words[0]} is of one machine" in result.stderr, (
+            result.stderr
+        )
+        assert "leave it out, or use `cosim run`" in result.stderr
+    assert "--live" not in (result := cosim("coordinator", "--help").stdout) and "--shard" in result
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_shard_of_a_coordinator_is_one_of_a_run(cosim: Cosim, tmp_path: Path) -> None:
-    """It needs the run's seed, and there are no more shards than scenarios."""
+def test_a_shard_of_a_coordinator_is_checked_like_that_of_a_run(
+    cosim: Cosim, tmp_path: Path
+) -> None:
+    """It needs the run's seed, and at most as many shards as scenarios."""
     words = (
         "coordinator",
         "reactive",

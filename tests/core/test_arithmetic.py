@@ -1,4 +1,4 @@
-"""The arithmetic of a machine: what records say of it, and numpy without AVX-512."""
+"""The arithmetic fingerprint of a machine in records, and numpy without AVX-512."""
 
 from __future__ import annotations
 
@@ -13,40 +13,42 @@ from cosim.core.versions import arithmetic, versions
 
 FLAGS = set(Path("/proc/cpuinfo").read_text().split())
 WITHOUT_FMA = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-FMA4,-AVX2_Usable,-FMA_Usable,-AVX2"}
-TELLS = "from cosim.core.versions import arithmetic as a; print(a())"
+PRINT_FINGERPRINT = "from cosim.core.versions import arithmetic as a; print(a())"
 
 
-def told(program: str = TELLS, **environment: str) -> str:
+def fingerprint(program: str = PRINT_FINGERPRINT, **environment: str) -> str:
     command = [sys.executable, "-W", "ignore", "-c", program]
     return subprocess.run(
         command, env=os.environ | environment, capture_output=True, text=True, check=True
     ).stdout
 
 
-def test_a_machine_always_tells_the_same() -> None:
-    """Every process of it, and every record."""
-    assert told().strip() == arithmetic() == versions()["arithmetic"]
+def test_a_machine_always_has_the_same_fingerprint() -> None:
+    """Every process of a machine, and every record, has the same fingerprint."""
+    assert fingerprint().strip() == arithmetic() == versions()["arithmetic"]
 
 
-def test_a_processor_without_fused_multiply_add_tells_something_else() -> None:
-    """The same packages, a C library that goes without: sines of other bits, and episodes of other
-    bits."""
+def test_a_processor_without_fused_multiply_add_has_another_fingerprint() -> None:
+    """The same packages with a C library without FMA give sines, and so episodes, of other bits."""
     if "fma" not in FLAGS:
         pytest.skip("this processor has no fma that could be left out")
-    assert told(**WITHOUT_FMA).strip() != arithmetic()
+    assert fingerprint(**WITHOUT_FMA).strip() != arithmetic()
 
 
-def test_numpy_with_avx512_tells_something_else() -> None:
-    """Where numpy is loaded before cosim, and so with AVX-512, its sines have other bits."""
+def test_numpy_with_avx512_has_another_fingerprint() -> None:
+    """Where numpy is loaded before cosim, with AVX-512, its sines have other bits."""
     if "avx512f" not in FLAGS:
         pytest.skip("this processor has no AVX-512")
-    assert told("import numpy; " + TELLS, NPY_DISABLE_CPU_FEATURES="").strip() != arithmetic()
+    assert (
+        fingerprint("import numpy; " + PRINT_FINGERPRINT, NPY_DISABLE_CPU_FEATURES="").strip()
+        != arithmetic()
+    )
 
 
 _FEATURES = "from numpy._core._multiarray_umath import __cpu_features__ as f; print(f['X86_V4'])"
 
 
-def _said(program: str) -> subprocess.CompletedProcess[str]:
+def _run(program: str) -> subprocess.CompletedProcess[str]:
     clean = {"PYTHONPATH": ":".join(sys.path)}
     return subprocess.run(
         [sys.executable, "-c", program], env=clean, capture_output=True, text=True, check=True
@@ -63,24 +65,22 @@ def _said(program: str) -> subprocess.CompletedProcess[str]:
         "bridge.codec",
     ],
 )
-def test_whatever_room_is_imported_numpy_goes_without_avx512(room: str) -> None:
-    """Whatever room of the project a program imports first, numpy computes without AVX-512
-    there."""
-    assert _said(f"import {room}; {_FEATURES}").stdout == "False\n"
+def test_every_package_loads_numpy_without_avx512(room: str) -> None:
+    """Whichever package of the project a program imports first, numpy computes without AVX-512."""
+    assert _run(f"import {room}; {_FEATURES}").stdout == "False\n"
 
 
 def test_a_program_that_loads_numpy_first_is_warned() -> None:
-    """Where numpy computes with AVX-512 because it was loaded before cosim, a warning says so and
-    what to do."""
-    if _said(_FEATURES).stdout == "False\n":
+    """The warning says that numpy computes with AVX-512, and what to do."""
+    if _run(_FEATURES).stdout == "False\n":
         pytest.skip("this processor has no AVX-512")
-    assert "Import cosim first" in _said("import numpy, cosim").stderr
-    assert "AVX-512" not in _said("import cosim, numpy").stderr
+    assert "Import cosim first" in _run("import numpy, cosim").stderr
+    assert "AVX-512" not in _run("import cosim, numpy").stderr
 
 
-def test_what_the_user_leaves_out_stays_left_out() -> None:
-    """Features of numpy that the environment leaves out already are left out still."""
-    asked = "import os; os.environ['NPY_DISABLE_CPU_FEATURES'] = 'X86_V3, X86_V4'; import cosim; "
-    assert _said(asked + "print(os.environ['NPY_DISABLE_CPU_FEATURES'])").stdout.startswith(
+def test_features_that_the_user_disables_stay_disabled() -> None:
+    """Features of numpy that the environment already disables remain disabled."""
+    program = "import os; os.environ['NPY_DISABLE_CPU_FEATURES'] = 'X86_V3, X86_V4'; import cosim; "
+    assert _run(program + "print(os.environ['NPY_DISABLE_CPU_FEATURES'])").stdout.startswith(
         "X86_V3 X86_V4 "
     )

@@ -1,4 +1,4 @@
-"""The cache folder: what lies in it, its limit, what is forgotten, and that nothing in use is."""
+"""The cache folder: its contents, its limit, and eviction that spares entries in use."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ MB = 10**6
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of its own, with an entry of 1 MB of each kind: the cities oldest, then the others,
-    an hour apart."""
+    """A cache of the test's own, with an entry of 1 MB of each kind, an hour apart, cities oldest."""
     folder = tmp_path / "cache"
     monkeypatch.setenv("COSIM_CACHE", str(folder))
     monkeypatch.delenv("COSIM_CACHE_LIMIT", raising=False)
@@ -51,7 +50,7 @@ def left(cache: Path) -> set[str]:
 
 @contextmanager
 def user_of(entry: str) -> Iterator[subprocess.Popen[str]]:
-    """A process that uses an entry, and lives on."""
+    """A process that uses an entry and stays alive."""
     code = (
         "import sys\nfrom cosim.core.cache import cache_folder, use_entry\n"
         "use_entry(cache_folder() / sys.argv[1])\nprint('uses', flush=True)\nsys.stdin.read()"
@@ -63,25 +62,25 @@ def user_of(entry: str) -> Iterator[subprocess.Popen[str]]:
         yield process
 
 
-def test_what_was_used_longest_ago_goes_beyond_the_limit(
+def test_least_recently_used_entries_are_evicted_beyond_the_limit(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Imported maps count and stay, whatever the limit; nothing goes below it."""
+    """Imported maps count and stay, whatever the limit; below it nothing is evicted."""
     assert len(left(cache)) == 5 and not clean_up().entries
-    gone = clean_up(limit_bytes=round(3.5 * MB))
-    assert [entry.path.name for entry in gone.entries] == ["a.map", "city-1.net.xml"]
-    assert gone.size_bytes == pytest.approx(2 * MB, rel=0.1)
+    evicted = clean_up(limit_bytes=round(3.5 * MB))
+    assert [entry.path.name for entry in evicted.entries] == ["a.map", "city-1.net.xml"]
+    assert evicted.size_bytes == pytest.approx(2 * MB, rel=0.1)
     monkeypatch.setenv("COSIM_CACHE_LIMIT", "0")
     clean_up_if_due()
     assert left(cache) == {"maps/town"}
 
 
-def test_what_a_living_process_uses_stays(cache: Path) -> None:
-    """Of a process that uses the oldest entry nothing is taken away while it lives, whatever the
-    limit; afterwards, however it ended, it is."""
+def test_entries_of_a_living_process_are_not_evicted(cache: Path) -> None:
+    """The oldest entry stays, whatever the limit, until the process that uses it ends, however it
+    ends."""
     with user_of("city-1.net.xml") as process:
-        gone = clean_up(limit_bytes=0)
-        assert [entry.path.name for entry in gone.in_use] == ["city-1.net.xml"]
+        evicted = clean_up(limit_bytes=0)
+        assert [entry.path.name for entry in evicted.in_use] == ["city-1.net.xml"]
         assert left(cache) == {"maps/town", "city-1.net.xml"}
         process.kill()
         process.wait(PATIENCE_S)
@@ -89,9 +88,9 @@ def test_what_a_living_process_uses_stays(cache: Path) -> None:
     assert left(cache) == {"maps/town"} and not list((cache / ".in-use").iterdir())
 
 
-def test_a_long_process_does_not_keep_what_it_used_long_ago(cache: Path) -> None:
-    """What it used within the hour stays, what it used before does not: else nothing would bound
-    what it makes."""
+def test_a_long_process_does_not_hold_entries_used_long_ago(cache: Path) -> None:
+    """Entries used within the hour stay and older ones are evicted, so that a long process is
+    bounded."""
     with user_of("city-1.net.xml"):
         long_ago_s = time.time() - 7200.0
         os.utime(cache / "city-1.net.xml", (long_ago_s, long_ago_s))
@@ -99,9 +98,9 @@ def test_a_long_process_does_not_keep_what_it_used_long_ago(cache: Path) -> None
         assert left(cache) == {"maps/town"}
 
 
-def test_processes_that_use_and_forget_at_once_do_not_hurt_one_another(cache: Path) -> None:
-    """Four processes keep entries and use them, two forget all that is not in use: no entry that is
-    used is ever gone, and nothing half done is left."""
+def test_concurrent_use_and_eviction_are_safe(cache: Path) -> None:
+    """While four processes write and use entries and two evict, no used entry disappears and none
+    is left unfinished."""
     keeps = (
         "import sys\nfrom cosim.core.cache import cache_folder, use_entry\nfor k in range(150):\n "
         "   entry = cache_folder() / 'read' / f'{sys.argv[1]}-{k}.map'\n    use_entry(entry)\n    "
@@ -116,8 +115,8 @@ def test_processes_that_use_and_forget_at_once_do_not_hurt_one_another(cache: Pa
         for word in words
     ]
     for process in processes:
-        said = process.communicate(timeout=PATIENCE_S)[1]
-        assert process.returncode == 0, said
+        output = process.communicate(timeout=PATIENCE_S)[1]
+        assert process.returncode == 0, output
     clean_up(limit_bytes=0)
     assert left(cache) == {"maps/town"}
     assert {path.name for path in cache.iterdir()} <= {
@@ -135,11 +134,10 @@ def test_processes_that_use_and_forget_at_once_do_not_hurt_one_another(cache: Pa
     [lambda: ArrayCache("tiles", "b").get("0_0", dict), lambda: mapped_arrays("sky-2", "b", dict)],
     ids=["piece", "baked"],
 )
-def test_who_keeps_something_makes_room_first(
+def test_adding_an_entry_evicts_old_ones_first(
     cache: Path, monkeypatch: pytest.MonkeyPatch, keep: Callable[[], object]
 ) -> None:
-    """Entries that were not used for a month go, but a process looks for them once a minute at
-    most."""
+    """Entries unused for a month are evicted, and a process checks at most once a minute."""
     os.utime(cache / "tiles/a", (0.0, 0.0))
     keep()
     assert "tiles/a" not in left(cache) and len(left(cache)) == 5
@@ -151,8 +149,8 @@ def test_who_keeps_something_makes_room_first(
     assert "read/a.map" not in left(cache)
 
 
-def test_what_killed_processes_left_half_made_goes(cache: Path) -> None:
-    """After an hour; what is younger may still be in the making."""
+def test_unfinished_entries_of_killed_processes_are_removed(cache: Path) -> None:
+    """They are removed after an hour; younger ones may still be in progress."""
     for name in (
         f"baked/{UNFINISHED_PREFIX}x",
         f"tiles/a/{UNFINISHED_PREFIX}x",
@@ -172,18 +170,16 @@ def test_what_killed_processes_left_half_made_goes(cache: Path) -> None:
     ]
 
 
-def test_the_command_says_what_lies_there_and_removes_what_is_not_used(
-    cache: Path, cosim: Cosim
-) -> None:
-    """A size for each kind, the sum, the limit; --prune what was not used for a month, or for so
-    many days, or all."""
-    said = cosim("cache")
-    assert said.returncode == 0 and said.stdout == cosim("cache", "--size").stdout
-    rows = {line.split()[0]: line for line in said.stdout.splitlines() if line.split()}
+def test_the_cache_command_lists_and_prunes_entries(cache: Path, cosim: Cosim) -> None:
+    """It prints a size for each kind, the sum and the limit; --prune removes entries unused for a
+    month, some days, or all."""
+    result = cosim("cache")
+    assert result.returncode == 0 and result.stdout == cosim("cache", "--size").stdout
+    rows = {line.split()[0]: line for line in result.stdout.splitlines() if line.split()}
     assert (
         "1 MB" in rows["cities"] and "6 h ago" in rows["cities"] and "never removed" in rows["maps"]
     )
-    assert f"{cache}: 5" in said.stdout and "of at most 4 GB (COSIM_CACHE_LIMIT)" in said.stdout
+    assert f"{cache}: 5" in result.stdout and "of at most 4 GB (COSIM_CACHE_LIMIT)" in result.stdout
     assert "Removed: 0 entries" in cosim("cache", "--prune").stdout
     os.utime(cache / "read/a.map", (0.0, 0.0))
     assert "Removed: 1 entry, 1 MB" in cosim(
@@ -199,15 +195,15 @@ def test_the_command_says_what_lies_there_and_removes_what_is_not_used(
 
 
 @pytest.mark.parametrize("limit", ["much", "-1", "nan", "inf"])
-def test_a_limit_that_is_none_is_refused(
+def test_an_invalid_limit_is_refused(
     cosim: Cosim, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
-    """The variable is named, with what was found and what may stand there."""
+    """The variable is named, with its value and the valid form."""
     monkeypatch.setenv("COSIM_CACHE_LIMIT", limit)
-    said = cosim("list")
+    result = cosim("list")
     assert (
-        said.returncode == 2
-        and f"COSIM_CACHE_LIMIT is '{limit}': give a number of GB from 0 on" in said.stderr
+        result.returncode == 2
+        and f"COSIM_CACHE_LIMIT is '{limit}': give a number of GB from 0 on" in result.stderr
     )
     monkeypatch.setenv("COSIM_CACHE_LIMIT", "0.5")
     assert "of at most 0.5 GB" in cosim("cache").stdout

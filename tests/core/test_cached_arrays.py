@@ -1,4 +1,4 @@
-"""Cached arrays: made once, never wrong, and made each time where they cannot be cached."""
+"""Cached arrays: computed once, always correct, and recomputed where they cannot be cached."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Maker:
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of its own."""
+    """A cache of the test's own."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     module._print_once.cache_clear()
     return tmp_path / "cache"
@@ -72,23 +72,23 @@ def files_in(cache: Path) -> list[Path]:
 
 def same(arrays: Arrays) -> bool:
     return [*arrays] == [*WANTED] and all(
-        (held.dtype, held.shape, held.tobytes()) == (wanted.dtype, wanted.shape, wanted.tobytes())
-        and not held.flags.writeable
-        for held, wanted in zip(arrays.values(), WANTED.values(), strict=True)
+        (array.dtype, array.shape, array.tobytes())
+        == (wanted.dtype, wanted.shape, wanted.tobytes())
+        and not array.flags.writeable
+        for array, wanted in zip(arrays.values(), WANTED.values(), strict=True)
     )
 
 
 @both
 def test_arrays_are_made_once(get: Get) -> None:
-    """Later calls give the same arrays, to the bit, of the same types and shapes,
-    write-protected."""
+    """Later calls return bit-identical, write-protected arrays of the same types and shapes."""
     make = Maker()
     assert same(get("a", "0_0", make)) and same(get("a", "0_0", make)) and make.times == 1
 
 
 @both
 def test_other_names_and_keys_are_other_arrays(get: Get, cache: Path) -> None:
-    """What is cached under another name or key is not returned."""
+    """Arrays cached under another name or key are not returned."""
     make = Maker()
     for key, name in (("a", "0_0"), ("a", "0_1"), ("b", "0_0")):
         assert same(get(key, name, make))
@@ -96,17 +96,17 @@ def test_other_names_and_keys_are_other_arrays(get: Get, cache: Path) -> None:
 
 
 def test_sets_without_a_key_are_not_cached(cache: Path) -> None:
-    """Where it is not known what they depend on they are made each time."""
+    """Without known inputs the arrays are computed each time."""
     make = Maker()
     assert same(one_of_many("", "0_0", make)) and same(one_of_many("", "0_0", make))
     assert make.times == 2 and not files_in(cache)
 
 
 @pytest.mark.parametrize("package", ["numpy", "scipy", "shapely"])
-def test_a_hash_of_sources_is_of_the_versions_of_libraries(
+def test_a_hash_of_sources_includes_library_versions(
     monkeypatch: pytest.MonkeyPatch, package: str
 ) -> None:
-    """What one version of a library made is not returned for another's."""
+    """Arrays of one version of a library are not returned for another."""
     before = sources_hash()
     monkeypatch.setattr(module, "version", lambda name: "0" if name == package else version(name))
     module._array_versions.cache_clear()
@@ -117,7 +117,7 @@ def test_a_hash_of_sources_is_of_the_versions_of_libraries(
 
 
 def test_a_hash_of_sources_covers_the_packages_that_they_import() -> None:
-    """What the rooms of textures and motions import of others is in the list."""
+    """The hash includes the modules that textures and motions import from other packages."""
     rooms = [ROOT / room for room in ("physics/textures", "physics/people", "cosim/people")]
     trees = [ast.parse(path.read_text()) for room in rooms for path in room.rglob("*.py")]
     nodes = [node for tree in trees for node in ast.walk(tree)]
@@ -136,7 +136,7 @@ def test_a_hash_of_sources_covers_the_packages_that_they_import() -> None:
 @both
 @pytest.mark.parametrize("damage", ["a bit", "its hash", "cut off", "empty", "other bytes"])
 def test_damaged_files_are_made_again(get: Get, cache: Path, damage: str) -> None:
-    """Whatever became of the file, the arrays are right, and the file is whole again afterwards."""
+    """After any damage the arrays are correct, and the file is complete again."""
     make = Maker()
     get("a", "0_0", make)
     (file,) = files_in(cache)
@@ -157,19 +157,21 @@ def test_damaged_files_are_made_again(get: Get, cache: Path, damage: str) -> Non
 def test_a_cache_that_cannot_be_written_is_reported_once(
     get: Get, cache: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The arrays are right all the same; one line says why the next process makes them again."""
+    """The arrays are correct, and one line says why the next process computes them again."""
     cache.write_text("a file where a folder should be")
     make = Maker()
     assert same(get("a", "0_0", make)) and same(get("a", "0_0", make)) and make.times == 2
-    said = capsys.readouterr().err
-    assert said.startswith("note: ") and "not cached" in said and len(said.splitlines()) == 1
+    message = capsys.readouterr().err
+    assert (
+        message.startswith("note: ") and "not cached" in message and len(message.splitlines()) == 1
+    )
 
 
 @both
 def test_a_read_only_cache_is_read(
     get: Get, cache: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What lies in a cache that may not be written is returned, without a note."""
+    """Entries of a cache without write permission are returned without a note."""
     make = Maker()
     get("a", "0_0", make)
     folders = [cache, *(path for path in cache.rglob("*") if path.is_dir())]
@@ -185,7 +187,7 @@ def test_a_read_only_cache_is_read(
 
 @both
 def test_a_full_disk_leaves_no_file(get: Get, cache: Path) -> None:
-    """Writing that ends in the middle gives the right arrays, a note, and no file, whole or not."""
+    """An interrupted write gives correct arrays, a note, and no complete or partial file."""
     code = (
         f"{SCRIPT}[sys.argv[1]]\nimport resource\nresource.setrlimit(resource.RLIMIT_FSIZE, "
         f"(4096, 4096))\n"

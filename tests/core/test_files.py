@@ -38,7 +38,7 @@ BEGIN = (
 
 @contextmanager
 def process_in(folder: Path, code: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A process, and the line that it prints before it waits; killed at the end."""
+    """A process, and the line that it prints before it waits; it is killed at the end."""
     command = [sys.executable, "-c", f"{BEGIN}{code}", str(folder)]
     with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as process:
         assert process.stdout is not None
@@ -58,7 +58,7 @@ with temp_folder("made-", here) as folder:
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_file_appears_whole_or_not_at_all(tmp_path: Path, shared: bool) -> None:
-    """An error in the middle leaves the old file, and nothing else."""
+    """An error during writing leaves the old file and nothing else."""
     path = tmp_path / "a"
     write_atomic(path, b"one", shared=shared)
     with pytest.raises(RuntimeError), atomic_file(path, shared=shared) as part:
@@ -70,7 +70,7 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path, shared: bool) -> Non
 
 
 def test_processes_that_write_one_shared_file_never_mix(tmp_path: Path) -> None:
-    """Every reader finds what one of four processes wrote, also when these are killed."""
+    """Every reader finds the complete text of one of four writers, also when these are killed."""
     code = (
         "for n in range(10**9): write_atomic(here / 'a', sys.argv[2].encode() * 50000, shared=True)"
     )
@@ -92,7 +92,7 @@ def test_processes_that_write_one_shared_file_never_mix(tmp_path: Path) -> None:
 
 
 def test_the_folder_of_a_process_that_was_killed_is_removed_by_the_next(tmp_path: Path) -> None:
-    """A folder of a living process stays, and one's own is gone at the end of the block."""
+    """The folder of a living process stays, and the own folder is removed at the end of the block."""
     with (
         process_in(tmp_path, HOLDS_FOLDER) as (dies, left),
         process_in(tmp_path, HOLDS_FOLDER) as (_, stays),
@@ -105,8 +105,8 @@ def test_the_folder_of_a_process_that_was_killed_is_removed_by_the_next(tmp_path
         assert {*tmp_path.iterdir()} == {Path(stays)}
 
 
-def test_young_unfinished_things_stay(tmp_path: Path) -> None:
-    """Without a lock to look at, files and folders are removed when they are an hour old."""
+def test_recent_unfinished_files_stay(tmp_path: Path) -> None:
+    """Without a lock, unfinished files and folders are removed when they are an hour old."""
     for name in ("young", "old"):
         (tmp_path / f"x-file-{name}").touch()
         (tmp_path / f"x-folder-{name}").mkdir()
@@ -120,7 +120,7 @@ def test_young_unfinished_things_stay(tmp_path: Path) -> None:
 def test_a_finished_folder_takes_its_place(
     tmp_path: Path, existing: Literal["replace", "keep", "refuse"], left: str
 ) -> None:
-    """An existing one is replaced, kept or refused; nothing unfinished is left."""
+    """An existing folder is replaced, preserved or refused, and nothing unfinished is left."""
     for number in (1, 2):
         try:
             with atomic_folder(tmp_path / "maps" / "town", existing=existing) as folder:
@@ -132,7 +132,7 @@ def test_a_finished_folder_takes_its_place(
 
 
 def test_an_error_in_the_block_leaves_the_old_folder(tmp_path: Path) -> None:
-    """The new folder is removed."""
+    """The new folder is removed, and the old one stays."""
     for _ in range(2):
         with pytest.raises(RuntimeError), atomic_folder(tmp_path / "town") as folder:
             (folder / "half").touch()
@@ -141,7 +141,7 @@ def test_an_error_in_the_block_leaves_the_old_folder(tmp_path: Path) -> None:
 
 
 def dead_replacement(maps: Path) -> Path:
-    """What a process leaves that was killed while it replaced the folder `town`."""
+    """Leave what a process leaves that was killed while it replaced the folder `town`."""
     dead = maps / f"{UNFINISHED_PREFIX}dead"
     (dead / ".old" / "town").mkdir(parents=True)
     (dead / ".old" / "town" / "net.xml").write_text("<net/>")
@@ -150,7 +150,7 @@ def dead_replacement(maps: Path) -> Path:
 
 
 def test_a_folder_that_was_being_replaced_by_a_killed_process_is_put_back(tmp_path: Path) -> None:
-    """By the next process that writes there, or that reads it."""
+    """The next process that writes or reads there restores the folder."""
     dead_replacement(tmp_path / "writer")
     with temp_folder(UNFINISHED_PREFIX, tmp_path / "writer"):
         assert (tmp_path / "writer" / "town" / "net.xml").read_text() == "<net/>"
@@ -161,7 +161,7 @@ def test_a_folder_that_was_being_replaced_by_a_killed_process_is_put_back(tmp_pa
 
 
 def test_a_reader_waits_while_a_folder_is_replaced(tmp_path: Path) -> None:
-    """Between the moment when the old one goes and that when the new one comes it does not miss."""
+    """A reader succeeds between the removal of the old folder and the arrival of the new one."""
     dead = dead_replacement(tmp_path)
     with lock(dead / ".held"):
         made = tmp_path / "new"
@@ -174,7 +174,7 @@ def test_a_reader_waits_while_a_folder_is_replaced(tmp_path: Path) -> None:
 
 
 def test_processes_replace_one_folder_at_once(tmp_path: Path) -> None:
-    """Readers find a whole one at any moment, also when some of the processes are killed."""
+    """Readers always find a complete folder, also when some of the writers are killed."""
     code = """
 number = 0
 while True:
@@ -204,10 +204,10 @@ while True:
 
 
 @pytest.mark.parametrize("existing", ["replace", "keep"])
-def test_a_folder_appears_though_another_process_removes_the_old_one_meanwhile(
+def test_a_folder_appears_though_another_process_removes_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, existing: Literal["replace", "keep"]
 ) -> None:
-    """Also where it is gone right after it was in the way."""
+    """The write succeeds even if the old folder disappears right after it was found."""
     (tmp_path / "town").mkdir()
     (tmp_path / "town" / "old").touch()
     rename = Path.rename
@@ -226,7 +226,7 @@ def test_a_folder_appears_though_another_process_removes_the_old_one_meanwhile(
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
-    """While another process holds it nothing is acquired; when that is killed it is free."""
+    """A lock cannot be acquired while another process holds it, and is free once that is killed."""
     path = tmp_path / "lock"
     assert not is_locked(path)
     with process_in(

@@ -62,7 +62,7 @@ def test_a_polyline_is_measured_along_itself() -> None:
 
 
 def test_a_projection_near_an_arc_length_ignores_the_rest_of_the_line() -> None:
-    """A route that passes near itself is projected onto the asked part."""
+    """A route that passes near itself is projected onto the requested part."""
     hairpin = Polyline([(0, 0), (50, 0), (50, 2), (0, 2)])
     assert hairpin.project(10.0, 1.9)[0] == pytest.approx(92.0)
     assert hairpin.project(10.0, 1.9, (0.0, 20.0))[0] == pytest.approx(10.0)
@@ -74,8 +74,8 @@ def test_a_polyline_needs_two_points() -> None:
         Polyline([(1, 1), (1, 1)])
 
 
-def test_the_gap_of_a_box_to_a_point_is_exact_beside_before_and_at_its_corner() -> None:
-    """Distances from an oriented box are those worked out by hand; inside it is 0."""
+def test_the_distance_from_a_box_to_a_point_is_exact() -> None:
+    """Distances at the sides, the front and a corner equal those by hand, and inside it is 0."""
     poses = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, math.pi / 2]])
     centres = np.array([[[3.0, 0.0], [0.0, 3.0], [4.0, 5.0], [0.5, 0.1]]])
     gaps = box_disk_gap(poses, 1.0, 0.5, centres)
@@ -83,8 +83,8 @@ def test_the_gap_of_a_box_to_a_point_is_exact_beside_before_and_at_its_corner() 
     assert gaps[1] == pytest.approx([2.5, 2.0, math.hypot(3.5, 4.0), 0.0])
 
 
-def test_boxes_overlap_only_when_they_do() -> None:
-    """Parallel, turned and corner-to-corner boxes are told apart by the separating axes."""
+def test_overlaps_of_boxes_are_exact() -> None:
+    """Parallel, turned and corner-to-corner boxes are distinguished by the separating axes."""
     one = np.array([0.0, 0.0, 0.0])
     half = np.array([1.0, 0.5])
     others = np.array(

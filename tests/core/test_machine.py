@@ -1,4 +1,4 @@
-"""What a machine lacks is said, or installed, before anything is set up or started."""
+"""Missing parts of a machine are reported, or installed, before anything is set up or started."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ GLIBC = {
 ENGINES = ("libsumo", "pybullet", "zenoh", "moderngl", "numpy", "scenarios")
 
 
-class Fake(Machine):
-    """A machine without these packages; apt-get has those of `archive`."""
+class FakeMachine(Machine):
+    """A machine without these packages, whose apt-get has those of `archive`."""
 
     def __init__(self, *without: str, root: bool = False, archive: tuple[str, ...] = ()) -> None:
         self.without = set(without)
@@ -68,36 +68,36 @@ class Fake(Machine):
 def test_each_missing_library_is_named_with_its_package() -> None:
     """A refusal names every missing library, its package, and one command that installs them
     all."""
-    said = refusal(Fake("libx11-6", "libatomic1", "libegl1"))
-    assert "libX11.so.6 (package libx11-6), libatomic.so.1 (package libatomic1)" in said
+    message = refusal(FakeMachine("libx11-6", "libatomic1", "libegl1"))
+    assert "libX11.so.6 (package libx11-6), libatomic.so.1 (package libatomic1)" in message
     assert (
-        said.endswith("install -y --no-install-recommends libx11-6 libatomic1 libegl1")
-        and "\n" not in said
+        message.endswith("install -y --no-install-recommends libx11-6 libatomic1 libegl1")
+        and "\n" not in message
     )
-    assert refusal(Fake()) == ""
+    assert refusal(FakeMachine()) == ""
 
 
-def test_whoever_is_not_root_is_told_and_stopped(capsys: pytest.CaptureFixture[str]) -> None:
-    """Without the right to install, the check says what is missing and ends with 3; nothing is
-    installed."""
-    machine = Fake("libx11-6", "python3.11")
+def test_without_root_the_check_reports_and_stops(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without the right to install, the check reports what is missing and exits with 3, and nothing
+    is installed."""
+    machine = FakeMachine("libx11-6", "python3.11")
     assert (
         check_machine(["--install", "--python", "python3.11"], machine) == EXIT_CODE
         and machine.installed == []
     )
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert (
         "lacks Python 3.11 with venv (there is no 'python3.11') and libX11.so.6 (package libx11-6)."
-        in said
+        in message
     )
-    assert "python3.11 python3.11-venv libx11-6\n" in said and "make PYTHON=" in said
+    assert "python3.11 python3.11-venv libx11-6\n" in message and "make PYTHON=" in message
 
 
 def test_root_installs_exactly_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
-    """As root on Debian, what is missing and nothing else is installed, and said; asked again,
-    nothing happens."""
+    """As root on Debian exactly the missing packages are installed and reported; a second check
+    does nothing."""
     archive = ("libx11-6", "libegl1", "python3.11", "python3.11-venv")
-    machine = Fake("libx11-6", "libegl1", "python3.11", root=True, archive=archive)
+    machine = FakeMachine("libx11-6", "libegl1", "python3.11", root=True, archive=archive)
     assert check_machine(["--install"], machine) == 0
     assert machine.installed == ["python3.11", "python3.11-venv", "libx11-6", "libegl1"]
     assert "lacks libx11-6, libegl1: apt-get installs exactly that" in capsys.readouterr().err
@@ -105,20 +105,21 @@ def test_root_installs_exactly_what_is_missing(capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().err == ""
 
 
-def test_what_the_archive_does_not_have_stops_root_too(capsys: pytest.CaptureFixture[str]) -> None:
-    """Where apt-get has no Python 3.11, the libraries are installed all the same, and what is left
-    is said."""
-    machine = Fake("libx11-6", "python3.11", root=True, archive=("libx11-6",))
+def test_a_package_missing_from_the_archive_stops_root_too(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Where apt-get has no Python 3.11, the libraries are installed and the rest is reported."""
+    machine = FakeMachine("libx11-6", "python3.11", root=True, archive=("libx11-6",))
     assert check_machine(["--install"], machine) == EXIT_CODE and missing(machine) == []
     assert "error: this machine lacks Python 3.11" in capsys.readouterr().err
 
 
-def test_without_egl_a_run_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
-    """Only pictures need EGL: its absence is one line, and no error."""
-    assert check_machine([], Fake("libegl1")) == 0
-    said = capsys.readouterr().err
-    assert said.startswith("note: no libEGL.so.1") and said.count("\n") == 1
-    assert refusal(Fake("libegl1")) == ""
+def test_a_missing_egl_is_no_error(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only pictures need EGL, so its absence is reported in one line."""
+    assert check_machine([], FakeMachine("libegl1")) == 0
+    message = capsys.readouterr().err
+    assert message.startswith("note: no libEGL.so.1") and message.count("\n") == 1
+    assert refusal(FakeMachine("libegl1")) == ""
 
 
 @pytest.mark.parametrize(
@@ -131,8 +132,8 @@ def test_without_egl_a_run_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
     ],
     ids=["newer", "no-venv", "broken", "good"],
 )
-def test_a_python_is_asked_what_it_is(script: str, wrong: str, tmp_path: Path) -> None:
-    """The interpreter that will make the environment is run, and what is wrong with it is said."""
+def test_the_python_of_the_environment_is_checked(script: str, wrong: str, tmp_path: Path) -> None:
+    """The interpreter that will create the environment is run, and its faults are reported."""
     python = tmp_path / "python3.11"
     python.write_text(f"#!/bin/sh\n{script}\n")
     python.chmod(0o755)
@@ -141,9 +142,8 @@ def test_a_python_is_asked_what_it_is(script: str, wrong: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("verb", ["run", "test", "check", "docs", "bench"])
-def test_make_looks_before_it_sets_up(verb: str, tmp_path: Path) -> None:
-    """Every verb of make that needs the packages first checks the machine: one error, and nothing
-    is begun."""
+def test_make_checks_the_machine_before_it_sets_up(verb: str, tmp_path: Path) -> None:
+    """Every make target that needs the packages checks the machine first and stops with one error."""
     make = shutil.which("make")
     assert make is not None
     locks = (path.name for path in ROOT.glob("requirements*.lock"))
@@ -166,8 +166,8 @@ def test_make_looks_before_it_sets_up(verb: str, tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_make_without_any_python_says_which(tmp_path: Path) -> None:
-    """On a machine without any Python, make names the package and stops."""
+def test_make_without_any_python_names_the_package(tmp_path: Path) -> None:
+    """On a machine without Python, make names the package and stops."""
     make = shutil.which("make")
     assert make is not None
     shutil.copy(ROOT / "Makefile", tmp_path)
@@ -182,8 +182,8 @@ def test_make_without_any_python_says_which(tmp_path: Path) -> None:
 
 
 def test_a_library_is_looked_for_by_the_loader(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A library that every process has is found, one that cannot exist is not; one that lacks
-    another is not blamed."""
+    """A common library is found, an impossible one is not, and one with a missing dependency is not
+    blamed."""
     assert Machine().loads("libc.so.6") and not Machine().loads("libcosim-has-none.so.9")
 
     def load(name: str) -> None:
@@ -194,7 +194,7 @@ def test_a_library_is_looked_for_by_the_loader(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_check_runs_before_anything_is_installed() -> None:
-    """The check is read by Python 3.8, imports the standard library alone, and runs without
+    """The check parses with Python 3.8, imports the standard library only, and runs without
     site-packages."""
     source = (ROOT / "cosim/machine.py").read_text()
     tree = ast.parse(source, feature_version=(3, 8))
@@ -214,11 +214,10 @@ def test_the_check_runs_before_anything_is_installed() -> None:
 @pytest.mark.parametrize(
     "words", [["doctor"], ["run", "long-horizon", "--out", "out"]], ids=["doctor", "run"]
 )
-def test_the_command_line_says_it_before_it_loads_an_engine(
+def test_the_command_line_reports_it_before_it_loads_an_engine(
     words: list[str], tmp_path: Path
 ) -> None:
-    """With libX11 out of the loader's sight `cosim doctor` and `cosim run` end at once: one line,
-    exit code 3."""
+    """Without libX11 `cosim doctor` and `cosim run` end at once with one line and exit code 3."""
     code = (
         "import atexit, ctypes, sys\nreal = ctypes.CDLL\ndef load(name, *rest, **more):\n    if "
         "'X11' in str(name): raise OSError(f'{name}: cannot open shared object file')\n    "
@@ -239,7 +238,7 @@ def test_the_command_line_says_it_before_it_loads_an_engine(
 
 
 @pytest.mark.parametrize("module", ["typer", "zenoh"], ids=["front", "engine"])
-def test_a_package_that_cannot_be_imported_is_said_in_one_line(module: str) -> None:
+def test_a_package_that_cannot_be_imported_is_reported_in_one_line(module: str) -> None:
     """Where a package is missing or broken, `cosim doctor` names it and ends with exit code 3,
     without a traceback."""
     code = f"import sys; sys.modules[{module!r}] = None; sys.argv = ['cosim', 'doctor']\n"
@@ -254,8 +253,8 @@ def test_a_package_that_cannot_be_imported_is_said_in_one_line(module: str) -> N
 
 
 def test_the_table_holds_every_library_that_the_packages_load() -> None:
-    """What the binaries of the locked packages need is in glibc, in the packages themselves, or in
-    the table."""
+    """Each library that the locked packages need is in glibc, in the packages themselves, or in the
+    table."""
     locked = re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
     files = [Path(str(f.locate())) for name in locked for f in distribution(name).files or ()]
     files = [
@@ -269,7 +268,7 @@ def test_the_table_holds_every_library_that_the_packages_load() -> None:
 
 
 def needed_by(path: Path) -> list[str]:
-    """The DT_NEEDED entries of a 64-bit little-endian ELF file; none of any other file."""
+    """Return the DT_NEEDED entries of a 64-bit little-endian ELF file, and none for other files."""
     if path.stat().st_size < 64:
         return []
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:

@@ -27,7 +27,7 @@ def gru() -> Gru:
 
 
 def outputs() -> NDArray[np.float32]:
-    """Shares of a batch of three after ten steps of a recurrent layer and a dense one."""
+    """Return shares of a batch of three after ten steps of a recurrent layer and a dense one."""
     output, layer = np.zeros((3, 5), np.float32), Dense(normal(5, 5, 4), normal(6, 4), "tanh")
     for k in range(10):
         output = gru().remember(normal(20 + k, 3, 7), output)
@@ -35,7 +35,7 @@ def outputs() -> NDArray[np.float32]:
 
 
 def test_a_gated_recurrent_unit_follows_its_formula() -> None:
-    """That of PyTorch, in float64."""
+    """The formula is that of PyTorch, in float64."""
     layer, output = gru(), normal(8, 5)
     given = normal(9, 7).astype(float) @ layer.weight + layer.bias
     own = output.astype(float) @ layer.own_weight + layer.own_bias
@@ -46,7 +46,7 @@ def test_a_gated_recurrent_unit_follows_its_formula() -> None:
 
 
 def test_a_batch_has_the_bits_of_its_rows() -> None:
-    """In a dense and in a recurrent layer."""
+    """Batches equal their rows in a dense and in a recurrent layer."""
     rows, memory = normal(10, 6, 7), normal(11, 6, 5)
     dense = Dense(normal(12, 7, 9), normal(13, 9), "relu")
     assert (dense.answer(rows) == [dense.answer(row) for row in rows]).all()
@@ -55,7 +55,7 @@ def test_a_batch_has_the_bits_of_its_rows() -> None:
 
 
 def test_shares_sum_to_one() -> None:
-    """In proportion to the exponentials, however large."""
+    """Shares are proportional to the exponentials, however large these are."""
     x = np.array([[1000.0, 1001.0, 900.0], [0.0, 0.0, 0.0]], np.float32)
     expected = [[1.0 / (1.0 + np.e), np.e / (1.0 + np.e), 0.0], 3 * [1.0 / 3.0]]
     assert np.abs(softmax(x) - expected).max() < 1e-7
@@ -63,7 +63,7 @@ def test_shares_sum_to_one() -> None:
 
 
 def test_batches_have_the_same_bits_without_fused_multiply_adds() -> None:
-    """And without AVX2."""
+    """The bits are the same without FMA and without AVX2."""
     done = subprocess.run(
         [sys.executable, "-c", PROCESS],
         env={**os.environ, "NPY_DISABLE_CPU_FEATURES": "X86_V3"},

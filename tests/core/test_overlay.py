@@ -1,4 +1,4 @@
-"""Putting ground together where GEOS gives up: tangled corners and slivers, as foreign maps have
+"""Robust overlays of ground where GEOS fails: tangled corners and slivers, as imported maps have
 them."""
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ CONFLICTING = (
     [(2025.37, 105.45), (2017.41, 104.93), (2017.11, 105.07)],
     3.2,
 )
-"""Another, on which GEOS finds a "side location conflict"."""
+"""Another such case, for which GEOS reports a "side location conflict"."""
 
 
-def test_a_net_is_read_whose_corner_geos_cannot_join(tmp_path: Path) -> None:
-    """Where the wedge between a sidewalk and its tangled corner cannot be joined as it is, the
-    place is read anyway."""
+def test_a_net_with_a_corner_that_geos_cannot_join_is_read(tmp_path: Path) -> None:
+    """The place is read although the wedge between a sidewalk and its tangled corner cannot be
+    joined directly."""
     path = tmp_path / "tangled.net.xml"
     area, walk = (" ".join(f"{x},{y}" for x, y in shape) for shape in TANGLED[:2])
     path.write_text(
@@ -70,8 +70,7 @@ def test_a_net_is_read_whose_corner_geos_cannot_join(tmp_path: Path) -> None:
 def test_the_seam_to_a_tangled_corner_is_closed(
     shapes: tuple[list[Point], list[Point], float],
 ) -> None:
-    """The sidewalk grows to its corner, which is many pieces that touch, and keeps its own
-    ground."""
+    """The sidewalk grows to its corner of many touching pieces, and its own ground is unchanged."""
     area, walk, width_m = shapes
     parts = [
         p
@@ -95,9 +94,8 @@ def crossing_itself() -> Polygon:
 
 
 @pytest.mark.parametrize("name", ["union", "difference", "intersection"])
-def test_what_geos_refuses_is_repaired(name: str) -> None:
-    """A shape that crosses itself is overlaid all the same, alone and among others; those others
-    keep their bits."""
+def test_shapes_that_geos_refuses_are_repaired(name: str) -> None:
+    """A self-crossing shape is overlaid alone and among others, whose bits do not change."""
     operation, plain = getattr(overlay, name), getattr(shapely, name)
     bow = crossing_itself()
     square = box(1.0, 1.0, 3.0, 9.0)
@@ -106,12 +104,12 @@ def test_what_geos_refuses_is_repaired(name: str) -> None:
     repaired = shapely.make_valid(bow, method="structure")
     assert operation(bow, square).is_valid
     assert operation(bow, square).area == pytest.approx(plain(repaired, square).area, abs=1e-6)
-    whole = box(0.1, 0.2, 3.3, 7.7)
-    many = operation(np.array([whole, bow, None], dtype=object), square)
-    assert many[0].wkb == plain(whole, square).wkb and many[1].is_valid and many[2] is None
+    sound = box(0.1, 0.2, 3.3, 7.7)
+    many = operation(np.array([sound, bow, None], dtype=object), square)
+    assert many[0].wkb == plain(sound, square).wkb and many[1].is_valid and many[2] is None
 
 
-def test_what_geos_accepts_keeps_its_bits() -> None:
+def test_shapes_that_geos_accepts_keep_their_bits() -> None:
     """Where the plain operation succeeds, nothing is repaired or snapped."""
     rng = np.random.default_rng(4)
     lines = shapely.linestrings(np.cumsum(rng.normal(0.0, 3.0, (60, 5, 2)), axis=1))
@@ -124,8 +122,10 @@ def test_what_geos_accepts_keeps_its_bits() -> None:
         assert [s.wkb for s in mine] == [s.wkb for s in plain]
 
 
-def test_what_nothing_helps_is_told_with_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A failure of GEOS that stays is a MapError that says where, in words."""
+def test_an_overlay_that_cannot_be_repaired_is_reported_with_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A persistent failure of GEOS is a MapError with the coordinates."""
 
     def broken(*_shapes: object, **_options: object) -> None:
         raise shapely.errors.GEOSException(

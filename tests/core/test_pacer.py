@@ -1,4 +1,4 @@
-"""Holding a simulation to the wall clock, with a clock of the test's own."""
+"""Holding a simulation to the wall clock, with a simulated clock."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from cosim.core.clock import Pacer
 
 
 class Wall:
-    """A wall clock that goes on while somebody sleeps or works."""
+    """A wall clock that advances with sleep and work."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -20,8 +20,8 @@ class Wall:
 
 
 @pytest.mark.parametrize("pace", [0.5, 1.0, 4.0])
-def test_ticks_take_their_time_however_long_each_is_computed(pace: float) -> None:
-    """100 ticks of 0.05 s, every fifth of which takes longer than that: together 5 s at real
+def test_ticks_take_real_time_however_long_each_is_computed(pace: float) -> None:
+    """100 ticks of 0.05 s, every fifth of which takes longer to compute, take 5 s together at real
     time."""
     wall = Wall()
     pacer = Pacer(pace, lambda: wall.now_s, wall.sleep)
@@ -31,9 +31,9 @@ def test_ticks_take_their_time_however_long_each_is_computed(pace: float) -> Non
     assert wall.now_s - 100.0 == pytest.approx(5.0 / pace, rel=0.01)
 
 
-def test_what_is_slower_is_not_held_back_and_a_long_pause_is_not_made_up_for() -> None:
-    """Ticks slower than real time are never waited after. After a policy that thought for a minute
-    the episode runs faster for a second's worth of ticks, and then at its pace again."""
+def test_slow_ticks_are_not_delayed_and_long_pauses_are_not_caught_up() -> None:
+    """Slow ticks are not followed by a wait; after a pause of a minute at most a second's worth of
+    ticks runs faster."""
     wall = Wall()
     pacer = Pacer(1.0, lambda: wall.now_s, wall.sleep)
     pacer.wait(0.05)

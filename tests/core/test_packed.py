@@ -32,9 +32,8 @@ def some_rows(lengths: tuple[int, ...] = (3, 2)) -> Packed:
     )
 
 
-def test_what_is_packed_is_read_again_by_a_python_that_has_numpy_alone(tmp_path: Path) -> None:
-    """The file has the arrays that were saved, twice the same bytes, and is read without any other
-    package."""
+def test_a_packed_file_is_read_with_numpy_alone(tmp_path: Path) -> None:
+    """The file has the saved arrays, the same bytes twice, and is read without any other package."""
     rows = some_rows()
     path = tmp_path / "rows.npz"
     again = tmp_path / "again.npz"
@@ -49,14 +48,14 @@ def test_what_is_packed_is_read_again_by_a_python_that_has_numpy_alone(tmp_path:
         "print(len(read_packed(Path(sys.argv[1]))), sorted({m.partition('.')[0] for m in "
         "sys.modules} & {'msgspec', 'pyarrow', 'pandas', 'av', 'scipy'}))"
     )
-    said = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
     )
-    assert said.stdout.strip() == "5 []"
+    assert result.stdout.strip() == "5 []"
 
 
-def test_a_history_does_not_reach_into_the_episode_before() -> None:
-    """Of four pictures, two rows apart, those from before an episode are its first."""
+def test_a_history_does_not_reach_into_the_previous_episode() -> None:
+    """Of four pictures, two rows apart, those before the episode are replaced by its first."""
     assert some_rows((5, 2)).history(4, 2).tolist()[4:] == [
         [0, 0, 2, 4],
         [5, 5, 5, 5],
@@ -65,8 +64,9 @@ def test_a_history_does_not_reach_into_the_episode_before() -> None:
 
 
 @pytest.mark.parametrize("damage", ["no file", "no npz", "cut off"])
-def test_what_is_no_packed_file_is_refused_by_name(tmp_path: Path, damage: str) -> None:
-    """A file that is not there, of another kind or cut off is named, with what makes one."""
+def test_an_invalid_packed_file_is_refused_by_name(tmp_path: Path, damage: str) -> None:
+    """A missing file, one of another kind and one cut off are named, with the command that makes
+    one."""
     path = tmp_path / "rows.npz"
     some_rows().save(path)
     if damage == "no file":

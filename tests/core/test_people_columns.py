@@ -1,5 +1,4 @@
-"""Kind and age of people are columns: an id is a name, and nothing that reads people looks into
-it."""
+"""Kind and age of people are columns: an id is a mere name, and no reader of people interprets it."""
 
 from __future__ import annotations
 
@@ -37,9 +36,8 @@ XY = [(10.0, 5.0), (11.0, 5.0), (12.0, 5.0), (10.0, 5.2)]
 STREET = Street(0, People.of(NAMES, XY, [0.0] * 4, [1.0] * 4, ("walk",) * 4, kind=KINDS, age=AGES))
 
 
-def test_columns_travel_with_their_people() -> None:
-    """Chosen rows and copies keep kind and age, which nobody can write to; one value stands for
-    all."""
+def test_columns_follow_their_people() -> None:
+    """Selected rows and copies have kind and age, which are read-only; one value applies to all."""
     people = STREET.people.only(np.array([1, 3]))
     assert people.kind.tolist() == [
         PersonKind.CROWD,
@@ -63,9 +61,9 @@ def test_columns_travel_with_their_people() -> None:
     ).age.tolist() == [1, 1]
 
 
-def test_who_reads_people_reads_the_columns() -> None:
-    """Bystanders, counts, delays, strides, bodies and the minimap, told of people whose names would
-    mislead them."""
+def test_every_reader_of_people_uses_the_columns() -> None:
+    """Bystanders, tally, delays, strides, bodies and the minimap are correct for people with
+    misleading names."""
     people = STREET.people
     assert [b.kind for b in nearby_people(people)] == [
         PersonKind.CROWD,
@@ -92,7 +90,7 @@ def test_who_reads_people_reads_the_columns() -> None:
 
 
 def minimap(street_map: StreetMap) -> Minimap:
-    """Of a way along the northern sidewalk."""
+    """A minimap of a route along the northern sidewalk."""
     route = ((4.0, 5.0), (30.0, 5.0))
     scenario = Scenario(
         id="t",

@@ -1,4 +1,4 @@
-"""Which cameras a policy may see by, and what is said of any other."""
+"""The rules for policy cameras, and the messages about cameras that break them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SHORT = Scenario(
 
 
 @pytest.mark.parametrize(
-    ("camera", "rate_hz", "told"),
+    ("camera", "rate_hz", "expected"),
     [
         (None, 20.0, ""),
         (CameraSpec(), 4.0, ""),
@@ -76,18 +76,18 @@ SHORT = Scenario(
         "front-by-its-place",
     ],
 )
-def test_what_no_mount_of_the_robot_allows_is_told(
-    camera: CameraSpec | None, rate_hz: float, told: str
+def test_a_camera_beyond_its_mount_is_reported(
+    camera: CameraSpec | None, rate_hz: float, expected: str
 ) -> None:
-    """Place, size, field of view and rate are held against the limits of the mount; a crop makes a
-    picture no less."""
-    assert nonstandard(Manifest("mine", rate_hz=rate_hz, camera=camera), COURIER) == told
+    """Place, size, field of view and rate are checked against the mount, and a crop does not reduce
+    the size."""
+    assert nonstandard(Manifest("mine", rate_hz=rate_hz, camera=camera), COURIER) == expected
 
 
-def test_a_camera_that_the_robot_does_not_have_is_refused_with_those_that_it_has(
+def test_an_unknown_camera_is_refused_with_the_valid_ones(
     tmp_path: Path,
 ) -> None:
-    """By an Episode and by a run, before anything starts; the remedy is told."""
+    """An Episode and a run refuse it before anything starts, with the remedy."""
     with pytest.raises(UsageError) as caught:
         Episode(SHORT, FarEye.manifest)
     assert str(caught.value).startswith(
@@ -105,8 +105,8 @@ def test_a_camera_that_the_robot_does_not_have_is_refused_with_those_that_it_has
     Episode(SHORT, FarEye.manifest, EpisodeOptions(own_camera=True))
 
 
-def test_every_record_and_row_tells_what_the_policy_saw_by() -> None:
-    """Also one of an episode that crashed: the camera itself, the rate, and what is nonstandard of
+def test_every_record_and_row_has_the_camera_of_the_policy() -> None:
+    """Records, also of crashed episodes, have the camera, the rate, and what is nonstandard about
     it."""
     manifest = Manifest(
         "mine",
@@ -151,8 +151,8 @@ def test_every_record_and_row_tells_what_the_policy_saw_by() -> None:
     [(0, 0, 97, 96), (5, 0, 5, 96), (-1, 0, 9, 9), (9, 9, 5, 20), (0, 0, 9)],
     ids=lambda crop: str(crop),
 )
-def test_a_crop_that_is_no_part_of_the_picture_is_refused(crop: tuple[int, int, int, int]) -> None:
-    """In words, with the size of the whole picture."""
+def test_a_crop_outside_the_picture_is_refused(crop: tuple[int, int, int, int]) -> None:
+    """The message has the size of the whole picture."""
     with pytest.raises(
         SpecError, match=r"camera crop must be \(x0, y0, x1, y1\) within 96 x 96 pixels"
     ):
@@ -174,8 +174,8 @@ def test_a_crop_that_is_no_part_of_the_picture_is_refused(crop: tuple[int, int, 
     ],
 )
 def test_a_crop_is_the_slice_of_the_whole_picture(camera: str, lens: Lens) -> None:
-    """To the bit, of colours, labels and depth, whatever the lens does: columns 10 to 50, rows 4 to
-    30."""
+    """Colours, labels and depth of columns 10 to 50, rows 4 to 30, are equal to the bit under any
+    lens."""
     world = BulletWorld(StreetSurface(tiny_map(), 1), (), COURIER)
     robot = RobotState(Pose(-40.0, 100.0, 0.2), 1.0)
     frames = []
@@ -184,21 +184,25 @@ def test_a_crop_is_the_slice_of_the_whole_picture(camera: str, lens: Lens) -> No
         spec = CameraSpec(64, 48, lens=lens, crop=crop)
         with camera_of(camera, world, spec, depth=True) as eyes:  # type: ignore[arg-type]
             frames.append(eyes.render(robot, street))
-    whole, part = frames
+    uncropped, part = frames
     assert spec.size == (40, 26) and part.rgb.shape == (26, 40, 3)
-    assert len(np.unique(whole.rgb)) > 10
-    for one, other in (
-        (whole.rgb, part.rgb),
-        (whole.labels, part.labels),
-        (whole.depth, part.depth),
+    assert len(np.unique(uncropped.rgb)) > 10
+    for expected, other in (
+        (uncropped.rgb, part.rgb),
+        (uncropped.labels, part.labels),
+        (uncropped.depth, part.depth),
     ):
-        assert one is not None and other is not None and np.array_equal(one[4:30, 10:50], other)
+        assert (
+            expected is not None
+            and other is not None
+            and np.array_equal(expected[4:30, 10:50], other)
+        )
 
 
 @pytest.mark.engine
-def test_a_run_with_a_camera_of_its_own_marks_every_row(tmp_path: Path) -> None:
-    """Its rows, its records and its run.json; what the policy gets is the camera that it asked
-    for."""
+def test_a_run_with_a_custom_camera_marks_every_row(tmp_path: Path) -> None:
+    """Rows, records and run.json are marked, and the policy gets the camera that its manifest
+    requests."""
     short = msgspec.structs.replace(small_scenario(), time_limit_s=0.5)
     suite = Suite(name="small", version="1", scenarios=(short,))
     options = EpisodeOptions(own_camera=True, camera="bullet", seed=1)

@@ -1,4 +1,4 @@
-"""From a policy's answer to a command."""
+"""Conversion of a policy's answer to a command."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from cosim.spec.robot import COURIER, Robot
 
 ATAN2 = WaypointRule(rule="atan2")
 QUICK = dataclasses.replace(COURIER, w_max_radps=100.0)
-"""Turns as fast as it is told."""
+"""A courier with practically no limit on turning."""
 
 
-def of(answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER) -> Command:
+def command_for(
+    answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER
+) -> Command:
     command = command_of(answer, rule=rule, robot=robot)
     assert isinstance(command, WaypointCommand) == (not isinstance(answer, Command))
     return Command(command.v_mps, command.w_radps)
@@ -67,7 +69,8 @@ BY_HAND = {
 @pytest.mark.parametrize("name", BY_HAND)
 @pytest.mark.parametrize("rule", [WaypointRule(), ATAN2], ids=["shipped", "atan2"])
 def test_both_rules_turn_as_worked_out_by_hand(name: str, rule: WaypointRule) -> None:
-    """v is x / dt, never backwards; w is that of the rule; only behind the robot the two differ."""
+    """v is x / dt, never negative, w follows the rule, and the two rules differ only behind the
+    robot."""
     x_m, y_m, heading_rad, shipped, atan2 = BY_HAND[name]
     row = (
         [x_m, y_m]
@@ -77,51 +80,54 @@ def test_both_rules_turn_as_worked_out_by_hand(name: str, rule: WaypointRule) ->
     v_mps = 4.0 * x_m if x_m > 1e-8 else 0.0
     expected = (v_mps, shipped if rule is not ATAN2 else atan2)
     assert dataclasses.astuple(
-        of([[9.0] * len(row), [9.0] * len(row), row], rule, QUICK)
+        command_for([[9.0] * len(row), [9.0] * len(row), row], rule, QUICK)
     ) == pytest.approx(expected)
 
 
 def test_a_waypoint_behind_the_robot_turns_it_as_the_models_were_driven() -> None:
-    """(-1, 0.5) at 0.25 s: -1.85 rad/s by the shipped rule, clipped to the courier's -0.65; by
-    atan2 to +0.65."""
+    """(-1, 0.5) at 0.25 s gives -1.85 rad/s by the shipped rule, clipped to -0.65 for the courier,
+    and +0.65 by atan2."""
     answer = [[-1.0, 0.5]] * 3
-    assert of(answer, robot=QUICK).w_radps == pytest.approx(-1.85, abs=0.005)
-    assert of(answer) == Command(0.0, -0.65) and of(answer, ATAN2) == Command(0.0, 0.65)
+    assert command_for(answer, robot=QUICK).w_radps == pytest.approx(-1.85, abs=0.005)
+    assert command_for(answer) == Command(0.0, -0.65) and command_for(answer, ATAN2) == Command(
+        0.0, 0.65
+    )
 
 
 def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> None:
-    """The third one unless it says otherwise; x and y times the unit, in the step that is
-    declared."""
+    """The default is the third one; x and y are multiplied by the unit over the declared step."""
     answer = np.array([[0.1, 0.0], [0.2, 0.1], [0.4, 0.0], [0.5, 0.5]])
-    assert of(answer) == Command(1.6, 0.0)
-    assert of(answer, WaypointRule(index=0)) == Command(0.4, 0.0)
-    assert of(answer, WaypointRule(index=3, unit_m=0.5, dt_s=0.5), QUICK) == Command(
+    assert command_for(answer) == Command(1.6, 0.0)
+    assert command_for(answer, WaypointRule(index=0)) == Command(0.4, 0.0)
+    assert command_for(answer, WaypointRule(index=3, unit_m=0.5, dt_s=0.5), QUICK) == Command(
         0.5, math.pi / 2.0
     )
     scaled = WaypointRule(index=0, unit_m=10.0)
-    assert of([[1e-9, 1e-9, 0.0, 1.0]], scaled, QUICK) == of(
+    assert command_for([[1e-9, 1e-9, 0.0, 1.0]], scaled, QUICK) == command_for(
         [[1e-8, 1e-8, 0.0, 1.0]], WaypointRule(index=0), QUICK
     )
 
 
-def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
+def test_a_command_carries_the_waypoints_that_it_follows() -> None:
     """A command carries its waypoints in metres and the index of the followed one."""
     rule = WaypointRule(index=1, unit_m=0.5)
-    told = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
+    command = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
     assert (
-        isinstance(told, WaypointCommand) and told.index == 1 and told.waypoints.dtype == np.float32
+        isinstance(command, WaypointCommand)
+        and command.index == 1
+        and command.waypoints.dtype == np.float32
     )
     assert np.array_equal(
-        told.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]])
+        command.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]])
     )
-    again = command_of(told, rule=rule, robot=COURIER)
+    again = command_of(command, rule=rule, robot=COURIER)
     assert (
         isinstance(again, WaypointCommand)
-        and again == told
-        and np.array_equal(again.waypoints, told.waypoints)
+        and again == command
+        and np.array_equal(again.waypoints, command.waypoints)
     )
     with pytest.raises(PolicyError, match=r"shape \(3,\)"):
-        of(dataclasses.replace(told, waypoints=np.zeros(3, np.float32)))
+        command_for(dataclasses.replace(command, waypoints=np.zeros(3, np.float32)))
     many = command_of([[1e300, 0.0]] * 1000, rule=WaypointRule(), robot=COURIER)
     assert (
         isinstance(many, WaypointCommand)
@@ -131,9 +137,9 @@ def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
 
 
 def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> None:
-    """Two waypoints, and the third is followed."""
+    """Two waypoints are refused where the third is followed."""
     with pytest.raises(PolicyError) as caught:
-        of([[0.1, 0.0], [0.2, 0.0]])
+        command_for([[0.1, 0.0], [0.2, 0.0]])
     assert str(caught.value) == (
         "answered waypoints of shape (2, 2), and waypoint 2 (from 0) is followed: answer at least "
         "3, or say which one in the manifest, as waypoints=WaypointRule(index=1)"
@@ -141,16 +147,16 @@ def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> No
 
 
 @given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(-math.pi, math.pi))
-def test_the_rules_agree_before_the_robot_and_never_leave_its_limits(
+def test_the_rules_agree_ahead_of_the_robot_and_respect_its_limits(
     x_m: float, y_m: float, heading: float
 ) -> None:
-    """For any waypoint: within the limits; ahead of the robot the same by both; mirrored, it turns
-    the other way."""
+    """For any waypoint commands stay within the limits, agree ahead of the robot, and mirror to the
+    other side."""
     row, mirrored = (
         (x_m, side * y_m, math.cos(heading), side * math.sin(heading)) for side in (1.0, -1.0)
     )
-    one = of([row] * 3)
-    other = of([row] * 3, ATAN2)
+    one = command_for([row] * 3)
+    other = command_for([row] * 3, ATAN2)
     for command in (one, other):
         assert (
             0.0 <= command.v_mps <= COURIER.v_max_mps
@@ -159,16 +165,16 @@ def test_the_rules_agree_before_the_robot_and_never_leave_its_limits(
     assert x_m < 0.0 or (one.v_mps, one.w_radps) == pytest.approx(
         (other.v_mps, other.w_radps), rel=1e-12
     )
-    turned = of([mirrored] * 3)
+    turned = command_for([mirrored] * 3)
     assert turned.v_mps == one.v_mps and turned.w_radps == -one.w_radps
 
 
 def test_commands_are_clipped_to_the_robot() -> None:
     """Speeds beyond the robot's, and driving backwards, are clipped."""
-    assert of(Command(9.0, -9.0)) == Command(2.5, -0.65)
-    assert of(Command(-1.0, 0.1)) == Command(0.0, 0.1)
-    assert of(np.array([[9.0, 9.0], [9.0, 9.0], [9.0, 0.0]])) == Command(2.5, 0.0)
-    assert of([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0]]) == Command(0.4, 0.0)
+    assert command_for(Command(9.0, -9.0)) == Command(2.5, -0.65)
+    assert command_for(Command(-1.0, 0.1)) == Command(0.0, 0.1)
+    assert command_for(np.array([[9.0, 9.0], [9.0, 9.0], [9.0, 0.0]])) == Command(2.5, 0.0)
+    assert command_for([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0]]) == Command(0.4, 0.0)
 
 
 UNUSABLE: dict[str, tuple[object, str]] = {
@@ -215,26 +221,26 @@ UNUSABLE: dict[str, tuple[object, str]] = {
 
 
 @pytest.mark.parametrize("name", UNUSABLE)
-def test_an_unusable_answer_is_refused_with_what_came(name: str) -> None:
-    """NaN, what is not real numbers, wrong shapes and other things raise PolicyError that says what
-    came."""
+def test_an_unusable_answer_is_refused_with_its_value(name: str) -> None:
+    """NaN, values that are not real numbers, wrong shapes and other objects raise PolicyError with
+    the value."""
     answer, message = UNUSABLE[name]
     with pytest.raises(PolicyError) as caught:
-        of(answer)
+        command_for(answer)
     assert message in str(caught.value)
 
 
 def test_numbers_of_every_kind_are_commands() -> None:
-    """Integers and numpy's numbers of any width are read once, as floats."""
-    assert of(Command(1, np.float32(0.5))) == Command(1.0, 0.5)
-    assert of(Command(np.int64(1), np.float16(0.5))) == Command(1.0, 0.5)
-    assert of(np.array([[1, 0]] * 3, dtype=np.uint8)) == Command(2.5, 0.0)
-    assert of(np.array([[0.1, 0]] * 3, dtype=np.longdouble)) == Command(0.4, 0.0)
-    assert of([(0.1, 0.0)] * 3) == Command(0.4, 0.0)
+    """Integers and numpy numbers of any width are read once, as floats."""
+    assert command_for(Command(1, np.float32(0.5))) == Command(1.0, 0.5)
+    assert command_for(Command(np.int64(1), np.float16(0.5))) == Command(1.0, 0.5)
+    assert command_for(np.array([[1, 0]] * 3, dtype=np.uint8)) == Command(2.5, 0.0)
+    assert command_for(np.array([[0.1, 0]] * 3, dtype=np.longdouble)) == Command(0.4, 0.0)
+    assert command_for([(0.1, 0.0)] * 3) == Command(0.4, 0.0)
 
 
 def test_a_clock_counts_in_whole_periods() -> None:
-    """Ticks, substeps and policy periods come from integers, and a rate that does not divide is
+    """Ticks, substeps and policy periods are whole numbers, and a rate that does not divide is
     refused."""
     clock = Clock.for_rate(4)
     assert (clock.substeps, clock.time_s(7), clock.ticks(10.0)) == (10, 0.35, 200)

@@ -1,4 +1,4 @@
-"""A policy at arm's length: what it is given, what it may answer, what it may raise."""
+"""The driver that calls a policy safely: its inputs, its answers, its exceptions."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tests.conftest import without_lines
 MINE = Manifest("mine", camera=None)
 
 
-class Fake:
-    """Acts as it is told."""
+class FakePolicy:
+    """A policy that acts as the test says."""
 
     def __init__(self, act: Callable[[Observation], object], manifest: Manifest = MINE) -> None:
         self.manifest = manifest
@@ -41,7 +41,7 @@ class Fake:
         return self.does(observation)  # type: ignore[return-value]
 
 
-def seen(tick: int = 0, known: Privileged | None = None) -> Observation:
+def observation_at(tick: int = 0, known: Privileged | None = None) -> Observation:
     return Observation(tick, 0.05 * tick, np.full((4, 4, 3), 7, np.uint8), 0.5, 0.0, COURIER, known)
 
 
@@ -69,7 +69,7 @@ def raising(error: BaseException) -> Callable[[Observation], NoReturn]:
     return act
 
 
-class Mute(Exception):
+class UnreadableError(Exception):
     """An error whose message cannot be read."""
 
     def __str__(self) -> str:
@@ -77,7 +77,7 @@ class Mute(Exception):
 
 
 @pytest.fixture
-def deaf() -> object:
+def ctrl_c_ignored() -> object:
     """Ctrl-C is ignored, as in an environment process."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     yield
@@ -85,32 +85,35 @@ def deaf() -> object:
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "expected"),
     [
         (KeyError("no such weight"), "raised KeyError: 'no such weight' (act at 0.10 s)"),
         (SystemExit(3), "raised SystemExit: 3 (act at 0.10 s)"),
         (KeyboardInterrupt(), "raised KeyboardInterrupt (act at 0.10 s)"),
         (GeneratorExit(), "raised GeneratorExit (act at 0.10 s)"),
         (MemoryError(), "raised MemoryError (act at 0.10 s)"),
-        (Mute(), "raised Mute: (its message cannot be read)"),
+        (UnreadableError(), "raised UnreadableError: (its message cannot be read)"),
         (ValueError("\ud800\x1b[2J"), "raised ValueError: ??[2J"),
         (ValueError("x" * 10_000), "... (10000 characters)"),
     ],
     ids=["error", "exit", "ctrl-c", "generator", "memory", "mute", "odd-text", "long-text"],
 )
-def test_whatever_a_policy_raises_is_its_crash(deaf: None, error: BaseException, told: str) -> None:
-    """Also what is no Exception, and what cannot be written down: one message with the policy's
-    name and the time."""
+def test_any_exception_of_a_policy_is_its_crash(
+    ctrl_c_ignored: None, error: BaseException, expected: str
+) -> None:
+    """Also BaseExceptions and unprintable errors give one message with the policy's name and the
+    time."""
     with pytest.raises(PolicyError) as caught:
-        PolicyCaller(Fake(raising(error))).act(seen(tick=2))
-    assert str(caught.value).startswith("policy 'mine' raised ") and told in without_lines(
+        PolicyCaller(FakePolicy(raising(error))).act(observation_at(tick=2))
+    assert str(caught.value).startswith("policy 'mine' raised ") and expected in without_lines(
         str(caught.value)
     )
     str(caught.value).encode()
 
 
 def test_a_crash_names_the_last_line_of_the_users_code() -> None:
-    """File and line of the policy, also where numpy or a class of this project raised."""
+    """The message has file and line of the policy, also where numpy or a class of this project
+    raised."""
 
     def by_numpy(_: Observation) -> Command:
         return Command(float(np.zeros(3).reshape(2)[0]), 0.0)
@@ -119,26 +122,25 @@ def test_a_crash_names_the_last_line_of_the_users_code() -> None:
     with pytest.raises(
         PolicyError, match=rf"size 3 into shape \(2,\) in test_driver\.py:{line} \(act at 0\.00 s\)"
     ):
-        PolicyCaller(Fake(by_numpy)).act(seen(tick=0))
+        PolicyCaller(FakePolicy(by_numpy)).act(observation_at(tick=0))
 
 
 def test_a_reset_that_raises_is_a_crash_too() -> None:
-    """It is told as what happened in reset."""
+    """An exception in reset is a crash whose message names reset."""
     with pytest.raises(
         PolicyError, match=r"policy 'mine' raised SystemExit: 3 in test_driver\.py:\d+ \(reset\)"
     ):
-        PolicyCaller(Fake(lambda _: STILL)).reset("bad", 0)
+        PolicyCaller(FakePolicy(lambda _: STILL)).reset("bad", 0)
 
 
 def test_ctrl_c_is_no_crash() -> None:
-    """Where somebody can press it, it ends what is going on."""
+    """Ctrl-C in an interactive process ends the call as KeyboardInterrupt."""
     with pytest.raises(KeyboardInterrupt):
-        PolicyCaller(Fake(raising(KeyboardInterrupt()))).act(seen())
+        PolicyCaller(FakePolicy(raising(KeyboardInterrupt()))).act(observation_at())
 
 
-def test_an_answer_is_read_once_and_inside_the_door() -> None:
-    """Numbers that raise when they are read, or change each time, cannot leave the robot's
-    limits."""
+def test_an_answer_is_read_once_and_safely() -> None:
+    """Numbers that raise when read, or change each time, cannot exceed the robot's limits."""
 
     class Pretends(float):
         def __float__(self) -> float:
@@ -150,15 +152,15 @@ def test_an_answer_is_read_once_and_inside_the_door() -> None:
             return next(values)
 
     with pytest.raises(PolicyError, match="raised SystemExit: 9"):
-        PolicyCaller(Fake(lambda _: Command(Pretends(1.0), 0.0))).act(seen())
+        PolicyCaller(FakePolicy(lambda _: Command(Pretends(1.0), 0.0))).act(observation_at())
     values = iter([1.0, float("nan"), 99.0])
     shifty = object.__new__(Shifty)
     object.__setattr__(shifty, "w_radps", 0.0)
-    assert PolicyCaller(Fake(lambda _: shifty)).act(seen()) == Command(1.0, 0.0)
+    assert PolicyCaller(FakePolicy(lambda _: shifty)).act(observation_at()) == Command(1.0, 0.0)
 
 
-def test_what_a_policy_writes_into_nobody_sees() -> None:
-    """Pictures, arrays, states and signals that it is given are copies."""
+def test_a_policy_gets_copies_that_it_may_write_to() -> None:
+    """Pictures, arrays, states and signals that it gets are copies."""
 
     def scribbles(observation: Observation) -> Command:
         observation.rgb[:] = 0  # type: ignore[index]
@@ -186,8 +188,8 @@ def test_what_a_policy_writes_into_nobody_sees() -> None:
         return STILL
 
     known = knowledge()
-    observation = seen(known=known)
-    PolicyCaller(Fake(scribbles, dataclasses.replace(MINE, privileged=True))).act(observation)
+    observation = observation_at(known=known)
+    PolicyCaller(FakePolicy(scribbles, dataclasses.replace(MINE, privileged=True))).act(observation)
     assert (observation.rgb == 7).all()
     again = knowledge()
     for kind in ("people", "vehicles"):
@@ -199,7 +201,7 @@ def test_what_a_policy_writes_into_nobody_sees() -> None:
 
 
 def test_a_route_stays_the_same_object_through_an_episode() -> None:
-    """A policy may prepare its route once."""
+    """The route is one object, so that a policy may prepare it once."""
     routes: list[object] = []
 
     def notes(observation: Observation) -> Command:
@@ -207,17 +209,17 @@ def test_a_route_stays_the_same_object_through_an_episode() -> None:
         routes.append(observation.privileged.route)
         return STILL
 
-    driver = PolicyCaller(Fake(notes, dataclasses.replace(MINE, privileged=True)))
+    driver = PolicyCaller(FakePolicy(notes, dataclasses.replace(MINE, privileged=True)))
     known = knowledge()
     for tick in (0, 5):
-        driver.act(seen(tick, known))
+        driver.act(observation_at(tick, known))
     driver.reset("next", 0)
-    driver.act(seen(0, known))
+    driver.act(observation_at(0, known))
     assert routes[0] is routes[1] and routes[2] is not routes[0]
 
 
 def test_a_manifest_is_read_once() -> None:
-    """A policy that declares itself privileged in the middle of an episode still knows nothing."""
+    """A policy that declares itself privileged during an episode still gets no knowledge."""
     known: list[object] = []
 
     def greedy(observation: Observation) -> Command:
@@ -227,22 +229,22 @@ def test_a_manifest_is_read_once() -> None:
         )
         return STILL
 
-    policy = Fake(greedy)
+    policy = FakePolicy(greedy)
     driver = PolicyCaller(policy)
     for tick in range(3):
-        driver.act(seen(tick, knowledge()))
+        driver.act(observation_at(tick, knowledge()))
     assert known == [None] * 3 and driver.manifest == MINE
 
 
-def test_a_child_that_a_policy_forks_does_not_go_on_with_the_episode() -> None:
-    """It ends where the policy returns."""
+def test_a_forked_child_of_a_policy_does_not_continue_the_episode() -> None:
+    """The child ends where the policy returns."""
     read, write = os.pipe()
 
     def forks(_: Observation) -> Command:
         os.fork()
         return STILL
 
-    PolicyCaller(Fake(forks)).act(seen())
+    PolicyCaller(FakePolicy(forks)).act(observation_at())
     os.write(write, b"x")
     _, status = os.wait()
     assert os.read(read, 10) == b"x" and os.waitstatus_to_exitcode(status) == 1
@@ -250,22 +252,22 @@ def test_a_child_that_a_policy_forks_does_not_go_on_with_the_episode() -> None:
 
 def test_a_policy_at_work_is_timed() -> None:
     """Every query of a policy is timed, also one that fails; the first is marked."""
-    told: list[tuple[str, int] | None] = []
+    calls: list[tuple[str, int] | None] = []
 
     class Notes:
         def starts(self, doing: PolicyCall, tick: int) -> None:
-            told.append((doing, tick))
+            calls.append((doing, tick))
 
         def stops(self) -> None:
-            told.append(None)
+            calls.append(None)
 
-    driver = PolicyCaller(Fake(lambda _: STILL), timer=Notes())
+    driver = PolicyCaller(FakePolicy(lambda _: STILL), timer=Notes())
     driver.reset("a", 0)
-    driver.act(seen(0))
-    driver.act(seen(5))
+    driver.act(observation_at(0))
+    driver.act(observation_at(5))
     with pytest.raises(PolicyError):
         driver.reset("bad", 0)
-    assert told == [
+    assert calls == [
         ("reset", 0),
         None,
         ("first act", 0),
@@ -277,15 +279,15 @@ def test_a_policy_at_work_is_timed() -> None:
     ]
 
 
-def test_what_a_policy_writes_into_its_goal_and_further_pictures_nobody_sees() -> None:
-    """Goals that are pictures or patches, depth, labels, pictures of further cameras: copies; and
-    its manifest is what it was, whatever it adds to the one of its class."""
+def test_a_policy_gets_copies_of_its_goal_and_further_pictures() -> None:
+    """Picture and patch goals, depth, labels and further pictures are copies, and changes to its
+    manifest have no effect."""
     ones = np.ones((4, 4), np.uint8)
     grey = np.full((4, 4, 3), 7, np.uint8)
     calibration = Calibration(np.eye(3), np.zeros(5), np.eye(4))
     left = CameraPicture(grey, ones, ones.astype(np.float32), calibration)
-    whole = dataclasses.replace(
-        seen(), depth=ones.astype(np.float32), labels=ones, pictures={"left": left}
+    full_observation = dataclasses.replace(
+        observation_at(), depth=ones.astype(np.float32), labels=ones, pictures={"left": left}
     )
     manifest = dataclasses.replace(MINE, cameras={})
 
@@ -311,38 +313,38 @@ def test_what_a_policy_writes_into_its_goal_and_further_pictures_nobody_sees() -
         manifest.cameras["mast"] = CameraSpec(mount="mast")  # type: ignore[index]
         return STILL
 
-    driver = PolicyCaller(Fake(scribbles, manifest))
+    driver = PolicyCaller(FakePolicy(scribbles, manifest))
     for goal in (ImageGoal(grey), RoutePatch(ones)):
-        driver.act(dataclasses.replace(whole, goal=goal))
+        driver.act(dataclasses.replace(full_observation, goal=goal))
     assert (
         (grey == 7).all()
         and (ones == 1).all()
         and (left.depth == 1).all()
-        and (whole.depth == 1).all()
+        and (full_observation.depth == 1).all()
     )
-    assert set(whole.pictures) == {"left"} and driver.manifest.cameras == {}
+    assert set(full_observation.pictures) == {"left"} and driver.manifest.cameras == {}
 
 
-def put_back(name: str, tick: int) -> Observation:
-    return dataclasses.replace(seen(tick), episode=name, reset=True)
+def after_reset(name: str, tick: int) -> Observation:
+    return dataclasses.replace(observation_at(tick), episode=name, reset=True)
 
 
-class Remembers(Fake):
-    """Notes what it is told, in order."""
+class RecordsCalls(FakePolicy):
+    """Records its calls in order."""
 
     def __init__(self) -> None:
         super().__init__(lambda observation: self.noted("act"))
-        self.told: list[object] = []
+        self.calls: list[object] = []
 
     def noted(self, what: object) -> Command:
-        self.told.append(what)
+        self.calls.append(what)
         return STILL
 
     def on_reset(self) -> None:
         self.noted("on_reset")
 
 
-class RemembersMany(Remembers):
+class RecordsBatchCalls(RecordsCalls):
     """The same for many episodes."""
 
     def on_reset(self, episode_id: str) -> None:  # type: ignore[override]
@@ -357,38 +359,39 @@ class RemembersMany(Remembers):
 
 def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
     """on_reset is called only before the act after a teleport; an error in it is a crash."""
-    policy = Remembers()
+    policy = RecordsCalls()
     driver = PolicyCaller(policy)
-    for observation in (seen(0), put_back("", 5), seen(10)):
+    for observation in (observation_at(0), after_reset("", 5), observation_at(10)):
         driver.act(observation)
     driver.ended()
-    assert policy.told == ["act", "on_reset", "act", "act"]
-    assert PolicyCaller(Fake(lambda one: Command(float(one.reset), 0.0))).act(
-        put_back("", 5)
+    assert policy.calls == ["act", "on_reset", "act", "act"]
+    assert PolicyCaller(FakePolicy(lambda one: Command(float(one.reset), 0.0))).act(
+        after_reset("", 5)
     ) == Command(1.0, 0.0)
     policy.on_reset = lambda: [][0]  # type: ignore[method-assign]
     where = r"in test_driver\.py:\d+ \(on_reset at 0\.50 s\)"
     with pytest.raises(PolicyError, match=rf"raised IndexError: list index out of range {where}"):
-        driver.act(put_back("", 10))
+        driver.act(after_reset("", 10))
 
 
-def test_a_policy_for_many_episodes_is_told_which_was_put_back_and_which_has_ended() -> None:
-    """Also where it is asked for one at a time; once for each episode that has begun."""
-    policy = RemembersMany()
+def test_a_policy_for_many_episodes_gets_each_reset_and_end() -> None:
+    """Also when queried one at a time, `on_reset` and `ended` are called once for each episode that
+    has begun."""
+    policy = RecordsBatchCalls()
     driver = PolicyCaller(policy)
     driver.ended()
     driver.reset("a", 0)
-    driver.act(put_back("a", 5))
+    driver.act(after_reset("a", 5))
     driver.ended()
     driver.ended()
-    assert policy.told == [("on_reset", "a"), "act", ("ended", "a")]
-    assert driver.batches and not PolicyCaller(Remembers()).batches
+    assert policy.calls == [("on_reset", "a"), "act", ("ended", "a")]
+    assert driver.batches and not PolicyCaller(RecordsCalls()).batches
 
 
 def test_an_ended_that_raises_is_printed_and_no_crash(capfd: pytest.CaptureFixture[str]) -> None:
-    """The episode is over."""
+    """An exception in `ended` is printed and is no crash, because the episode is over."""
 
-    class Fails(RemembersMany):
+    class Fails(RecordsBatchCalls):
         def ended(self, episode_id: str) -> None:
             raise LookupError("no such episode")
 

@@ -1,4 +1,5 @@
-"""Episode: held, driven period by period, and refused in words when it is used out of turn."""
+"""Episode: entered, driven period by period, and refused with a remedy when it is used out of
+order."""
 
 from __future__ import annotations
 
@@ -47,8 +48,7 @@ class Ahead:
 
 
 def test_an_episode_is_driven_by_hand_to_the_result_of_a_run(scenario: Scenario) -> None:
-    """reset and advance until it is over: eight observations of four a second, then the record of
-    the same run."""
+    """reset and advance give eight observations at 4 Hz, and then the record of the same run."""
     times = []
     with Episode(scenario, SEEING) as episode:
         observation = episode.reset()
@@ -67,10 +67,10 @@ def test_an_episode_is_driven_by_hand_to_the_result_of_a_run(scenario: Scenario)
 def test_waypoints_are_recorded_as_they_were_answered_and_the_record_replays(
     scenario: Scenario,
 ) -> None:
-    """Blind gives commands for a second, then waypoints, all of which its trajectory has, with the
-    followed one; run again it comes to the same state hash."""
-    came = run_episode(scenario, Blind())
-    record, log = came.record, came.log
+    """After a second of commands the trajectory has all waypoints with the followed one, and the
+    replay has the same state hash."""
+    result = run_episode(scenario, Blind())
+    record, log = result.record, result.log
     assert log is not None and log.answers[:, 0].tolist() == [*range(0, 40, 4)]
     assert log.plan_sizes.tolist() == [0] * 5 + [8] * 5 and log.plan_index == 2
     assert np.array_equal(log.plan_points, np.tile(BEND.astype(np.float32), (5, 1)))
@@ -78,17 +78,16 @@ def test_waypoints_are_recorded_as_they_were_answered_and_the_record_replays(
     assert replay_state_hash(RecordedEpisode(scenario, record, log)) == record.state_hash
 
 
-def test_an_episode_stops_within_a_period_for_who_wants_to_look(scenario: Scenario) -> None:
-    """until_tick ends a period early; the next one ends where it would have ended."""
+def test_until_tick_stops_an_episode_within_a_period(scenario: Scenario) -> None:
+    """until_tick ends a period early, and the next period ends where it would have ended."""
     with Episode(scenario, SEEING) as episode:
         episode.reset()
         assert episode.advance(AHEAD, until_tick=3).tick == 3
         assert episode.advance(AHEAD).tick == 5
 
 
-def test_the_observation_after_a_teleport_says_so() -> None:
-    """Put back after leaving its lane: the next observation, and no other, has `reset`; the first
-    one has not."""
+def test_the_observation_after_a_teleport_has_reset_set() -> None:
+    """Only the observation after the robot left its lane has `reset`; the first one has not."""
     blind = Manifest("blind", rate_hz=4.0, camera=None)
     put_back = []
 
@@ -96,8 +95,8 @@ def test_the_observation_after_a_teleport_says_so() -> None:
         if verdict.reset is not None:
             put_back.append(step.tick)
 
-    whole = msgspec.structs.replace(small_scenario(), time_limit_s=12.0)
-    with Episode(whole, blind, watches=[watch]) as episode:
+    scenario = msgspec.structs.replace(small_scenario(), time_limit_s=12.0)
+    with Episode(scenario, blind, watches=[watch]) as episode:
         seen = [episode.reset()]
         while not episode.over:
             seen.append(episode.advance(Command(1.5, 0.65)))
@@ -107,28 +106,31 @@ def test_the_observation_after_a_teleport_says_so() -> None:
     )
 
 
-def test_an_episode_tells_its_policy_an_opaque_name_and_a_seed(scenario: Scenario) -> None:
-    """Drawn from the run's seed, in every observation and in the record; what happens in the street
-    does not change."""
-    told: list[tuple[str, int]] = []
+def test_a_policy_gets_an_opaque_episode_name_and_a_seed(scenario: Scenario) -> None:
+    """Both follow from the run's seed, are in every observation and the record, and do not change
+    the street."""
+    resets: list[tuple[str, int]] = []
 
     class Noting(Ahead):
         def reset(self, episode_id: str, seed: int) -> None:
-            told.append((episode_id, seed))
+            resets.append((episode_id, seed))
 
         def act(self, observation: Observation) -> Command:
-            assert observation.episode == told[-1][0]
+            assert observation.episode == resets[-1][0]
             return AHEAD
 
     records = [run_episode(scenario, Noting(), EpisodeOptions(seed=seed)).record for seed in (1, 2)]
-    assert told == [episode_id_of(seed, scenario) for seed in (1, 2)] and told[0] != told[1]
-    assert [(one.setup.seed, one.episode) for one in records] == [(1, told[0][0]), (2, told[1][0])]
+    assert resets == [episode_id_of(seed, scenario) for seed in (1, 2)] and resets[0] != resets[1]
+    assert [(one.setup.seed, one.episode) for one in records] == [
+        (1, resets[0][0]),
+        (2, resets[1][0]),
+    ]
     assert records[0].state_hash == records[1].state_hash
 
 
-def test_an_episode_out_of_turn_says_what_to_do_instead(scenario: Scenario) -> None:
-    """Before entering, before reset, twice begun, an answer that is none, after the end, after
-    close: each in words."""
+def test_an_episode_used_out_of_order_is_refused_with_the_remedy(scenario: Scenario) -> None:
+    """Calls before entering, before reset, after the end or close, a second reset and a bad answer
+    are refused."""
     episode = Episode(scenario, SEEING)
     with pytest.raises(UsageError, match="has not been entered: use it in a `with` block"):
         episode.reset()

@@ -1,4 +1,4 @@
-"""Goals: each protocol against a case worked out by hand, and by its seed."""
+"""Goals: each protocol against a case worked out by hand, and their dependence on the seed."""
 
 from __future__ import annotations
 
@@ -67,29 +67,32 @@ def point(goal: Goal | None) -> tuple[float, float]:
 
 
 def test_the_point_of_the_route_lies_5_to_20_m_along_it() -> None:
-    """The goal is set 20 m along the route and set again at 5 m or after a reset; near the end it
-    is the end."""
-    told = goals("route_point")
-    assert point(told.at(Pose(0.0, 0.0, 0.0), 0.0)) == (20.0, 0.0)
-    assert point(told.at(Pose(15.0, 1.0, 0.0), 15.0)) == (5.0, -1.0)
-    assert point(told.at(Pose(15.5, 1.0, NORTH), 15.5)) == (-1.0, -20.0)  # 35.5 m along: (35.5, 0)
-    assert point(told.at(Pose(31.0, 0.0, 0.0), 31.0)) == (9.0, 11.0)  # 51 m along: (40, 11)
-    told.on_reset()
-    assert point(told.at(Pose(25.0, 0.0, 0.0), 25.0)) == (
+    """The goal is set 20 m along the route and again at 5 m or after a reset; near the end it is
+    the end."""
+    protocol = goals("route_point")
+    assert point(protocol.at(Pose(0.0, 0.0, 0.0), 0.0)) == (20.0, 0.0)
+    assert point(protocol.at(Pose(15.0, 1.0, 0.0), 15.0)) == (5.0, -1.0)
+    assert point(protocol.at(Pose(15.5, 1.0, NORTH), 15.5)) == (
+        -1.0,
+        -20.0,
+    )  # 35.5 m along: (35.5, 0)
+    assert point(protocol.at(Pose(31.0, 0.0, 0.0), 31.0)) == (9.0, 11.0)  # 51 m along: (40, 11)
+    protocol.on_reset()
+    assert point(protocol.at(Pose(25.0, 0.0, 0.0), 25.0)) == (
         15.0,
         5.0,
     )  # 26 m were too many: 45 m along, (40, 5)
-    assert point(told.at(Pose(40.0, 58.0, NORTH), 98.0)) == (2.0, 0.0)
+    assert point(protocol.at(Pose(40.0, 58.0, NORTH), 98.0)) == (2.0, 0.0)
 
 
 @pytest.mark.parametrize("s_m", [0.0, 7.3, 14.999, 15.001, 33.0, 61.2, 79.9])
-def test_no_point_of_the_route_is_nearer_or_farther_along_it(s_m: float) -> None:
-    """By arc length it is in [5, 20] m for every robot that drives along the route, in steps of 0.4
+def test_every_point_of_the_route_is_5_to_20_m_along_it(s_m: float) -> None:
+    """Its arc length is in [5, 20] m for every robot that drives along the route, in steps of 0.4
     m."""
-    told = goals("route_point")
+    protocol = goals("route_point")
     line = Polyline(CORNER)
     for here in np.arange(s_m, 80.0, 0.4).tolist():
-        goal = told.at(Pose(0.0, 0.0, 0.0), here)
+        goal = protocol.at(Pose(0.0, 0.0, 0.0), here)
         assert isinstance(goal, PointGoal)
         ahead = line.project(goal.x_m, goal.y_m)[0] - here
         assert 5.0 - 1e-6 <= ahead <= 20.0 + 1e-6
@@ -103,10 +106,9 @@ def test_the_final_point_is_the_goal_in_the_robots_frame() -> None:
     assert goal.bearing_rad == pytest.approx(math.atan2(-30.0, 60.0))
 
 
-def test_random_points_are_drawn_ahead_and_stay_where_they_are_until_reached_or_passed() -> None:
-    """Of 300: 5 to 20 m ahead and up to 5 m aside, over all of that; one stays in the street while
-    the robot drives and turns; within 1 m of it, when it is no longer ahead, and after a reset,
-    another is drawn."""
+def test_random_points_are_drawn_ahead_and_fixed_until_reached_or_passed() -> None:
+    """300 points fill 5 to 20 m ahead and 5 m aside; each stays until it is within 1 m, passed, or
+    the robot is reset."""
     pose = Pose(3.0, -2.0, 0.7)
     first = [point(goals("random_point", seed).at(pose, 0.0)) for seed in range(300)]
     ahead, aside = np.array(first).T
@@ -114,34 +116,34 @@ def test_random_points_are_drawn_ahead_and_stay_where_they_are_until_reached_or_
     assert ahead.min() < 5.5 and ahead.max() > 19.5 and aside.min() < -4.5 and aside.max() > 4.5
     assert abs(ahead.mean() - 12.5) < 0.8 and abs(aside.mean()) < 0.6
 
-    told = goals("random_point", 4)
-    x_m, y_m = point(told.at(Pose(0.0, 0.0, 0.0), 0.0))
-    assert point(told.at(Pose(1.0, 0.0, 0.0), 1.0)) == pytest.approx((x_m - 1.0, y_m))
-    assert point(told.at(Pose(x_m - 2.0, y_m, 0.3), 9.0)) == pytest.approx(
+    protocol = goals("random_point", 4)
+    x_m, y_m = point(protocol.at(Pose(0.0, 0.0, 0.0), 0.0))
+    assert point(protocol.at(Pose(1.0, 0.0, 0.0), 1.0)) == pytest.approx((x_m - 1.0, y_m))
+    assert point(protocol.at(Pose(x_m - 2.0, y_m, 0.3), 9.0)) == pytest.approx(
         (2 * math.cos(0.3), -2 * math.sin(0.3))
     )
-    assert told.at(Pose(x_m - 1.1, y_m, 0.0), 9.0) == PointGoal(
+    assert protocol.at(Pose(x_m - 1.1, y_m, 0.0), 9.0) == PointGoal(
         pytest.approx(1.1), pytest.approx(0.0, abs=1e-9)
     )
-    second = point(told.at(Pose(x_m - 0.9, y_m, 0.0), 9.0))
+    second = point(protocol.at(Pose(x_m - 0.9, y_m, 0.0), 9.0))
     assert 5.0 <= second[0] <= 20.0
-    assert point(told.at(Pose(x_m - 0.9, y_m, 0.0), 9.0)) == second
-    third = point(told.at(Pose(x_m - 0.9, y_m, math.pi), 9.0))
+    assert point(protocol.at(Pose(x_m - 0.9, y_m, 0.0), 9.0)) == second
+    third = point(protocol.at(Pose(x_m - 0.9, y_m, math.pi), 9.0))
     assert 5.0 <= third[0] <= 20.0 and third != second
-    told.on_reset()
-    assert point(told.at(Pose(x_m - 0.9, y_m, math.pi), 9.0)) != third
+    protocol.on_reset()
+    assert point(protocol.at(Pose(x_m - 0.9, y_m, math.pi), 9.0)) != third
 
 
-def test_an_image_is_taken_at_the_next_sub_goal_and_only_when_there_is_another() -> None:
-    """20 m along the route, looking along it; around the corner it looks the other way."""
+def test_an_image_goal_is_taken_once_for_each_sub_goal() -> None:
+    """It is taken 20 m along the route, looking along it; round the corner it looks the other way."""
     looked: list[Pose] = []
 
     def look(pose: Pose) -> np.ndarray:
         looked.append(pose)
         return np.full((2, 2, 3), len(looked), np.uint8)
 
-    told = goals("image", take_picture=look)
-    seen = [told.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 5.0, 15.0, 16.0, 30.0, 32.0)]
+    protocol = goals("image", take_picture=look)
+    seen = [protocol.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 5.0, 15.0, 16.0, 30.0, 32.0)]
     assert [one.rgb[0, 0, 0] for one in seen if isinstance(one, ImageGoal)] == [1, 1, 1, 2, 2, 3]
     assert [tuple(round(v, 9) for v in pose) for pose in looked] == [
         (20.0, 0.0, 0.0),
@@ -150,10 +152,11 @@ def test_an_image_is_taken_at_the_next_sub_goal_and_only_when_there_is_another()
     ]
 
 
-def test_a_random_image_is_noise_of_the_cameras_size_and_one_for_an_episode() -> None:
-    """All values, evenly; the same from beginning to end; another for another seed."""
-    told = goals("random_image", 1, size=(64, 48))
-    first, later = (told.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 50.0))
+def test_a_random_image_is_constant_noise_of_the_cameras_size() -> None:
+    """All values are equally frequent; it is the same throughout an episode and differs with
+    another seed."""
+    protocol = goals("random_image", 1, size=(64, 48))
+    first, later = (protocol.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 50.0))
     other = goals("random_image", 2, size=(64, 48)).at(Pose(0.0, 0.0, 0.0), 0.0)
     assert (
         isinstance(first, ImageGoal)
@@ -165,14 +168,14 @@ def test_a_random_image_is_noise_of_the_cameras_size_and_one_for_an_episode() ->
     assert (first.rgb == later.rgb).all() and (first.rgb != other.rgb).mean() > 0.9
 
 
-def test_an_instruction_tells_turns_and_crosswalks_before_they_come() -> None:
-    """On a route that turns left at 40 m and crosses from 70 to 80 m, to 5 m; beyond 20 m, and
-    afterwards, it is to follow the sidewalk."""
+def test_an_instruction_announces_turns_and_crosswalks() -> None:
+    """A left turn at 40 m and a crosswalk from 70 to 80 m are announced to 5 m; otherwise it says
+    to follow the sidewalk."""
     crossing = RouteCrossing(id="x", enter_s_m=70.0, leave_s_m=80.0, signalised=True)
-    told = goals_for("instruction", scenario(crossings=(crossing,)), np.random.default_rng(0))
+    protocol = goals_for("instruction", scenario(crossings=(crossing,)), np.random.default_rng(0))
     words = {}
     for s_m in np.arange(0.0, 100.0, 0.5).tolist():
-        goal = told.at(Pose(0.0, 0.0, 0.0), s_m)
+        goal = protocol.at(Pose(0.0, 0.0, 0.0), s_m)
         assert isinstance(goal, Instruction)
         words[s_m] = goal.text
     assert (
@@ -192,25 +195,27 @@ def test_an_instruction_tells_turns_and_crosswalks_before_they_come() -> None:
     assert words[68.0] == words[79.5] == "Cross the street at the crosswalk."
 
 
-def test_instructions_tell_turns_and_crosswalks_alone() -> None:
-    """On every metre of the long ways of a suite: no number but the metres to the next turn or
-    crosswalk, to 5 m and at most 20; no word of people, events or where the goal is."""
+def test_instructions_mention_only_turns_and_crosswalks() -> None:
+    """On every metre of long ways the only number is the distance, to 5 m and at most 20; no
+    people, events or goal."""
     what = r"((turn|bear) (left|right)|cross the street at the crosswalk)"
-    told = re.compile(
+    allowed = re.compile(
         rf"(Follow the sidewalk\.|{what}\.( {what}\.)*)( In (5|10|15|20) m, {what}\.)?",
         re.IGNORECASE,
     )
-    heard = set()
+    instructions = set()
     for one in load_suite("long-horizon").scenarios[:12]:
         ways = manoeuvres(one.route_line, one.crossings)
-        heard |= {
+        instructions |= {
             instruction_at(s_m, ways) for s_m in np.arange(0.0, one.route_line.length_m).tolist()
         }
-    assert [text for text in heard if not told.fullmatch(text)] == [] and len(heard) > 8
+    assert [text for text in instructions if not allowed.fullmatch(text)] == [] and len(
+        instructions
+    ) > 8
 
 
 @pytest.mark.parametrize(
-    ("route", "told"),
+    ("route", "expected"),
     [
         ([(0, 0), (60, 0)], []),
         ([(0, 0), (30, 0), (30, -30)], ["turn right"]),
@@ -221,16 +226,17 @@ def test_instructions_tell_turns_and_crosswalks_alone() -> None:
     ],
     ids=["straight", "right", "half", "slight", "two", "curve"],
 )
-def test_what_is_a_turn(route: list[tuple[float, float]], told: list[str]) -> None:
+def test_the_angle_of_a_turn_decides_its_instruction(
+    route: list[tuple[float, float]], expected: list[str]
+) -> None:
     """Of 45 degrees one bears, of 27 one follows the sidewalk, as round a long curve."""
-    assert [one.words for one in manoeuvres(Polyline(route))] == told
+    assert [one.words for one in manoeuvres(Polyline(route))] == expected
     assert instruction_at(0.0, ()) == "Follow the sidewalk."
 
 
 def test_a_route_patch_has_the_route_around_the_robot() -> None:
-    """Ahead is up, left is left, 0.5 m a pixel: a straight way ahead is the two columns whose
-    middles are within half a metre; turned to the left of a robot it is to its right; the corner 10
-    m ahead goes off to the left."""
+    """Ahead is up at 0.5 m a pixel: a straight way is two columns, a turned one is rotated, and a
+    corner leads left."""
     pixels = route_patch_at(Pose(20.0, 0.0, 0.0), np.array([(-100.0, 0.0), (100.0, 0.0)]))
     assert (
         pixels.shape == (80, 80) and pixels.dtype == np.uint8 and set(np.unique(pixels)) == {0, 255}
@@ -256,7 +262,7 @@ def test_a_route_patch_has_the_route_around_the_robot() -> None:
 
 
 def test_route_points_are_two_metres_apart_on_the_route() -> None:
-    """From the robot's place on it, in its frame; they go round a corner and end with the route."""
+    """They begin at the robot's place, in its frame, follow a corner, and end with the route."""
     ahead = goals("route_points").at(Pose(30.0, 1.0, 0.0), 30.0)
     assert isinstance(ahead, RoutePoints) and ahead.points_m.dtype == np.float32
     straight = [(2.0 * i, -1.0) for i in range(6)]
@@ -270,16 +276,18 @@ def test_route_points_are_two_metres_apart_on_the_route() -> None:
 
 @pytest.mark.parametrize("protocol", sorted(GOALS))
 def test_goals_are_the_same_for_the_same_seed(protocol: GoalProtocol) -> None:
-    """Twice the same along a drive; of those that are drawn, another seed gives another."""
+    """A repeated drive has the same goals; where they are drawn, another seed gives others."""
 
     def drive(seed: int) -> list[bytes]:
-        told = goals(
+        goal_source = goals(
             protocol,
             seed,
             size=(8, 6),
             take_picture=lambda pose: np.full((6, 8, 3), int(pose.x_m), np.uint8),
         )
-        along = [told.at(Pose(s_m, 0.5, 0.1), s_m) for s_m in np.arange(0.0, 40.0, 0.5).tolist()]
+        along = [
+            goal_source.at(Pose(s_m, 0.5, 0.1), s_m) for s_m in np.arange(0.0, 40.0, 0.5).tolist()
+        ]
         return [
             msgspec.msgpack.encode(one, enc_hook=lambda array: array.tobytes()) for one in along
         ]
@@ -292,8 +300,7 @@ def test_goals_are_the_same_for_the_same_seed(protocol: GoalProtocol) -> None:
     "kind", [kind for kind in GOALS.values() if kind.type], ids=lambda kind: str(kind.name)
 )
 def test_a_type_of_goal_is_mirrored_copied_and_encoded(kind: GoalKind) -> None:
-    """Twice mirrored, copied, and encoded and decoded it is the same; what a policy is asked about
-    is of its type."""
+    """Mirrored twice, copied, or encoded and decoded it is equal, and a query carries its type."""
     assert kind.type is not None
     for goal in kind.type.example((8, 6)).probes().values():
         assert type(goal) is kind.type
@@ -305,8 +312,8 @@ def test_a_type_of_goal_is_mirrored_copied_and_encoded(kind: GoalKind) -> None:
         assert (left.turn(5.0, 20.0), left.mirrored().turn(5.0, 20.0)) == ("left", "right")
 
 
-def test_goals_and_odometry_that_there_are_none_of_are_refused_with_the_valid_ones() -> None:
-    """By name; a picture as a goal, or a further camera, for a policy without a camera too."""
+def test_unknown_goals_and_odometry_are_refused_with_the_valid_ones() -> None:
+    """So are image goals for policies without a camera."""
     blind = Manifest("blind", camera=None)
     seeing = Manifest("seeing")
     with pytest.raises(
@@ -329,8 +336,8 @@ def test_goals_and_odometry_that_there_are_none_of_are_refused_with_the_valid_on
     )
 
 
-def test_goals_and_odometry_stand_in_every_row() -> None:
-    """Those that the policy was given, and whether it was privileged."""
+def test_goals_and_odometry_are_in_every_row() -> None:
+    """A row has those that the policy got, and whether it was privileged."""
     manifest = with_goal(Manifest("mine", goal="image", odometry="wheel"), "route_point")
     row = table_row(record_of(scenario(), manifest))
     assert (row["goal_protocol"], row["odometry"], row["privileged"]) == (
@@ -340,8 +347,8 @@ def test_goals_and_odometry_stand_in_every_row() -> None:
     )
 
 
-def test_a_camera_is_told_as_computer_vision_has_it() -> None:
-    """A point a metre to the left, on the ground, 5 m ahead of the robot, falls where trigonometry
+def test_a_calibration_follows_the_convention_of_computer_vision() -> None:
+    """A point 1 m to the left, on the ground, 5 m ahead of the robot, projects where trigonometry
     puts it."""
     spec = CameraSpec(64, 48, 60.0, Mount((0.3, 0.0, 0.6), 10.0), Lens(k1=-0.1, k2=0.02))
     camera = calibration_of(spec, COURIER)

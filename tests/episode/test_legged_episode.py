@@ -36,7 +36,7 @@ ABOVE_M = 0.25
 
 @pytest.fixture(params=LEGGED)
 def robot(request: pytest.FixtureRequest) -> str:
-    """A robot with legs; one that needs weights is left out where they are missing."""
+    """A robot with legs; one whose weights are missing is skipped."""
     if robot_called(request.param).drive.gait == "network":  # type: ignore[union-attr]
         request.getfixturevalue("walker_weights")
     return str(request.param)
@@ -47,7 +47,7 @@ def scenario() -> Scenario:
     return msgspec.structs.replace(small_scenario(), time_limit_s=6.0)
 
 
-def walked(scenario: Scenario, robot: str, push_ns: float) -> RecordedEpisode:
+def walk_with_push(scenario: Scenario, robot: str, push_ns: float) -> RecordedEpisode:
     """A walk straight ahead, pushed to the left once."""
     stages: list[StagedScenario] = []
 
@@ -75,25 +75,25 @@ def walked(scenario: Scenario, robot: str, push_ns: float) -> RecordedEpisode:
     return RecordedEpisode(episode.scenario, record, log)
 
 
-def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_walks_on(
+def test_a_fall_on_a_long_route_is_counted_once_and_the_robot_continues(
     scenario: Scenario, robot: str
 ) -> None:
-    """A push of 30 N s fells it; it is reset standing and walks within 2 s; the trajectory agrees
-    with the record."""
-    told, record, log, *_ = walked(scenario, robot, 30.0)
+    """A push of 30 N s fells the robot, which is reset upright and walks within 2 s; trajectory and
+    record agree."""
+    pushed_scenario, record, log, *_ = walk_with_push(scenario, robot, 30.0)
     assert [failure.kind for failure in record.failures] == ["fall"]
     assert (record.measures["falls"], record.measures["failures"]) == (1.0, 1.0)
     (reset,) = np.flatnonzero(np.isfinite(log.reset_s_m)).tolist()
     assert PUSH_TICK < reset == record.failures[0].tick < PUSH_TICK + 40
     assert log.legs.shape == (record.ticks, 16) and log.legs[reset - 2 : reset + 1, 0].all()
     assert log.speed[reset + 40, 0] > 0.4 and not log.legs[reset + 1 :, 0].any()
-    assert [*contradictions(record, told, log)] == []
+    assert [*contradictions(record, pushed_scenario, log)] == []
 
 
 def test_a_walk_replays_to_the_same_state_hash(scenario: Scenario, robot: str) -> None:
-    """Without a push it does not fall, it travels the way between its first and last pose, and run
-    again it has the same hash."""
-    episode = walked(scenario, robot, 0.0)
+    """Without a push it does not fall, travels from its first to its last pose, and replays to the
+    same hash."""
+    episode = walk_with_push(scenario, robot, 0.0)
     straight_m = math.dist(episode.log.pose[0, :2], episode.log.pose[-1, :2])
     assert episode.record.measures["path_length_m"] == pytest.approx(straight_m, rel=0.02)
     assert episode.record.measures["falls"] == 0.0
@@ -101,10 +101,10 @@ def test_a_walk_replays_to_the_same_state_hash(scenario: Scenario, robot: str) -
     assert replay_state_hash(episode, check) == episode.record.state_hash
 
 
-def test_a_body_that_flies_makes_the_episode_invalid_with_the_engines_values(
+def test_a_flying_body_makes_the_episode_invalid_with_its_values(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where every height counts as flying, the row says so; it is no failure of the policy."""
+    """Where every height counts as flying, the row says so, and the policy has not failed."""
     monkeypatch.setattr("physics.dynamics.legs.leg_monitor._FLIES_M", -1.0)
     suite = Suite(name="one", version="1", scenarios=(scenario,))
     options = EpisodeOptions(seed=0, robot=LEGGED[0])
@@ -115,7 +115,7 @@ def test_a_body_that_flies_makes_the_episode_invalid_with_the_engines_values(
 
 @pytest.mark.parametrize(("suite", "solved"), [("unit", "curve-001"), ("reactive", "lateral-001")])
 def test_the_oracle_solves_scenarios_on_legs(robot: str, suite: str, solved: str) -> None:
-    """One of each suite without a failure."""
+    """It solves one scenario of each suite without a failure."""
     options = EpisodeOptions(seed=0, robot=robot)
     (row,) = cosim.run(suite, "orca", scenarios=[solved], options=options).to_dict("records")
     assert (row["status"], row["success"], row["falls"]) == ("done", 1.0, 0.0), row["reason"]

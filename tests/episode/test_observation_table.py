@@ -1,4 +1,4 @@
-"""The table in docs/observations.md of all that an observation holds, against observations of real
+"""The table of all observation attributes in docs/observations.md, against observations of real
 episodes."""
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ WHOLE = ("Skid", "Mount", "ScanSpec", "Polyline", "Polygon", "MultiPolygon", "Po
 
 
 class Row(NamedTuple):
-    """An attribute as the table has it. types: of its value, any of these."""
+    """An attribute in the table; its value has one of `types`."""
 
     path: str
     asked: str
@@ -63,7 +63,7 @@ class Row(NamedTuple):
 
 
 def table() -> list[Row]:
-    """The table of the page, a row for each attribute."""
+    """Return the rows of the page's table, one for each attribute."""
     lines = (
         text_of("docs/observations.md")
         .partition("| of `observation` |")[2]
@@ -72,9 +72,11 @@ def table() -> list[Row]:
     )
     found = []
     for line in lines:
-        named, asked, types, words = (cell.strip() for cell in line.strip("|").split(" | "))
+        named, requested_by, types, words = (cell.strip() for cell in line.strip("|").split(" | "))
         stated = tuple(types.split(" or ")) if " of " not in types else (types,)
-        found += [Row(path, asked, stated, words) for path in re.findall(r"`([^`]+)`", named)]
+        found += [
+            Row(path, requested_by, stated, words) for path in re.findall(r"`([^`]+)`", named)
+        ]
     return found
 
 
@@ -82,7 +84,7 @@ TABLE = table()
 
 
 def fits(value: Any, stated: str) -> bool:
-    """Whether a value is of the type that a cell of the table states."""
+    """Return whether a value has the type that a cell of the table states."""
     of = re.fullmatch(r"`(\w+)` of `(\w+)` to `(\w+)`", stated)
     if of:
         holds, key, item = of.groups()
@@ -106,12 +108,12 @@ def fits(value: Any, stated: str) -> bool:
     )
 
 
-def held(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every public attribute below an observation, with its path: fields and properties, not
-    methods. Those of a camera stand in the table once."""
+def public_attributes(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Return every public attribute of an observation by its path: fields and properties, cameras
+    once."""
     if isinstance(value, Mapping) and "signals" not in path and "mounts" not in path:
         for name, item in value.items():
-            yield from held(item, f'{path}["{name}"]')
+            yield from public_attributes(item, f'{path}["{name}"]')
         return
     if dataclasses.is_dataclass(value):
         names = [field.name for field in dataclasses.fields(value)]
@@ -131,14 +133,14 @@ def held(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         part = getattr(value, name)
         yield below, part
         if type(part).__name__ not in WHOLE and name != "spec":
-            yield from held(part, "camera" if name == "camera" else below)
+            yield from public_attributes(part, "camera" if name == "camera" else below)
 
 
-def untrue(seen: Any, goal: str = "") -> list[str]:
-    """What of an observation is not in the table, or not of a type that it states. goal: by which
+def mismatches(seen: Any, goal: str = "") -> list[str]:
+    """Return attributes of an observation that the table lacks or gives another type, for a goal
     protocol."""
     found = []
-    for path, value in held(seen):
+    for path, value in public_attributes(seen):
         rows = [
             row
             for row in TABLE
@@ -151,13 +153,13 @@ def untrue(seen: Any, goal: str = "") -> list[str]:
 
 
 def paths(seen: Any) -> set[str]:
-    return {path for path, _ in held(seen)}
+    return {path for path, _ in public_attributes(seen)}
 
 
 @pytest.fixture(scope="module")
 def seen() -> dict[str, Observation]:
-    """An observation by each goal protocol of a policy that asks for everything, by one of them
-    among people."""
+    """Observations by each goal protocol of a policy that requests everything, one of them among
+    people."""
     found = {}
     for protocol in get_args(GoalProtocol):
         scenario = small_scenario()
@@ -175,9 +177,9 @@ def seen() -> dict[str, Observation]:
 
 @pytest.mark.engine
 def test_the_table_has_every_attribute_of_an_observation(seen: dict[str, Observation]) -> None:
-    """By every goal protocol: each attribute is in the table with its type, and no other."""
+    """By every goal protocol each attribute is in the table with its type, and no other is."""
     for protocol, one in seen.items():
-        assert untrue(one, protocol) == []
+        assert mismatches(one, protocol) == []
     assert {row.path for row in TABLE} == set().union(*map(paths, seen.values()))
     assert {row.asked for row in TABLE if row.path == "goal"} == {
         f'`goal="{protocol}"`' for protocol in seen
@@ -187,7 +189,7 @@ def test_the_table_has_every_attribute_of_an_observation(seen: dict[str, Observa
 
 
 def test_the_table_of_goal_protocols_is_that_of_the_source() -> None:
-    """Name, type and summary of each row of `GOALS`, in their order."""
+    """The page has name, type and summary of each row of `GOALS`, in their order."""
     lines = (
         text_of("docs/observations.md")
         .partition("| `goal=` |")[2]
@@ -204,8 +206,8 @@ def test_the_table_of_goal_protocols_is_that_of_the_source() -> None:
     assert get_args(GoalProtocol) == tuple(GOALS)
 
 
-def test_who_asks_for_nothing_gets_none() -> None:
-    """What the table says is None without being asked for: the defaults of an observation."""
+def test_attributes_that_are_not_requested_are_none() -> None:
+    """A default observation is None where the table says so."""
     fields = {field.name: field.default for field in dataclasses.fields(Observation)}
     absent = {row.path for row in TABLE if "`None`" in row.words and "." not in row.path} | {
         "depth",
@@ -226,9 +228,9 @@ def test_who_asks_for_nothing_gets_none() -> None:
 
 
 @pytest.mark.engine
-def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Observation]) -> None:
-    """Isolated and served policies get the same types; one without cosim the same names, but for
-    those that the page lists, and the same arrays of goals and odometry."""
+def test_the_table_holds_for_isolated_and_served_policies(seen: dict[str, Observation]) -> None:
+    """Types are the same with cosim; without it names and arrays are, except for those that the
+    page lists."""
     listed = (
         text_of("docs/observations.md")
         .partition("It lacks these attributes: ")[2]
@@ -237,30 +239,30 @@ def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Obs
     lacking = set(re.findall(r"`([\w.]+)`", listed))
     assert len(lacking) == 6
     for protocol, one in seen.items():
-        afar, plain = hosted(one)
+        afar, plain = decoded_elsewhere(one)
         given = dataclasses.replace(one, privileged=None)
         assert paths(afar) == paths(given) and paths(plain) == paths(given) - lacking
         own = [
             line
-            for line in untrue(plain, protocol)
+            for line in mismatches(plain, protocol)
             if "namespace(" not in line and "_Plain" not in line
         ]
-        assert {*untrue(afar, protocol), *own} == {"privileged is None, not `Privileged`"}
+        assert {*mismatches(afar, protocol), *own} == {"privileged is None, not `Privileged`"}
         for name in ("odometry", "scan", "imu", "people", "goal"):
             if name != "goal" or protocol not in ("none", "instruction"):
                 assert np.array_equal(getattr(plain, name), getattr(one, name))
 
 
-def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
-    """What a policy gets in another process with cosim, and in one without."""
+def decoded_elsewhere(seen: Observation) -> tuple[Observation, SimpleNamespace]:
+    """Return what a policy gets in another process with cosim, and in one without."""
     fields, arrays = encode_observation(dataclasses.replace(seen, privileged=None))
     laid = {name: pack_array(array) for name, array in arrays.items()}
     about = encode_constants(seen)
-    asked = ActRequest("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
-    came = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=ActRequest)
-    copies = {name: unpack_array(array) for name, array in came.arrays.items()}
+    request = ActRequest("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
+    received = msgspec.msgpack.decode(msgspec.msgpack.encode(request), type=ActRequest)
+    copies = {name: unpack_array(array) for name, array in received.arrays.items()}
     afar, plain = (
-        kind(seen.episode, came.about).decoded(came, copies)
+        kind(seen.episode, received.about).decoded(received, copies)
         for kind in (ObservationDecoder, EpisodeDecoder)
     )
     return afar, plain
@@ -268,16 +270,16 @@ def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
 
 @pytest.mark.engine
 def test_an_observation_that_is_sent_arrives_equal_to_the_bit(seen: dict[str, Observation]) -> None:
-    """By every goal protocol: each array and number, what the simulator knows included."""
+    """By every goal protocol each array and number arrives, privileged knowledge included."""
     for one in seen.values():
         fields, arrays = encode_observation(one)
-        asked = ActRequest("r", one.episode, "a", 0, **fields)
-        came = ObservationDecoder(one.episode, encode_constants(one)).decoded(asked, arrays)
-        assert bytes_of(one) == bytes_of(came)
+        request = ActRequest("r", one.episode, "a", 0, **fields)
+        received = ObservationDecoder(one.episode, encode_constants(one)).decoded(request, arrays)
+        assert bytes_of(one) == bytes_of(received)
 
 
 def bytes_of(seen: Observation) -> bytes:
-    """Everything in an observation."""
+    """Return everything in an observation as bytes."""
 
     def extra(value: object) -> object:
         if isinstance(value, Polyline):
@@ -288,9 +290,8 @@ def bytes_of(seen: Observation) -> bytes:
 
 
 def test_goals_and_odometry_are_arrays_for_numpy() -> None:
-    """A point is x and y, a pose x, y and heading, without one x and y; pictures and patches are
-    their pixels; what is no array says what to read. Equality, hashes and messages are those of the
-    fields."""
+    """Points, poses and pictures convert to arrays, other goals name the attribute to read;
+    equality and hashes follow the fields."""
     point = PointGoal(3.0, -4.0)
     pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     assert np.asarray(point).tolist() == [3.0, -4.0] and np.asarray(point).dtype == float
@@ -298,13 +299,19 @@ def test_goals_and_odometry_are_arrays_for_numpy() -> None:
     assert np.stack([point, point]).shape == (2, 2)  # type: ignore[call-overload]
     assert np.asarray(Odometry(1.0, 2.0, 0.5)).tolist() == [1.0, 2.0, 0.5]
     assert np.asarray(Odometry(1.0, 2.0, None)).tolist() == [1.0, 2.0]
-    for one in (ImageGoal(pixels), RoutePatch(pixels), CameraPicture(pixels, None, None, CAMERA)):
-        assert np.asarray(one) is pixels and np.asarray(one, np.float32).dtype == np.float32
-    for one, words in (
+    for expected in (
+        ImageGoal(pixels),
+        RoutePatch(pixels),
+        CameraPicture(pixels, None, None, CAMERA),
+    ):
+        assert (
+            np.asarray(expected) is pixels and np.asarray(expected, np.float32).dtype == np.float32
+        )
+    for expected, words in (
         (Instruction("Stop."), "read observation.goal.text"),
         (CAMERA, r"read .matrix \(3, 3\)"),
     ):
         with pytest.raises(TypeError, match=words):
-            np.asarray(one)
+            np.asarray(expected)
     assert point == PointGoal(3.0, -4.0) and hash(point) == hash(PointGoal(3.0, -4.0))
     assert msgspec.json.encode(point) == b'{"type":"point","x_m":3.0,"y_m":-4.0}'

@@ -1,5 +1,5 @@
-"""What a policy is given: what its manifest asks for, from a seed, and nothing that only the
-simulator knows."""
+"""Observations: what the manifest requests, drawn from a seed, and nothing that only the simulator
+knows."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def moment(tick: int = 20, pose: Pose = HERE) -> Moment:
     )
 
 
-class Eye:
-    """A camera that draws who is there: one pixel brighter for each."""
+class CountingCamera:
+    """A camera that draws people as one brighter pixel each."""
 
     def __init__(self, spec: CameraSpec) -> None:
         self.spec = spec
@@ -73,7 +73,7 @@ class Eye:
         return Frame(rgb, np.zeros(rgb.shape[:2], np.uint8), np.ones(rgb.shape[:2], np.float32))
 
 
-def unknown_here(now: Moment) -> Privileged:
+def no_knowledge(now: Moment) -> Privileged:
     raise AssertionError("what the simulator knows was asked for")
 
 
@@ -81,19 +81,19 @@ def observed(
     manifest: Manifest,
     now: Moment | None = None,
     seed: int = 3,
-    known: Callable[[Moment], Privileged] = unknown_here,
+    known: Callable[[Moment], Privileged] = no_knowledge,
 ) -> Observation:
-    """What a policy is given in a street with two people."""
-    eye = None if manifest.camera is None else Eye(manifest.camera)
+    """Return what a policy observes in a street with two people."""
+    eye = None if manifest.camera is None else CountingCamera(manifest.camera)
     observer = observing(manifest, seed, known)
     return observer.observed(now or moment(), 1.0, eye, was_reset=False)[0]
 
 
 def observing(
-    manifest: Manifest, seed: int = 3, known: Callable[[Moment], Privileged] = unknown_here
+    manifest: Manifest, seed: int = 3, known: Callable[[Moment], Privileged] = no_knowledge
 ) -> Observer:
-    eye = None if manifest.camera is None else Eye(manifest.camera)
-    further = {name: Eye(spec) for name, spec in manifest.cameras.items()}
+    eye = None if manifest.camera is None else CountingCamera(manifest.camera)
+    further = {name: CountingCamera(spec) for name, spec in manifest.cameras.items()}
 
     def look(pose: Pose) -> np.ndarray:
         assert eye is not None
@@ -102,19 +102,19 @@ def observing(
     return Observer(SCENARIO, manifest, seed, known, further, look)
 
 
-def test_who_asks_for_nothing_gets_nothing_more() -> None:
-    """Speeds, time and its robot; no picture, goal, odometry, calibration, depth, labels or
+def test_a_default_manifest_gets_only_the_basic_observation() -> None:
+    """It has speeds, time and robot, but no picture, goal, odometry, calibration, depth, labels or
     knowledge."""
     seen = observed(Manifest("blind", camera=None))
-    given = {
+    goal_and_odometry = {
         f.name for f in dataclasses.fields(seen) if getattr(seen, f.name) not in (None, {}, False)
     }
-    assert given == {"tick", "time_s", "v_mps", "w_radps", "robot", "episode"}
+    assert goal_and_odometry == {"tick", "time_s", "v_mps", "w_radps", "robot", "episode"}
 
 
-def test_each_thing_that_is_asked_for_is_given() -> None:
-    """Depth and labels of the cameras that ask for them, goals without the people whom the picture
-    shows."""
+def test_each_requested_sensor_is_given() -> None:
+    """Cameras get the depth and labels that they request, and image goals lack the people of the
+    picture."""
     spec = CameraSpec(8, 6, depth=True)
     manifest = Manifest(
         "all",
@@ -147,12 +147,11 @@ def test_each_thing_that_is_asked_for_is_given() -> None:
 
 @pytest.mark.parametrize("protocol", get_args(GoalProtocol))
 @pytest.mark.parametrize("odometry", get_args(OdometryKind))
-def test_nothing_privileged_is_reached_from_an_observation(
+def test_an_observation_gives_no_access_to_privileged_values(
     protocol: GoalProtocol, odometry: OdometryKind
 ) -> None:
-    """By attributes, containers, closures, weak references and bases of arrays: no value of the
-    simulator's types, no name of the scenario, a person or an event, no number of the map, however
-    the goal is told."""
+    """No attribute, container, closure, weak reference or array base of any goal protocol leads to
+    simulator values."""
     cameras = {"left": CameraSpec(4, 4, mount="left", depth=True, labels=True)}
     spec = CameraSpec(8, 6, depth=True, labels=True)
     seen = observed(Manifest("all", camera=spec, goal=protocol, odometry=odometry, cameras=cameras))
@@ -196,38 +195,43 @@ PLANTS += ["name", "key"]
 
 
 @pytest.mark.parametrize("what", PLANTS)
-def test_the_sweep_finds_what_is_hidden(what: str) -> None:
-    """Each way to hand something on is one that it knows."""
+def test_the_sweep_finds_every_kind_of_leak(what: str) -> None:
+    """Each planted way to pass a privileged value on is found."""
     assert leaks(_planted(observed(Manifest("blind", camera=None)), what), SCENARIO, moment())
 
 
-def test_what_the_simulator_knows_goes_to_who_declares_it() -> None:
-    """And its goal beside it."""
-    told: list[Moment] = []
+def test_privileged_policies_get_the_simulators_knowledge() -> None:
+    """They get it in addition to their goal."""
+    moments: list[Moment] = []
     nothing = cast(Privileged, object())
 
     def known(now: Moment) -> Privileged:
-        told.append(now)
+        moments.append(now)
         return nothing
 
     seen = observed(
         Manifest("knows", camera=None, privileged=True, goal="final_point"), known=known
     )
-    assert seen.privileged is nothing and len(told) == 1 and isinstance(seen.goal, PointGoal)
+    assert seen.privileged is nothing and len(moments) == 1 and isinstance(seen.goal, PointGoal)
 
 
-def test_goals_and_errors_are_drawn_from_the_runs_seed_each_by_itself() -> None:
-    """The same seed gives the same, another another, of both; odometry changes no goal."""
+def test_goals_and_errors_are_drawn_independently_from_the_runs_seed() -> None:
+    """Goals and errors repeat with the seed and differ with another, and odometry changes no goal."""
 
-    def given(seed: int, odometry: OdometryKind = "gps") -> tuple[object, Odometry | None]:
+    def goal_and_odometry(
+        seed: int, odometry: OdometryKind = "gps"
+    ) -> tuple[object, Odometry | None]:
         seen = observed(
             Manifest("mine", camera=None, goal="random_point", odometry=odometry), seed=seed
         )
         return seen.goal, seen.odometry
 
-    assert given(3) == given(3)
-    assert given(3)[0] != given(4)[0] and given(3)[1] != given(4)[1]
-    assert given(3, "wheel")[0] == given(3)[0]
+    assert goal_and_odometry(3) == goal_and_odometry(3)
+    assert (
+        goal_and_odometry(3)[0] != goal_and_odometry(4)[0]
+        and goal_and_odometry(3)[1] != goal_and_odometry(4)[1]
+    )
+    assert goal_and_odometry(3, "wheel")[0] == goal_and_odometry(3)[0]
 
 
 def drove(before: Pose, after: Pose) -> Step:
@@ -237,21 +241,21 @@ def drove(before: Pose, after: Pose) -> Step:
 
 
 def test_a_reset_gives_another_random_point_and_is_not_counted_by_the_wheels() -> None:
-    """Driven 2 m, then put back by 6 m: the wheels have counted 2 m, and the point lies 5 to 20 m
-    ahead of it."""
+    """After 2 m of driving and a reset by 6 m the wheels count 2 m, and the point is 5 to 20 m
+    ahead."""
     observer = observing(Manifest("mine", camera=None, goal="random_point", odometry="wheel"))
-    start, there, back = (Pose(101.3 + d, 57.7, 0.0) for d in (0.0, 2.0, -4.0))
+    start, ahead, back = (Pose(101.3 + d, 57.7, 0.0) for d in (0.0, 2.0, -4.0))
     first = observer.observed(moment(0, start), 0.0, None, was_reset=False)[0].goal
-    observer.moved(drove(start, there), is_reset=False)
-    kept = observer.observed(moment(5, there), 0.25, None, was_reset=False)[0].goal
-    observer.moved(drove(there, there), is_reset=True)
+    observer.moved(drove(start, ahead), is_reset=False)
+    unchanged = observer.observed(moment(5, ahead), 0.25, None, was_reset=False)[0].goal
+    observer.moved(drove(ahead, ahead), is_reset=True)
     seen = observer.observed(moment(6, back), 0.3, None, was_reset=True)[0]
     assert (
         isinstance(first, PointGoal)
-        and isinstance(kept, PointGoal)
+        and isinstance(unchanged, PointGoal)
         and isinstance(seen.goal, PointGoal)
     )
-    assert (kept.x_m, kept.y_m) == pytest.approx((first.x_m - 2.0, first.y_m))
+    assert (unchanged.x_m, unchanged.y_m) == pytest.approx((first.x_m - 2.0, first.y_m))
     assert 5.0 <= seen.goal.x_m <= 20.0 and abs(seen.goal.x_m - (first.x_m + 4.0)) > 1e-6
     assert (
         seen.odometry is not None
@@ -260,6 +264,6 @@ def test_a_reset_gives_another_random_point_and_is_not_counted_by_the_wheels() -
     )
 
 
-def test_a_robot_is_told_of_itself_alone() -> None:
-    """Its size, limits and mounts are those of the table: the same value for every episode."""
+def test_the_robot_description_is_that_of_the_table() -> None:
+    """Size, limits and mounts are the same value in every episode."""
     assert observed(Manifest("blind", camera=None)).robot is COURIER

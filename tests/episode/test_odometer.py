@@ -14,7 +14,7 @@ from cosim.spec.odometry import LEG_NOISE, DriftNoise, GpsNoise, Odometry
 from cosim.spec.robot import DOG
 
 START = Pose(10.0, 20.0, 0.5 * math.pi)
-"""Looking north."""
+"""The start pose, facing north."""
 
 
 def driven(odometer: Odometer, poses: list[Pose]) -> Odometry | None:
@@ -29,30 +29,29 @@ def straight(far_m: float, steps: int = 100) -> list[Pose]:
     ]
 
 
-def test_exact_odometry_is_where_the_robot_is_from_its_start() -> None:
-    """3 m north and 2 m west of a start that looks north, looking west: 3 m ahead, 2 m left, a
-    quarter turn; carried or driven."""
-    told = odometer_for("exact", START, np.random.default_rng(0)).read(
+def test_exact_odometry_is_the_pose_relative_to_the_start() -> None:
+    """3 m north and 2 m west of a start facing north is 3 m ahead and 2 m left, carried or driven."""
+    reading = odometer_for("exact", START, np.random.default_rng(0)).read(
         Pose(8.0, 23.0, math.pi), 1.0
     )
-    assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
-    assert (told.x_m, told.y_m) == pytest.approx((3.0, 2.0))
+    assert reading is not None and reading.heading_rad == pytest.approx(0.5 * math.pi)
+    assert (reading.x_m, reading.y_m) == pytest.approx((3.0, 2.0))
     assert odometer_for("none", START, np.random.default_rng(0)).read(START, 1.0) is None
 
 
-def test_wheels_without_errors_count_the_way_and_not_what_carries_the_robot() -> None:
-    """A quarter circle of 5 m to the left; then it is put elsewhere, and drives 2 m on."""
+def test_wheels_without_errors_count_driving_and_not_resets() -> None:
+    """A quarter circle of 5 m to the left and 2 m after a reset are counted, the reset is not."""
     counted = DeadReckoning(np.random.default_rng(0), DriftNoise(0.0, 0.0, 0.0, 0.0, 0.0))
     angles = np.linspace(0.0, 0.5 * math.pi, 200).tolist()
-    told = driven(counted, [Pose(5 * math.sin(a), 5 - 5 * math.cos(a), a) for a in angles])
-    assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
-    assert (told.x_m, told.y_m) == pytest.approx((5.0, 5.0), abs=1e-3)
-    told = driven(counted, straight(2.0))
-    assert told is not None and (told.x_m, told.y_m) == pytest.approx((5.0, 7.0), abs=1e-3)
+    reading = driven(counted, [Pose(5 * math.sin(a), 5 - 5 * math.cos(a), a) for a in angles])
+    assert reading is not None and reading.heading_rad == pytest.approx(0.5 * math.pi)
+    assert (reading.x_m, reading.y_m) == pytest.approx((5.0, 5.0), abs=1e-3)
+    reading = driven(counted, straight(2.0))
+    assert reading is not None and (reading.x_m, reading.y_m) == pytest.approx((5.0, 7.0), abs=1e-3)
 
 
 def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
-    """1 m aside is counted to a few per cent; over 30 m the heading drifts by 15 degrees."""
+    """1 m aside is counted within a few per cent, and over 30 m the heading drifts by 15 degrees."""
     aside = [
         driven(
             odometer_for("wheel", START, np.random.default_rng(seed), DOG),
@@ -72,9 +71,9 @@ def test_legs_count_steps_aside_and_drift_more_than_wheels() -> None:
     assert headings.std() == pytest.approx(expected, rel=0.15)
 
 
-def test_wheels_are_as_wrong_as_declared() -> None:
-    """Over 400 episodes of 100 m: scale and noise make the length, drift and noise the heading;
-    nothing is wrong of a robot that stands."""
+def test_wheel_errors_are_as_declared() -> None:
+    """In 400 episodes of 100 m the errors of length and heading are those declared; a robot at rest
+    has none."""
     noise = DriftNoise()
     far_m = 100.0
     ends = [
@@ -93,33 +92,34 @@ def test_wheels_are_as_wrong_as_declared() -> None:
     assert driven(DeadReckoning(np.random.default_rng(1)), [START] * 100) == Odometry(0.0, 0.0, 0.0)
 
 
-def test_fixes_are_as_wrong_as_declared() -> None:
-    """Over 400 episodes each fix is off by noise and bias; from one second to the next by the noise
-    alone, nearly; a minute later the bias is another; no heading is told."""
+def test_position_fix_errors_are_as_declared() -> None:
+    """In 400 episodes fixes have the declared noise and a bias that drifts over minutes, and no
+    heading."""
     noise = GpsNoise()
     errors = []
     for seed in range(400):
         gps = Gps(START, np.random.default_rng(seed))
-        told = [gps.read(Pose(10.0, 23.0, 0.0), time_s) for time_s in (0.0, 1.0, 61.0)]
-        assert {one.heading_rad for one in told} == {None}
-        errors.append([(one.x_m - 3.0, one.y_m) for one in told])
+        fixes = [gps.read(Pose(10.0, 23.0, 0.0), time_s) for time_s in (0.0, 1.0, 61.0)]
+        assert {one.heading_rad for one in fixes} == {None}
+        errors.append([(one.x_m - 3.0, one.y_m) for one in fixes])
     off = np.array(errors)
     assert off.std(axis=0) == pytest.approx(
         np.full((3, 2), math.hypot(noise.noise_m, noise.bias_m)), rel=0.12
     )
     short, long = (off[:, 1] - off[:, 0]).std(), (off[:, 2] - off[:, 1]).std()
-    kept = math.exp(-1.0 / 60.0)
+    correlation = math.exp(-1.0 / 60.0)
     assert short == pytest.approx(
-        math.hypot(math.sqrt(2) * noise.noise_m, noise.bias_m * math.sqrt(2 - 2 * kept)), rel=0.1
+        math.hypot(math.sqrt(2) * noise.noise_m, noise.bias_m * math.sqrt(2 - 2 * correlation)),
+        rel=0.1,
     )
     assert long > 2.0 * short
 
 
 @pytest.mark.parametrize("kind", ["exact", "wheel", "gps"])
 def test_odometry_is_the_same_for_the_same_seed(kind: str) -> None:
-    """And another for another, but where it has no error."""
+    """Another seed gives another odometry, unless it has no error."""
 
-    def told(seed: int) -> Odometry | None:
+    def reading(seed: int) -> Odometry | None:
         return driven(odometer_for(kind, START, np.random.default_rng(seed)), straight(30.0))  # type: ignore[arg-type]
 
-    assert told(3) == told(3) and (told(3) == told(4)) == (kind == "exact")
+    assert reading(3) == reading(3) and (reading(3) == reading(4)) == (kind == "exact")

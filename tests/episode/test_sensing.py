@@ -1,4 +1,4 @@
-"""Lidar, inertial sensor and tracked people: as wrong as they are declared, and no more."""
+"""Lidar, inertial sensor and tracked people have exactly their declared errors."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from tests.support.tiny_street import tiny_map
 ROBOT = RobotState(Pose(3.0, 4.0, 0.5 * math.pi))
 
 
-class Open:
-    """An open street: every person is visible, walls are 5 m away, ahead there is nothing."""
+class OpenStreet:
+    """An open street where every person is visible, walls are 5 m away, and nothing is ahead."""
 
     def distances(
         self,
@@ -68,10 +68,10 @@ def walking(*kinds: PersonKind, far_m: float = 6.0, east_m: float = 0.0) -> Stre
 
 
 def test_a_scan_has_declared_noise_and_no_return_where_there_is_none() -> None:
-    """Over 200 scans distances of 5 m have the mean and deviation of the spec; the same seed
+    """Over 200 scans distances of 5 m have the mean and deviation of the spec, and the same seed
     repeats them."""
     spec = ScanSpec(rays=64, noise_m=0.05)
-    lidar, again = (Lidar(spec, Open(), np.random.default_rng(7)) for _ in range(2))
+    lidar, again = (Lidar(spec, OpenStreet(), np.random.default_rng(7)) for _ in range(2))
     scans = np.stack([lidar.read(ROBOT, Street(0)).ranges_m[0] for _ in range(200)])
     assert scans.dtype == np.float32 and np.isinf(scans[:, 32]).all()
     hit = scans[np.isfinite(scans)]
@@ -81,10 +81,9 @@ def test_a_scan_has_declared_noise_and_no_return_where_there_is_none() -> None:
 
 
 def test_tracks_have_declared_errors_misses_and_switches() -> None:
-    """Two people 6 m ahead, in 4,000 observations of 0.1 s: position, velocity, share of misses and
-    rate of switches are those of `TrackNoise`. The velocity is that of their motion, wherever they
-    face: 0.6 m to the east in eight ticks."""
-    tracker = Tracker(COURIER, Open(), np.random.default_rng(1))
+    """In 4,000 observations of two people errors, misses and switches are as declared; velocity
+    follows motion, not facing."""
+    tracker = Tracker(COURIER, OpenStreet(), np.random.default_rng(1))
     street = walking(PersonKind.CROWD, PersonKind.EVENT)
     for ticks in range(9, 0, -1):
         tracker.moved(walking(PersonKind.CROWD, PersonKind.EVENT, east_m=-0.075 * ticks))
@@ -102,11 +101,10 @@ def test_tracks_have_declared_errors_misses_and_switches() -> None:
     assert ids == pytest.approx(noise.switch_hz * 0.95 * 800.0, rel=0.5)
 
 
-def test_tracks_do_not_tell_event_pedestrians_from_others() -> None:
-    """The same people with other names, kinds and order in the table have the same ids by
-    distance."""
+def test_tracks_do_not_reveal_event_pedestrians() -> None:
+    """The same people with other names, kinds and order in the table have the same ids by distance."""
     first, second = (
-        Tracker(COURIER, Open(), np.random.default_rng(5)).read(ROBOT, street, 0.0)
+        Tracker(COURIER, OpenStreet(), np.random.default_rng(5)).read(ROBOT, street, 0.0)
         for street in (
             walking(PersonKind.CROWD, PersonKind.CROWD, PersonKind.CROWD),
             walking(PersonKind.EVENT, PersonKind.CROWD, PersonKind.INJECTED),
@@ -117,17 +115,17 @@ def test_tracks_do_not_tell_event_pedestrians_from_others() -> None:
     assert (np.diff(np.hypot(*first.positions_m.T)) > 0.0).all()
 
 
-def test_neighbours_swap_ids_and_the_lost_get_new_ones() -> None:
-    """With a switch at every observation two people 0.5 m apart exchange ids; after 1 s out of
-    sight a person has a new id, before that the old one. Rare observations lose no person in sight."""
+def test_neighbours_swap_ids_and_lost_people_get_new_ones() -> None:
+    """A switch exchanges the ids of two neighbours; 1 s out of sight gives a new id; rare
+    observations lose no visible person."""
     street = walking(PersonKind.CROWD)
     both = Street(0, People.of(("a", "b"), [(3, 8), (3, 8.5)], [0, 0], [0, 0], ("stand",) * 2))
     swaps = TrackNoise(position_m=0.0, miss=0.0, switch_hz=1e9)
-    tracker = Tracker(COURIER, Open(), np.random.default_rng(0), swaps)
+    tracker = Tracker(COURIER, OpenStreet(), np.random.default_rng(0), swaps)
     assert tracker.read(ROBOT, both, 0.0).ids.tolist() == [0, 1]
     assert set(tracker.read(ROBOT, both, 0.1).ids.tolist()) == {0, 1}
     calm = TrackNoise(miss=0.0, switch_hz=0.0)
-    tracker = Tracker(COURIER, Open(), np.random.default_rng(0), calm)
+    tracker = Tracker(COURIER, OpenStreet(), np.random.default_rng(0), calm)
     found = []
     seen = [(0.0, street), (0.5, Street(0)), (0.9, street), (3.0, street), (3.5, Street(0))]
     for time_s, shown in (*seen, (4.1, street)):
@@ -139,8 +137,7 @@ def test_neighbours_swap_ids_and_the_lost_get_new_ones() -> None:
 
 @pytest.mark.engine
 def test_an_inertial_sensor_integrates_to_the_motion_of_the_robot() -> None:
-    """On level ground it shows gravity at rest; over a turn and a start the sums of yaw rate and
-    forward acceleration are those of heading and speed."""
+    """At rest it shows gravity, and sums of yaw rate and acceleration equal heading and speed."""
     sensor = InertialSensor("exact", np.random.default_rng(0))
     with BulletWorld(StreetSurface(tiny_map(), seed=0)) as world:
         robot = world.place(Pose(-20.0, 1.0, 0.0))
@@ -159,7 +156,7 @@ def test_an_inertial_sensor_integrates_to_the_motion_of_the_robot() -> None:
 
 
 def test_a_noisy_inertial_sensor_has_declared_noise_and_a_slow_bias() -> None:
-    """Over 2,000 readings at rest the differences of neighbours have the noise; means of episodes
+    """In 2,000 readings at rest differences of neighbours have the noise, and means of episodes
     have the bias."""
     noise = ImuNoise()
     sensor = InertialSensor("noisy", np.random.default_rng(2))
@@ -177,8 +174,7 @@ def test_a_noisy_inertial_sensor_has_declared_noise_and_a_slow_bias() -> None:
 
 
 def test_mirrored_readings_are_of_the_mirrored_street() -> None:
-    """A wall on the left is on the right; a turn and a push to the left become ones to the right;
-    twice mirrored is the same."""
+    """Walls, turns and pushes change sides, and mirroring twice changes nothing."""
     spec = ScanSpec(rays=8)
     scan = Scan(np.where(spec.angles_rad == math.pi / 2, 1.0, 9.0).astype(np.float32)[None], spec)
     mirrored = scan.mirrored()

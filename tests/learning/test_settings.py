@@ -1,5 +1,5 @@
-"""What of a training needs no PyTorch: settings, how it is continued, what it prints, its curve,
-what is missing."""
+"""The parts of training that need no PyTorch: settings, continuation, output, curve, missing
+packages."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ HERE = Path("small/checkpoint.pt")
 def test_without_pytorch_the_cpu_build_is_recommended_first(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Exit code 3, and one message: PyTorch's index of CPU builds before the extra, which alone
-    takes 7 GB."""
+    """Exit code 3 and one message name PyTorch's index of CPU builds before the extra of 7 GB."""
     monkeypatch.setattr(
         train, "find_spec", lambda name: None if name == "torch" else find_spec(name)
     )
@@ -49,8 +48,8 @@ def test_without_pytorch_the_cpu_build_is_recommended_first(
 
 
 def test_a_training_continues_to_its_planned_end_or_to_another() -> None:
-    """Without --steps to the end that was planned; with more than are done to these; never to
-    fewer."""
+    """Without --steps it runs to the planned end, with a larger number to that, and never to a
+    smaller one."""
     assert planned_steps(HERE, None, planned=300, done=300) == 300
     assert planned_steps(HERE, 900, planned=300, done=300) == 900
     assert planned_steps(HERE, 200, planned=300, done=118) == 200
@@ -61,8 +60,8 @@ def test_a_training_continues_to_its_planned_end_or_to_another() -> None:
         planned_steps(HERE, 100, planned=300, done=118)
 
 
-def test_another_training_is_not_continued() -> None:
-    """Seed, batch and rate must be the same, steps need not; the differences are named."""
+def test_a_training_with_other_settings_is_not_continued() -> None:
+    """Seed, batch and rate must be equal, steps need not, and the differences are named."""
     was = Training(steps=300).spec
     refuse_another(HERE, was, Training(steps=900).spec)
     with pytest.raises(
@@ -73,14 +72,15 @@ def test_another_training_is_not_continued() -> None:
 
 
 @pytest.mark.parametrize("field", ["steps", "batch", "rate", "minutes"])
-def test_settings_are_above_zero(field: str) -> None:
+def test_settings_must_be_above_zero(field: str) -> None:
     """The option is named."""
     with pytest.raises(UsageError, match=f"--{field} must be above 0, not 0"):
         Training(**{field: 0})
 
 
-def test_the_rate_of_learning_rises_and_falls_to_zero() -> None:
-    """Within 3 % of the steps to its highest, then down to 0, however many steps there are."""
+def test_the_learning_rate_rises_and_falls_to_zero() -> None:
+    """It reaches its maximum within 3 % of the steps and then falls to 0, however many steps there
+    are."""
     for steps in (60, 20_000):
         shares = [rate_share(step, steps) for step in range(steps + 1)]
         assert shares[0] > 0.0 and shares[-1] == 0.0 and max(shares) > 0.98
@@ -91,16 +91,16 @@ def test_the_rate_of_learning_rises_and_falls_to_zero() -> None:
     assert [step for step in range(1, 701) if is_evaluated(step, 700)] == [200, 400, 600, 700]
 
 
-def test_what_a_training_has_come_to_is_said() -> None:
-    """The bundle, where it stopped, and how to continue, also to another end."""
-    stopped, whole = (
+def test_the_end_of_a_training_is_summarised() -> None:
+    """The summary has the bundle, the last step, and how to continue to the same or another end."""
+    stopped, finished = (
         outcome_in_words(Path("small"), StepsReached(step, 300)) for step in (118, 300)
     )
     assert (
         "a bundle: --policy onnx:small, stopped at step 118 of 300. Continue with --resume"
         in stopped
     )
-    assert "--resume --steps N, at least 119" in stopped and whole.endswith(
+    assert "--resume --steps N, at least 119" in stopped and finished.endswith(
         "more steps: --resume --steps 600"
     )
     assert state_in_words(20, [10, 40, 80]) == "; step 20 of 80"
@@ -110,7 +110,7 @@ def test_what_a_training_has_come_to_is_said() -> None:
 def test_the_curve_is_drawn_with_nothing_cut_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int
 ) -> None:
-    """Small errors over many steps: no title or tick label is outside of the picture, or runs into
+    """With small errors over many steps no title or tick label leaves the picture or overlaps
     another."""
     names = [
         "speed_loss",

@@ -1,5 +1,4 @@
-"""The small policies that ship, which were trained by `cosim train`; none of them: nothing to
-test."""
+"""The small shipped policies, trained by `cosim train`; without any there is nothing to test."""
 
 from __future__ import annotations
 
@@ -17,8 +16,8 @@ SMALL = [name for name in shipped_bundles() if name.startswith("small")]
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: str) -> None:
-    """Its folder is no larger than 8 MB; by its name it is loaded and asked without PyTorch in the
+def test_a_shipped_small_policy_is_small_and_answers_without_pytorch(name: str) -> None:
+    """Its folder is at most 8 MB, and it is loaded by name and queried without PyTorch in the
     process."""
     assert sum(path.stat().st_size for path in shipped_bundles()[name].iterdir()) < 8_000_000
     code = (
@@ -26,20 +25,17 @@ def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: st
         "policy = cosim.load_policy(sys.argv[1]); policy.reset('one', 1); "
         "print(policy.act(example_observation(policy.manifest)).v_mps >= 0.0, 'torch' in sys.modules)"
     )
-    said = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code, name], capture_output=True, text=True, check=True
     )
-    assert said.stdout.split() == ["True", "False"]
+    assert result.stdout.split() == ["True", "False"]
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", SMALL)
-def test_a_small_policy_that_ships_drives_to_a_goal_by_what_it_sees(
-    name: str, tmp_path: Path, cosim: Cosim
-) -> None:
-    """By its name, as any policy: over a crosswalk of the test part, in a city that it has never
-    seen."""
-    said = cosim(
+def test_a_shipped_small_policy_drives_to_a_goal(name: str, tmp_path: Path, cosim: Cosim) -> None:
+    """By its name it crosses a crosswalk of the test split, in a city that it was not trained on."""
+    result = cosim(
         "run",
         "unit",
         "--policy",
@@ -51,6 +47,6 @@ def test_a_small_policy_that_ships_drives_to_a_goal_by_what_it_sees(
         cwd=tmp_path,
     )
     (record,) = read_records(tmp_path / "run")
-    assert said.returncode == 0 and record.ended == "goal" and not record.manifest.privileged, (
-        said.stderr
+    assert result.returncode == 0 and record.ended == "goal" and not record.manifest.privileged, (
+        result.stderr
     )

@@ -51,7 +51,7 @@ NAMES = ("a", "b", "c", "d", "d-decoy", "e", "f", "g", "h", "i", "j", "k", "l", 
 
 
 def street(length: int = 6, labels: bool = True) -> Packed:
-    """Episodes of random pictures, which expert and labels do not depend on."""
+    """Episodes of random pictures, which do not determine expert and labels."""
     draws = np.random.default_rng(3)
     count = len(NAMES) * length
 
@@ -102,19 +102,17 @@ def session_of(graph: bytes) -> object:
 
 
 @pytest.mark.parametrize("keeps", [True, False])
-def test_a_memory_carried_from_step_to_step_is_that_of_the_whole_window(
-    data: Path, keeps: bool
-) -> None:
-    """The graph, queried once for each picture with its own memory, gives the plans of PyTorch for
-    all pictures at once; without a memory each picture alone gives its plan."""
+def test_a_step_by_step_memory_equals_that_of_the_whole_window(data: Path, keeps: bool) -> None:
+    """The graph, queried per picture with its memory, gives PyTorch's plans of the window; without
+    memory each picture decides alone."""
     parameters = new_memory_parameters(7)
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(examples.held_out[:1], 6)
     with torch.no_grad():
-        whole = forward_steps(
+        window = forward_steps(
             parameters, batch.pictures, batch.goal, batch.speeds, torch.zeros(1, MEMORY), keeps
         )
-    wanted = plan(whole.plan).numpy()
+    wanted = plan(window.plan).numpy()
     session = session_of(build_memory_graph(parameters, keeps))
     memory = np.zeros((1, MEMORY), np.float32)
     for step in range(6):
@@ -125,14 +123,14 @@ def test_a_memory_carried_from_step_to_step_is_that_of_the_whole_window(
             ["plan", "memory_next", "near"], inputs | {"memory": memory}
         )
         np.testing.assert_allclose(found[0], wanted[step], atol=1e-4)
-        np.testing.assert_allclose(near[0], whole.near[step].numpy(), atol=1e-4)
+        np.testing.assert_allclose(near[0], window.near[step].numpy(), atol=1e-4)
         assert memory.any() == keeps
-    np.testing.assert_allclose(memory, whole.memory.numpy(), atol=1e-4)
+    np.testing.assert_allclose(memory, window.memory.numpy(), atol=1e-4)
 
 
 def test_a_run_feeds_the_graph_the_windows_of_training(data: Path) -> None:
-    """By the bundle's manifest observations become the pictures, goals and speeds of a window from
-    the start of an episode; after a reset the memory is 0 again."""
+    """Observations become the pictures, goals and speeds of an episode's first window, and a reset
+    sets the memory to 0."""
     packed = street()
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(np.array([0]), 6)
@@ -159,11 +157,9 @@ def test_a_run_feeds_the_graph_the_windows_of_training(data: Path) -> None:
     )["memory"].any()
 
 
-def test_a_training_that_was_stopped_ends_with_the_bits_of_one_that_was_not(
-    data: Path, tmp_path: Path
-) -> None:
-    """Two steps at once, and one after the other: the same graph and curve; the bundle is one that
-    runs take, and its size is at most 25 MB."""
+def test_a_stopped_and_resumed_training_has_the_same_bits(data: Path, tmp_path: Path) -> None:
+    """Two steps at once and one by one give the same graph and curve, in a valid bundle of at most
+    25 MB."""
     assert train([data], tmp_path / "one", BRISK, False, ignore).whole
     first = train([data], tmp_path / "other", replace(BRISK, minutes=1e-9), False, ignore)
     assert first.step == 1
@@ -176,7 +172,7 @@ def test_a_training_that_was_stopped_ends_with_the_bits_of_one_that_was_not(
 
 
 def test_windows_stay_in_their_episode(data: Path) -> None:
-    """A window that is longer than its episode ends with it; its first picture is seen twice."""
+    """A window longer than its episode ends with it, and its first picture is repeated."""
     packed = street()
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(np.array([6, 9]), 5)
@@ -191,19 +187,19 @@ def test_windows_stay_in_their_episode(data: Path) -> None:
 
 
 def test_the_mirror_exchanges_left_and_right_in_labels_too(data: Path) -> None:
-    """Twice it changes nothing; people change sides, and free distances their order."""
+    """Twice it changes nothing; once people change sides, and free distances their order."""
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(np.array([0, 6]), 4)
-    there = mirror_windows(batch)
-    back = mirror_windows(there)
+    mirrored = mirror_windows(batch)
+    back = mirror_windows(mirrored)
     assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
-    torch.testing.assert_close(there.near[..., 2], -batch.near[..., 2])
-    torch.testing.assert_close(there.free[:, 0], batch.free[:, -1])
-    torch.testing.assert_close(there.near[..., 1], batch.near[..., 1])
+    torch.testing.assert_close(mirrored.near[..., 2], -batch.near[..., 2])
+    torch.testing.assert_close(mirrored.free[:, 0], batch.free[:, -1])
+    torch.testing.assert_close(mirrored.near[..., 1], batch.near[..., 1])
 
 
 def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
-    """The same step gives the same windows, another step gives others."""
+    """The same step gives the same windows, and another step gives others."""
     examples = WindowExamples([data], BRISK, CPU)
     third, other, again = (examples.drawn(0, step, 3) for step in (3, 4, 3))
     assert all(torch.equal(value, getattr(again, name)) for name, value in vars(third).items())
@@ -211,9 +207,9 @@ def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
     assert float(third.pictures.min()) >= 0.0 and float(third.pictures.max()) <= 1.0
 
 
-def test_ablations_leave_out_training_episodes_alone() -> None:
-    """Held-out episodes follow from names: the same with any setting, with decoys on the side of
-    their events. A smaller share is a part of a larger one."""
+def test_ablations_remove_only_training_episodes() -> None:
+    """Held-out episodes follow from names, with decoys on the side of their events; a smaller share
+    is a subset of a larger one."""
     names = [f"{kind}-{k}{end}" for kind in "ab" for k in range(200) for end in ("", "-decoy")]
     weathers = ["clear", "clear", "rain", "rain"] * 200
 
@@ -232,13 +228,14 @@ def test_ablations_leave_out_training_episodes_alone() -> None:
 
 
 def test_numbers_of_labels_are_those_of_the_simulator() -> None:
-    """A hand held out, the classes of events and the unit of free distances."""
+    """A raised hand, the classes of events and the unit of free distances have the simulator's
+    values."""
     assert 1 + DOINGS.index("stop") == HAND and Doing.__args__ == DOINGS  # type: ignore[attr-defined]
     assert max(EVENT_NUMBERS.values()) + 1 == EVENTS and FREE_UNIT_M == FREE_RANGE_M
 
 
-def test_people_who_are_missing_do_not_count() -> None:
-    """Without a person only presence is trained; with one also the place."""
+def test_missing_people_do_not_contribute_to_the_loss() -> None:
+    """Without a person only presence is trained; with one the place is, too."""
     labels = torch.zeros(1, LABELLED_PEOPLE, 6)
     near = torch.zeros(1, 4, 6, requires_grad=True)
     near_loss(near, labels).backward()
@@ -250,8 +247,8 @@ def test_people_who_are_missing_do_not_count() -> None:
 
 
 def test_settings_of_ablations_are_checked(data: Path, tmp_path: Path) -> None:
-    """Another network, a share above 1 and an ablation of `small` are refused; so are data without
-    labels, unless auxiliary heads are left out, and another ablation on resuming."""
+    """Unknown networks, shares above 1, ablations of `small`, missing labels and another ablation
+    on resuming are refused."""
     with pytest.raises(CosimError, match="unknown network 'large'"):
         Training(network="large")
     with pytest.raises(UsageError, match="--share must be at most 1"):
@@ -270,8 +267,8 @@ def test_settings_of_ablations_are_checked(data: Path, tmp_path: Path) -> None:
 
 
 def test_rows_with_rewards_are_weighted_by_values(data: Path, tmp_path: Path) -> None:
-    """Only training rows with rewards change their weight, the same in each call; the training
-    needs the bundle that drove, and such rows. The bundle's source has the figures."""
+    """Only training rows with rewards are reweighted, reproducibly; the driving bundle and such
+    rows are required, figures are recorded."""
     plain = WindowExamples([data], BRISK, CPU)
     write_bundle(tmp_path, new_memory_parameters(7), plain, BRISK, "")
     rows = street()
@@ -293,7 +290,7 @@ def test_rows_with_rewards_are_weighted_by_values(data: Path, tmp_path: Path) ->
         SIDEWALK.examples([data], tuned, CPU)
 
 
-def test_batches_that_are_drawn_ahead_are_the_same(data: Path) -> None:
+def test_prefetched_batches_are_the_same(data: Path) -> None:
     """A thread draws the batches of the steps in order."""
     examples = WindowExamples([data], BRISK, CPU)
     for ahead, alone in zip(
@@ -304,8 +301,8 @@ def test_batches_that_are_drawn_ahead_are_the_same(data: Path) -> None:
 
 @pytest.mark.engine
 def test_from_the_simulator_to_a_drive(tmp_path: Path, cosim: Cosim) -> None:
-    """Raw demonstrations are collected with labels, in two pieces, packed in parts, trained on, and
-    the bundle drives and then teaches in a round of DAgger."""
+    """Demonstrations with labels are collected in two pieces, packed and trained on; the bundle
+    drives and teaches in DAgger."""
     words = ("collect", "unit", "--event", "crosswalk", "--cities", "900:901", "--city-size", "500")
     words += ("--labels", "--format", "raw", "--fov", "60", "--astray", "0.5", "--episodes", "2")
     begun = cosim(*words, "--out", "demos", "--minutes", "1e-9", cwd=tmp_path)

@@ -44,8 +44,8 @@ BRISK = Training(steps=4, batch=4, device="cpu")
 
 
 def street(episodes: int = 12, length: int = 4, seed: int = 1) -> Packed:
-    """Episodes in which somebody white stands at the left or at the right, which the expert turns
-    away from, or somebody dark right ahead, for whom it stops."""
+    """Episodes in which a white person left or right makes the expert turn away, and a dark one
+    ahead makes it stop."""
     draws = np.random.default_rng(seed)
     count = episodes * length
     scene = np.repeat(np.arange(episodes) % 3, length)
@@ -88,7 +88,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bundle that has learned from that street."""
+    """A bundle trained on that street."""
     folder = tmp_path_factory.mktemp("learned")
     assert train(
         [data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, ignore
@@ -97,12 +97,12 @@ def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def steps_of(folder: Path) -> list[str]:
-    """The first column of a curve."""
+    """Return the first column of a curve."""
     return [line.partition(",")[0] for line in (folder / "curve.csv").read_text().splitlines()]
 
 
 def plans(folder: Path, rows: Sequence[int]) -> np.ndarray:
-    """(rows, WAYPOINTS, 4): what the shipped graph answers to pictures of another street."""
+    """Return (rows, WAYPOINTS, 4) answers of the shipped graph to pictures of another street."""
     ort = pytest.importorskip("onnxruntime")
     path = folder / "unseen.npz"
     street(episodes=3, length=1, seed=9).save(path)
@@ -117,23 +117,23 @@ def plans(folder: Path, rows: Sequence[int]) -> np.ndarray:
     )
 
 
-def test_it_learns_to_turn_away_and_to_stop(learned: Path) -> None:
-    """To pictures of a street that it has not seen it answers a turn to the free side, and of
-    somebody ahead that it stops, which is no slow speed but 0."""
+def test_training_learns_to_turn_away_and_to_stop(learned: Path) -> None:
+    """For pictures of an unseen street it turns to the free side, and for a person ahead it stops
+    at a speed of 0."""
     left, right, ahead = plans(learned, [0, 1, 2])
     assert left[0, 3] < -0.1 and right[0, 3] > 0.1
     assert min(left[0, 2], right[0, 2]) > 0.5 * CRUISE_MPS
     np.testing.assert_array_equal(ahead, 0.0)
 
 
-def test_the_bundle_is_one_that_runs_take(learned: Path) -> None:
-    """Its manifest is a bundle's, with the graph's size and hash, no larger than 8 MB; its example
-    answers as said."""
+def test_the_bundle_is_accepted_by_runs(learned: Path) -> None:
+    """Its manifest has the graph's size and hash, it is at most 8 MB, and its example gives the
+    expected answers."""
     manifest = msgspec.json.decode((learned / "manifest.json").read_bytes(), type=BundleManifest)
     graph = (learned / "model.onnx").read_bytes()
-    told = manifest.files["model.onnx"]
+    facts = manifest.files["model.onnx"]
     digest = hashlib.blake2b(graph, digest_size=32).hexdigest()
-    assert (told.bytes, told.blake2b) == (len(graph), digest) and len(graph) < 8_000_000
+    assert (facts.bytes, facts.blake2b) == (len(graph), digest) and len(graph) < 8_000_000
     assert (manifest.goal, manifest.rate_hz, manifest.camera.spec.size) == (
         "route_point",
         5.0,
@@ -145,9 +145,8 @@ def test_the_bundle_is_one_that_runs_take(learned: Path) -> None:
     np.testing.assert_allclose(answer, example["expected.plan"], atol=1e-4)
 
 
-def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
-    """The bundle's camera has the size, the field of view, the place and the crop of that of the
-    demonstrations."""
+def test_the_bundles_camera_equals_that_of_the_demonstrations() -> None:
+    """Size, field of view, place and crop are the same."""
     camera = {
         "width": 160,
         "height": 120,
@@ -157,14 +156,16 @@ def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
         "depth": False,
     }
     manifest = msgspec.convert(
-        manifest_of("small", street().meta | {"camera": camera}, "told", SMALL.inputs),
+        manifest_of("small", street().meta | {"camera": camera}, "small policy", SMALL.inputs),
         BundleManifest,
     )
     assert manifest.camera.spec == CameraSpec(160, 120, 60.0, crop=(0, 30, 160, 120))
 
 
-def test_a_training_that_was_stopped_ends_as_one_in_one_piece(data: Path, tmp_path: Path) -> None:
-    """Stopped after each step and gone on with, it writes the same graph to the byte, and the same
+def test_a_stopped_and_resumed_training_equals_an_uninterrupted_one(
+    data: Path, tmp_path: Path
+) -> None:
+    """Stopped after each step and resumed, it writes the same graph to the byte, and the same
     curve."""
     assert train([data], tmp_path / "whole", BRISK, False, ignore).whole
     pieces = 1
@@ -191,12 +192,11 @@ def test_a_training_killed_in_its_last_evaluation_loses_no_step(
     assert train([data], tmp_path, brisk, True, ignore).step == 2
 
 
-def test_a_training_whose_time_is_over_leaves_a_bundle_and_its_curve(
+def test_a_training_at_its_time_limit_leaves_a_bundle_and_its_curve(
     data: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """`cosim train --minutes`, far too short: exit code 4, a bundle that can be loaded and says at
-    which step it is, a curve with a row of that step, and how to continue; `--resume` alone ends
-    it."""
+    """A too short --minutes exits with 4, and leaves a loadable bundle with its step, a curve, and
+    a way to resume."""
     words = ("train", str(data), "-o", "small", "--batch", "4", "--device", "cpu", "--seed", "3")
     done = cosim(*words, "--steps", "3", "--minutes", "1e-9", cwd=tmp_path)
     assert (
@@ -214,8 +214,8 @@ def test_a_training_whose_time_is_over_leaves_a_bundle_and_its_curve(
 
 
 def test_a_finished_training_is_continued_with_more_steps(data: Path, tmp_path: Path) -> None:
-    """Four steps, then six: a curve of both, another graph, the same again to the byte, and the
-    bundle says so. Fewer steps than are done are refused."""
+    """Four steps, then six, give one reproducible curve and graph; fewer steps than are done are
+    refused."""
     for name in ("one", "other"):
         assert train([data], tmp_path / name, BRISK, False, ignore).whole
         before = (tmp_path / name / "model.onnx").read_bytes()
@@ -233,42 +233,39 @@ def test_a_finished_training_is_continued_with_more_steps(data: Path, tmp_path: 
         train([data], tmp_path / "one", replace(BRISK, steps=5), True, ignore)
 
 
-def test_it_can_be_trained_on_from_the_shipped_graph_alone(
+def test_training_can_start_from_the_shipped_graph_alone(
     learned: Path, data: Path, tmp_path: Path
 ) -> None:
-    """The graph holds the parameters that training begins with: at a rate of next to nothing it
-    stays as it is."""
-    held = load_parameters(learned / "model.onnx", new_parameters(0))
+    """The graph holds the initial parameters, so that at a negligible rate it stays as it is."""
+    parameters = load_parameters(learned / "model.onnx", new_parameters(0))
     assert train(
         [data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, ignore
     ).whole
-    for name, value in load_parameters(tmp_path / "on" / "model.onnx", held).items():
-        torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
+    for name, value in load_parameters(tmp_path / "on" / "model.onnx", parameters).items():
+        torch.testing.assert_close(value, parameters[name], atol=1e-6, rtol=0)
     drawn = new_parameters(3)
     (tmp_path / "drawn.onnx").write_bytes(build_graph(drawn))
     assert all(
         torch.equal(value, drawn[name])
-        for name, value in load_parameters(tmp_path / "drawn.onnx", held).items()
+        for name, value in load_parameters(tmp_path / "drawn.onnx", parameters).items()
     )
 
 
 def test_the_mirror_exchanges_left_and_right_everywhere(data: Path) -> None:
-    """Mirroring exchanges left and right in picture, goal, speeds and waypoints; twice it changes
-    nothing."""
+    """It exchanges sides in picture, goal, speeds and waypoints, and twice it changes nothing."""
     batch = Examples([data], 0, CPU).rows(np.array([0, 4]))
-    there = mirror(batch)
+    mirrored = mirror(batch)
     back = mirror(mirror(batch))
     assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
-    bright = there.pictures[0] > 0.8
+    bright = mirrored.pictures[0] > 0.8
     assert torch.equal(bright, batch.pictures[1] > 0.8)
-    torch.testing.assert_close(there.turn[0], batch.turn[1])
-    torch.testing.assert_close(there.way[0], batch.way[1])
+    torch.testing.assert_close(mirrored.turn[0], batch.turn[1])
+    torch.testing.assert_close(mirrored.way[0], batch.way[1])
 
 
-def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
-    """By the bundle's manifest an observation becomes the numbers that the row of it was in
-    training, with its history, also at an episode's beginning, and with a goal farther than is
-    told."""
+def test_a_run_feeds_the_graph_its_training_inputs(tmp_path: Path) -> None:
+    """An observation becomes its row of training numbers with history, at an episode's start and
+    for far goals too."""
     draws = np.random.default_rng(5)
     packed = street(episodes=2, length=6)
     goals = draws.uniform(-30.0, 30.0, (12, 2)).astype(np.float32)
@@ -278,7 +275,7 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
     packed.save(tmp_path / "street.npz")
     trained_on = Examples([tmp_path / "street.npz"], 0, CPU).rows(np.arange(12))
     manifest = msgspec.convert(
-        manifest_of("small", packed.meta, "told", SMALL.inputs), BundleManifest
+        manifest_of("small", packed.meta, "small policy", SMALL.inputs), BundleManifest
     )
     ports = {name: TensorPort(name, np.dtype(np.float32), shape) for name, shape in INPUTS.items()}
     feeder = Feeder(manifest.inputs, ports, 0)
@@ -295,28 +292,28 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
             np.testing.assert_allclose(tensor[0], getattr(trained_on, name)[row], atol=1e-6)
 
 
-def test_a_bundle_says_who_taught_it_and_who_drove(
+def test_a_bundle_records_its_experts_and_drivers(
     learned: Path, data: Path, tmp_path: Path
 ) -> None:
-    """Of all files that it learned from: the experts, and the learners beside which they answered;
-    and which network it began with."""
+    """It lists, for all training files, experts and driving learners, and the network that it began
+    with."""
     again = street()
     replace(again, meta=again.meta | {"policy": ["orca-disturbed"], "learner": ["first"]}).save(
         tmp_path / "again.npz"
     )
     meta = Examples([data, tmp_path / "again.npz"], 0, CPU).meta
     assert source_of(street().meta, 0) == "cosim train, seed 0, on what orca drove"
-    told = (
+    expected = (
         "cosim train, seed 1, on what orca, orca-disturbed drove, and would have done where "
         "first drove"
     )
-    assert source_of(meta, 1) == told
-    assert source_of(meta, 1, bundle_facts(learned)) == f"{told}; begun with small"
+    assert source_of(meta, 1) == expected
+    assert source_of(meta, 1, bundle_facts(learned)) == f"{expected}; begun with small"
 
 
-def test_a_batch_hangs_on_seed_and_step_alone(data: Path) -> None:
-    """The same step gives the same batch in any order, another one other pictures, within 0 and
-    1."""
+def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
+    """The same step gives the same batch in any order, another step others, with values within 0
+    and 1."""
     examples = Examples([data], 0, CPU)
     third = examples.drawn(0, 3, 8)
     other, again = examples.drawn(0, 4, 8), examples.drawn(0, 3, 8)
@@ -326,12 +323,11 @@ def test_a_batch_hangs_on_seed_and_step_alone(data: Path) -> None:
     assert not torch.equal(third.pictures, examples.rows(examples.learned[:8]).pictures)
 
 
-def test_moments_in_which_the_expert_stops_are_drawn_more_often_than_they_come(
+def test_rows_where_the_expert_stops_are_oversampled(
     tmp_path: Path,
 ) -> None:
-    """It drives all along, but for one row of each episode in which it stops: these are a sixteenth
-    of all rows, and a third of those that are drawn. Where it never stops nothing is drawn
-    otherwise."""
+    """Stops are a sixteenth of all rows and a third of the drawn ones; without stops the sampling
+    is unchanged."""
     going = street(length=16)
     going.state[:, 0] = going.command[:, 0] = 1.4
     going.save(tmp_path / "goes.npz")
@@ -342,8 +338,8 @@ def test_moments_in_which_the_expert_stops_are_drawn_more_often_than_they_come(
     assert 0.25 < share < 0.45
 
 
-def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -> None:
-    """No episode is on both sides, and none is on neither."""
+def test_held_out_episodes_are_whole_and_never_trained_on(data: Path) -> None:
+    """Each episode is on exactly one side."""
     examples = Examples([data, data], 0, CPU)
     episode = np.repeat(np.arange(24), 4)
     learned, held_out = (
@@ -354,7 +350,7 @@ def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         (
             "size",
@@ -374,11 +370,10 @@ def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -
         ("steps", r"--steps must be above 0, not 0"),
     ],
 )
-def test_what_cannot_be_trained_on_is_refused(
-    learned: Path, data: Path, tmp_path: Path, wrong: str, told: str
+def test_unusable_training_data_is_refused(
+    learned: Path, data: Path, tmp_path: Path, wrong: str, expected: str
 ) -> None:
-    """Each is one line that names file and field, what was found and what is wanted, and nothing is
-    written."""
+    """One line names file and field, what was found and what is required, and nothing is written."""
     packed = street(episodes=2)
     other = tmp_path / "other.npz"
     out = tmp_path / "out"
@@ -401,7 +396,7 @@ def test_what_cannot_be_trained_on_is_refused(
     before = sorted(out.rglob("*"))
     files = [data, other] if wrong in ("size", "goal", "turn", "rate", "file") else [data]
     files = [other] if wrong == "other data" else files
-    with pytest.raises(CosimError, match=told):
+    with pytest.raises(CosimError, match=expected):
         training = replace(
             BRISK,
             begin=tmp_path
@@ -423,13 +418,14 @@ def test_what_cannot_be_trained_on_is_refused(
     assert sorted(out.rglob("*")) == before
 
 
-def test_it_needs_nothing_but_pytorch_numpy_and_onnx() -> None:
-    """What the project has besides is not imported by a training: a GPU host's own Python can do
-    it."""
+def test_training_needs_only_pytorch_numpy_and_onnx() -> None:
+    """It imports no other dependency of the project, so that a GPU host's own Python can run it."""
     code = (
         "import sys, cosim.learning.training; print(sorted({m.partition('.')[0] for m in "
         "sys.modules} & {'msgspec', 'shapely', 'pandas', 'scipy', 'cv2', 'av', 'typer', 'rich', "
         "'onnxruntime', 'libsumo'}))"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == "[]"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

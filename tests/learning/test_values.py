@@ -8,8 +8,8 @@ from cosim.learning.values import MAX_WEIGHT, weights_of
 
 
 def test_weights_follow_actions_and_not_scenes() -> None:
-    """Where returns depend on a visible scene and on the action, good actions weigh more, and easy
-    scenes do not. The mean weight of training rows is 1, and none is above the bound."""
+    """Good actions weigh more and easy scenes do not; the mean weight is 1, and none exceeds the
+    bound."""
     draws = np.random.default_rng(5)
     scene = draws.normal(size=(4000, 6)).astype(np.float32)
     good = draws.random(4000) < 0.5
@@ -29,9 +29,9 @@ def test_weights_follow_actions_and_not_scenes() -> None:
     assert 0.9 < bounded[0] / np.median(bounded) / MAX_WEIGHT < 1.1
 
 
-def test_a_value_that_knows_nothing_does_not_hide_advantages() -> None:
-    """With more features than episodes, and returns that follow the episode's luck alone, the
-    value is close to the mean return, and lucky episodes keep their weight."""
+def test_an_uninformed_value_does_not_hide_advantages() -> None:
+    """With more features than episodes and random returns the value is near the mean, and lucky
+    episodes keep their weight."""
     draws = np.random.default_rng(7)
     episode = np.arange(2000) // 20
     features = draws.normal(size=(100, 150))[episode].astype(np.float32)

@@ -15,7 +15,7 @@ from cosim.people.orca import HalfPlane, best_velocity, half_plane
 FASTEST_MPS = 2.0
 
 
-def of(
+def half_plane_for(
     apart: tuple[float, float],
     mine: tuple[float, float],
     other: tuple[float, float],
@@ -27,50 +27,48 @@ def of(
 
 
 def test_standing_still_before_a_standing_disk_is_permitted_and_driving_into_it_is_not() -> None:
-    """A disk of radius 1 at 6 m is reached in 2 s at 2.5 m/s: the edge lies there, square to the
+    """A disk of radius 1 m at 6 m is reached in 2 s at 2.5 m/s, which is the edge, square to the
     way."""
-    plane = of((6.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    plane = half_plane_for((6.0, 0.0), (0.0, 0.0), (0.0, 0.0))
     assert plane == pytest.approx((-1.0, 0.0, -2.5))
     assert plane.excess(np.array([0.0, 0.0])) == pytest.approx(2.5)
     assert plane.excess(np.array([2.6, 0.0])) == pytest.approx(-0.1)
 
 
-def test_head_on_the_edge_is_the_leg_of_the_cone() -> None:
-    """Two 5 m apart that close at 4 m/s: the leg is at asin(1/5) to the line between them, and I
-    must cross it."""
-    plane = of((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0))
+def test_the_edge_of_a_head_on_approach_is_the_leg_of_the_cone() -> None:
+    """Two disks 5 m apart that close at 4 m/s must cross the leg at asin(1/5) to the line between
+    them."""
+    plane = half_plane_for((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0))
     sin = 0.2
     assert (plane.nx, plane.ny) == pytest.approx((-sin, math.sqrt(1 - sin**2)))
     assert plane.excess(np.array([2.0, 0.0])) == pytest.approx(-4.0 * sin)
-    shared = of((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0), share=0.5)
+    shared = half_plane_for((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0), share=0.5)
     assert shared.excess(np.array([2.0, 0.0])) == pytest.approx(-2.0 * sin)
 
 
-def test_somebody_who_crosses_before_me_is_passed_behind() -> None:
-    """One who walks left to right ahead of me turns the edge so that going on straight is
-    forbidden, left is not."""
-    plane = of((2.5, 1.0), (1.0, 0.0), (0.0, -0.5))
+def test_a_crossing_person_is_passed_behind() -> None:
+    """A person walking left to right ahead forbids going straight on, and permits left."""
+    plane = half_plane_for((2.5, 1.0), (1.0, 0.0), (0.0, -0.5))
     assert plane.excess(np.array([1.0, 0.0])) < 0.0
     v = best_velocity([plane], np.array([1.0, 0.0]), FASTEST_MPS)
     assert plane.excess(v) == pytest.approx(0.0, abs=1e-9)
     assert closest(np.array([2.5, 1.0]), v - [0.0, -0.5], 2.0) >= 1.0 - 1e-6
 
 
-def test_disks_that_overlap_are_parted_within_a_step() -> None:
-    """0.9 m apart with radii of 1 m: in 0.1 s the missing 0.1 m is made up by 1 m/s away from
-    it."""
-    plane = of((0.9, 0.0), (0.0, 0.0), (0.0, 0.0))
+def test_overlapping_disks_separate_within_a_step() -> None:
+    """Disks of radius 1 m at 0.9 m separate by the missing 0.1 m in 0.1 s, at 1 m/s."""
+    plane = half_plane_for((0.9, 0.0), (0.0, 0.0), (0.0, 0.0))
     assert plane == pytest.approx((-1.0, 0.0, 1.0))
 
 
-def test_what_is_permitted_is_kept_and_what_is_too_fast_is_cut() -> None:
+def test_a_permitted_velocity_is_kept_and_a_too_fast_one_is_clipped() -> None:
     """Without half-planes the preferred velocity comes out, no faster than allowed."""
     assert best_velocity([], np.array([1.0, 0.5]), FASTEST_MPS).tolist() == [1.0, 0.5]
     assert best_velocity([], np.array([3.0, 4.0]), FASTEST_MPS) == pytest.approx([1.2, 1.6])
 
 
-def test_where_nothing_is_permitted_the_worst_violation_is_least() -> None:
-    """x >= 1 and x <= -1 meet half way; with y >= 1.5 and y <= -0.5 beside them the midpoint of the
+def test_the_worst_violation_is_minimal_where_nothing_is_permitted() -> None:
+    """x >= 1 and x <= -1 meet half way; with y >= 1.5 and y <= -0.5 added, the midpoint of the
     worse pair wins."""
     east = HalfPlane(1.0, 0.0, 1.0)
     west = HalfPlane(-1.0, 0.0, 1.0)
@@ -83,7 +81,7 @@ def test_where_nothing_is_permitted_the_worst_violation_is_least() -> None:
 
 
 def closest(apart: np.ndarray, relative: np.ndarray, horizon_s: float) -> float:
-    """Least distance of two centres within a time."""
+    """Return the least distance of two centres within a time."""
     t = min(max(float(apart @ relative) / max(float(relative @ relative), 1e-12), 0.0), horizon_s)
     return float(np.hypot(*(apart - t * relative)))
 
@@ -98,11 +96,10 @@ directions = st.floats(-math.pi, math.pi)
 def test_a_permitted_velocity_keeps_clear_for_the_horizon(
     apart: tuple[float, float], mine: tuple[float, float], other: tuple[float, float]
 ) -> None:
-    """Whoever takes full responsibility and a velocity of the half-plane does not touch the other
-    within tau."""
+    """With full responsibility a velocity of the half-plane avoids the other disk for tau."""
     if math.hypot(*apart) <= 1.01:
         return
-    plane = of(apart, mine, other)
+    plane = half_plane_for(apart, mine, other)
     v = best_velocity([plane], np.array(mine), 20.0)
     assert plane.excess(v) >= -1e-6
     assert closest(np.array(apart), v - np.array(other), 2.0) >= 1.0 - 1e-4
@@ -113,8 +110,8 @@ def test_a_permitted_velocity_keeps_clear_for_the_horizon(
 def test_the_programme_agrees_with_a_search_of_all_velocities(
     made: list[tuple[float, float]], preferred: tuple[float, float]
 ) -> None:
-    """No solution violates a half-plane where one could keep them all, and none is farther from the
-    wish than needed; where none can, no velocity's worst violation is smaller."""
+    """The solution violates no satisfiable half-plane, is nearest to the wish, and otherwise has
+    the least worst violation."""
     planes = [HalfPlane(math.cos(a), math.sin(a), c) for a, c in made]
     v = best_velocity(planes, np.array(preferred), FASTEST_MPS)
     wish = np.array(preferred)

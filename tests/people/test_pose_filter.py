@@ -18,13 +18,12 @@ DT_S = 0.05
 
 
 def east(name: str) -> float:
-    """Everybody enters facing along x."""
+    """Headings of people who all enter facing along x."""
     return 0.0
 
 
-def shown(track: Floats, facing_rad: float = 0.0) -> tuple[Floats, Floats, Floats]:
-    """What the filter shows of one person on a track (T, 2), facing so at first: (T, 2), (T,),
-    (T,)."""
+def filtered(track: Floats, facing_rad: float = 0.0) -> tuple[Floats, Floats, Floats]:
+    """Return what the filter shows of one person on a track (T, 2): (T, 2), (T,), (T,)."""
     poses = PoseFilter(DT_S)
     speed = np.hypot(*np.diff(track, axis=0, prepend=track[:1]).T) / DT_S
     rows = [
@@ -40,45 +39,45 @@ def walk(seconds: float, mps: float = 1.4) -> Floats:
     return np.column_stack([mps * t, np.zeros_like(t)])
 
 
-def test_an_even_walk_is_shown_as_it_is() -> None:
+def test_an_even_walk_is_unchanged() -> None:
     """A person who walks evenly is shown exactly where it is, at its speed."""
     track = walk(3.0)
-    xy, facing, speed = shown(track)
+    xy, facing, speed = filtered(track)
     np.testing.assert_allclose(xy, track, atol=1e-12)
     np.testing.assert_allclose(facing, 0.0, atol=1e-12)
     np.testing.assert_allclose(speed[1:], 1.4)
 
 
 def test_a_jump_becomes_a_brisk_walk_that_catches_up() -> None:
-    """After a jump of 2 m sideways nobody is shown faster than the limit, and the gap closes."""
+    """After a sideways jump of 2 m the shown speed stays below the limit, and the gap closes."""
     track = walk(8.0)
     track[40:, 1] += 2.0
-    xy, _, speed = shown(track)
+    xy, _, speed = filtered(track)
     assert speed.max() <= MAX_SPEED_MPS + 1e-9
     assert np.hypot(*np.diff(xy, axis=0).T).max() <= MAX_SPEED_MPS * DT_S + 1e-9
     np.testing.assert_allclose(xy[-1], track[-1], atol=1e-9)
 
 
-def test_the_heading_follows_the_motion_and_turns_like_a_body() -> None:
+def test_the_heading_follows_the_motion_at_a_limited_rate() -> None:
     """A turn on the spot by 90 degrees takes at least half a second."""
     track = walk(3.0)
     corner = np.concatenate([track, track[-1] + walk(3.0)[1:, ::-1]])
-    _, facing, _ = shown(corner)
+    _, facing, _ = filtered(corner)
     turns = [abs(wrap_angle(b - a)) for a, b in itertools.pairwise(facing)]
     assert max(turns) <= MAX_TURN_RADPS * DT_S + 1e-9
     assert facing[-1] == pytest.approx(math.pi / 2, abs=0.01)
 
 
-def test_a_standing_person_keeps_facing_where_it_faced() -> None:
+def test_a_standing_person_keeps_its_heading() -> None:
     """Small shuffles of a standing person do not turn it."""
     rest = np.zeros((60, 2))
     rest[:, 1] = 0.005 * (np.arange(60) % 2)
-    _, facing, _ = shown(rest, facing_rad=1.0)
+    _, facing, _ = filtered(rest, facing_rad=1.0)
     np.testing.assert_allclose(facing, 1.0)
 
 
-def test_people_come_and_go() -> None:
-    """Each id keeps its own pose whatever its row; who left and comes back is new."""
+def test_poses_follow_ids_as_people_enter_and_leave() -> None:
+    """Each id keeps its own pose whatever its row, and a person who returns is new."""
     poses = PoseFilter(DT_S)
     ab = np.array([[0.0, 0.0], [10.0, 0.0]])
     poses.update(("a", "b"), ab, np.zeros(2), east)
@@ -94,7 +93,7 @@ def test_people_come_and_go() -> None:
 
 
 @pytest.mark.parametrize("aside_m", [0.3, 0.6, 0.8, 1.0], ids=["close", "near", "middle", "apart"])
-def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
+def test_people_avoid_obstacles_without_walking_into_the_robot(aside_m: float) -> None:
     """A person who passes an obstacle comes no nearer to a robot that drives on the other side."""
     half_m = 0.35, 0.275
     standing = StandingObstacles([StandingBody(0.0, -aside_m, 0.0, 1.0, 0.6, 0.0, -1.0)])
@@ -114,10 +113,8 @@ def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
 
 @pytest.mark.parametrize("robot_y_m", [0.3, 0.45, 0.6])
 @pytest.mark.parametrize("aside_m", [-0.4, 0.0, 0.2])
-def test_people_pass_a_robot_that_stands_beside_an_obstacle(
-    robot_y_m: float, aside_m: float
-) -> None:
-    """Nobody gets stuck between an obstacle at the edge and a robot that stands beside it."""
+def test_people_pass_a_robot_beside_an_obstacle(robot_y_m: float, aside_m: float) -> None:
+    """Nobody gets stuck between an obstacle at the edge and a standing robot beside it."""
     half_m = 0.35, 0.275
     standing = StandingObstacles([StandingBody(0.0, -0.7, 0.0, 1.0, 0.6, 0.0, -1.0)])
     poses = PoseFilter(DT_S, standing)

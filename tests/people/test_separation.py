@@ -1,4 +1,4 @@
-"""Nobody walks through anybody."""
+"""Separation: pedestrians do not walk through each other."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from sumo_nets.crowd.separation import SHOULDERS_M, separated_positions
 REACH_M = 2.2 * 0.05
 
 
-def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.ndarray]:
-    """Where people are who walk from (N, 2) to (N, 2) at 1.4 m/s, tick by tick; who is firm steps
-    as it wants."""
+def tracks_of(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.ndarray]:
+    """Return the tracks, tick by tick, of people who walk from (N, 2) to (N, 2) at 1.4 m/s; firm
+    ones do not yield."""
     at = start.astype(float)
     track = []
     for _ in range(200):
@@ -25,45 +25,45 @@ def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.nda
 
 @pytest.mark.parametrize("aside_m", [0.0, 0.1, -0.3])
 @pytest.mark.parametrize("firm", [False, True])
-def test_two_who_walk_at_each_other_pass_without_touching(aside_m: float, firm: bool) -> None:
-    """Head-on or nearly so, both arrive, never nearer than shoulders, and never faster than the
-    reach of a step."""
+def test_two_people_pass_head_on_without_touching(aside_m: float, firm: bool) -> None:
+    """Head-on or nearly so both arrive, never nearer than their shoulders, and never faster than a
+    step allows."""
     start = np.array([[-4.0, 0.0], [4.0, aside_m]])
     goal = np.array([[4.0, 0.0], [-4.0, aside_m]])
-    track = walked(start, goal, np.array([firm, False]))
+    track = tracks_of(start, goal, np.array([firm, False]))
     assert min(float(np.hypot(*(at[0] - at[1]))) for at in track) > 0.9 * SHOULDERS_M
     assert np.hypot(*(track[-1] - goal).T).max() < 0.05
     steps = np.diff(np.array([start, *track]), axis=0)
     assert np.hypot(steps[..., 0], steps[..., 1]).max() <= REACH_M + 1e-9
 
 
-def test_who_is_firm_does_not_give_way() -> None:
-    """An event pedestrian walks its line to the millimetre; the other goes round it."""
+def test_a_firm_person_does_not_give_way() -> None:
+    """An event pedestrian walks its line to the millimetre, and the other walks round it."""
     start = np.array([[-4.0, 0.0], [4.0, 0.0]])
     goal = np.array([[4.0, 0.0], [-4.0, 0.0]])
-    track = walked(start, goal, np.array([True, False]))
+    track = tracks_of(start, goal, np.array([True, False]))
     assert all(at[0, 1] == 0.0 for at in track)
     assert max(abs(float(at[1, 1])) for at in track) > 0.8 * SHOULDERS_M
 
 
-def test_a_throng_at_one_place_parts() -> None:
-    """Eight who all want to stand at the same place end up side by side, none in another."""
+def test_a_crowd_at_one_place_spreads_out() -> None:
+    """Eight people with one destination end up side by side without overlap."""
     rng = np.random.default_rng(1)
-    track = walked(rng.uniform(-2.0, 2.0, (8, 2)), np.zeros((8, 2)), np.zeros(8, dtype=bool))
+    track = tracks_of(rng.uniform(-2.0, 2.0, (8, 2)), np.zeros((8, 2)), np.zeros(8, dtype=bool))
     gaps = np.hypot(*(track[-1][:, None] - track[-1][None]).transpose(2, 0, 1)) + 9.0 * np.eye(8)
     assert gaps.min() > 0.3
 
 
-def test_who_is_alone_walks_as_it_wants() -> None:
-    """Without anybody near the very same values come back."""
+def test_a_person_alone_walks_as_wanted() -> None:
+    """Without anybody near, the same values come back."""
     before = np.array([[0.0, 0.0], [2.0, 0.0]])
     wanted = before + 0.07
     assert separated_positions(before, wanted, np.zeros(2, dtype=bool), REACH_M) is wanted
 
 
-def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
-    """Somebody that SUMO has stopped among three talkers comes as near as shoulders allow, and then
-    does not stir."""
+def test_a_person_who_wants_to_stand_in_a_group_stops_before_it() -> None:
+    """A person whom SUMO stopped among three talkers comes as near as shoulders allow, and then
+    stays still."""
     angles = np.pi / 2 + 2.0 * np.pi * np.arange(3) / 3
     talkers = 0.62 * np.column_stack([np.cos(angles), np.sin(angles)])
     start = np.vstack([talkers, [[0.2, 0.38]]])
@@ -80,8 +80,8 @@ def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
     assert max(steps[40:]) == 0.0
 
 
-def test_who_stands_gives_way_to_who_comes_through() -> None:
-    """Standing is a wish, too: a walker is not held up by somebody that could step aside."""
+def test_a_standing_person_gives_way_to_a_walker() -> None:
+    """A walker is not held up by a standing person who can step aside."""
     at = np.array([[-2.0, 0.0], [0.0, 0.0]])
     for _ in range(100):
         wanted = np.array([at[0] + (0.07, 0.0), [0.0, 0.0]])

@@ -1,5 +1,4 @@
-"""Nobody walks through what stands there: the shown crowd, people of events and injected ones step
-round it."""
+"""Obstacles: the shown crowd, people of events and injected people walk round them."""
 
 from __future__ import annotations
 
@@ -29,16 +28,18 @@ def standing(*obstacles: Obstacle, area: Polygon = SIDEWALK) -> StandingObstacle
     return standing_obstacles(obstacles, area)
 
 
-def thing(
+def obstacle_at(
     kind: str, x_m: float = 0.0, y_m: float = 0.0, heading_rad: float = 0.3, form: int = 2
 ) -> Obstacle:
     return Obstacle(kind=kind, x_m=x_m, y_m=y_m, heading_rad=heading_rad, form=form)
 
 
-def shown(things: StandingObstacles, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
-    """(T, 2) where somebody is shown whom SUMO walks along x at y_m, straight through
-    everything."""
-    poses = PoseFilter(DT_S, things)
+def shown_track(
+    obstacle_list: StandingObstacles, y_m: float, east: bool, seconds: float = 9.0
+) -> Floats:
+    """Return the track (T, 2) of a person whom SUMO moves along x at y_m, straight through every
+    obstacle."""
+    poses = PoseFilter(DT_S, obstacle_list)
     x = np.arange(-5.0, -5.0 + 1.3 * seconds, 1.3 * DT_S) * (1 if east else -1)
     rows = [
         poses.update(
@@ -50,18 +51,17 @@ def shown(things: StandingObstacles, y_m: float, east: bool, seconds: float = 9.
 
 
 def gap_m(track: Floats, *obstacles: Obstacle) -> float:
-    """Least distance of the disk on a track from what stands there."""
+    """Return the least distance of a person's disk on a track from the obstacles."""
     ground = shapely.union_all([footprint(one) for one in obstacles])
     return float(shapely.distance(shapely.points(track), ground).min()) - PERSON_RADIUS_M
 
 
-def test_distances_found_before_do_not_change_a_step() -> None:
-    """Obstacles that were compared with people before give the same bits as new ones, also where
-    the number of people changes."""
+def test_cached_distances_do_not_change_a_step() -> None:
+    """Obstacles used before give the bits of new ones, also where the number of people changes."""
     rng = np.random.default_rng(3)
     places = rng.uniform(-15.0, 15.0, (12, 2)).tolist()
     ground = box(-40.0, -40.0, 40.0, 40.0)
-    obstacles = [thing("bin", x_m, y_m) for x_m, y_m in places]
+    obstacles = [obstacle_at("bin", x_m, y_m) for x_m, y_m in places]
     used = standing(*obstacles, area=ground)
     changed = 0
     for count in (30, 45, 1, 45):
@@ -78,44 +78,42 @@ def test_distances_found_before_do_not_change_a_step() -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(OBSTACLE_SIZES_M))
-def test_the_crowd_steps_round_what_stands_in_its_way(kind: str) -> None:
-    """From either side, wherever on it they are headed, people go round and come to where they
-    would be."""
-    one = thing(kind)
+def test_the_crowd_walks_round_obstacles(kind: str) -> None:
+    """From either side and any offset people pass the obstacle and return to their track."""
+    obstacle = obstacle_at(kind)
     for y_m in (-0.5, -0.1, 0.0, 0.3):
         for east in (True, False):
-            track = shown(standing(one), y_m, east)
-            assert gap_m(track, one) > -TOUCHES_M
+            track = shown_track(standing(obstacle), y_m, east)
+            assert gap_m(track, obstacle) > -TOUCHES_M
             assert track[-1] == pytest.approx([6.6 if east else -6.6, y_m], abs=0.1)
             assert np.hypot(*np.diff(track, axis=0).T).max() <= 0.12
-    through = shown(StandingObstacles(), 0.0, True)
-    assert gap_m(through, one) < -0.2
+    through = shown_track(StandingObstacles(), 0.0, True)
+    assert gap_m(through, obstacle) < -0.2
 
 
-def test_what_reaches_to_the_edge_is_passed_on_the_other_side() -> None:
-    """Beside a wall people pass a row of bins on the side where there is room, and stay on the
-    sidewalk."""
-    row = [thing("bin", 0.75 * k, 1.15, 1.57) for k in range(3)]
-    things = standing(*row)
-    (body,) = things.bodies
+def test_an_obstacle_at_the_edge_is_passed_on_the_other_side() -> None:
+    """Beside a wall people pass a row of bins on the open side and stay on the sidewalk."""
+    row = [obstacle_at("bin", 0.75 * k, 1.15, 1.57) for k in range(3)]
+    obstacle_list = standing(*row)
+    (body,) = obstacle_list.bodies
     assert (body.closed_x, body.closed_y) == pytest.approx((0.0, 1.0), abs=0.05)
     for east in (True, False):
         for y_m in (1.2, 1.0, 0.7):
-            track = shown(things, y_m, east)
+            track = shown_track(obstacle_list, y_m, east)
             assert gap_m(track, *row) > -TOUCHES_M and track[:, 1].max() < 1.6
             assert abs(track[-1, 0]) > 6.0
 
 
-def test_who_fits_between_two_things_goes_between_them() -> None:
-    """Things a person's width and more apart are two bodies, nearer ones are one."""
-    apart = standing(thing("bin", 0.0, -0.8, 0.0), thing("bin", 0.0, 0.95, 0.0))
-    near = standing(thing("bin", 0.0, -0.6, 0.0), thing("bin", 0.0, 0.6, 0.0))
+def test_people_walk_between_obstacles_where_they_fit() -> None:
+    """Obstacles a person's width or more apart are two bodies, nearer ones are one."""
+    apart = standing(obstacle_at("bin", 0.0, -0.8, 0.0), obstacle_at("bin", 0.0, 0.95, 0.0))
+    near = standing(obstacle_at("bin", 0.0, -0.6, 0.0), obstacle_at("bin", 0.0, 0.6, 0.0))
     assert len(apart.bodies) == 2 and len(near.bodies) == 1
-    assert np.abs(shown(apart, 0.1, True)[:, 1]).max() < 0.35
+    assert np.abs(shown_track(apart, 0.1, True)[:, 1]).max() < 0.35
 
 
-def asked(things: StandingObstacles) -> EventQuery:
-    """A question with the robot far away."""
+def query_with(obstacle_list: StandingObstacles) -> EventQuery:
+    """A query with the robot far away."""
     return EventQuery(
         episode="t",
         tick=0,
@@ -129,31 +127,34 @@ def asked(things: StandingObstacles) -> EventQuery:
         robot_length_m=0.7,
         robot_width_m=0.55,
         events=(),
-        standing=things.bodies,
+        standing=obstacle_list.bodies,
     )
 
 
 @pytest.mark.parametrize("kind", ["bike", "cafe", "fence"])
 @pytest.mark.parametrize("moves", [walk_on, walk_straight], ids=["walks", "presses"])
-def test_directed_people_step_round_it_too(kind: str, moves: object) -> None:
-    """People of events, who know the query alone, go round what it holds and walk on; without it
-    they walk through."""
-    one = thing(kind, 0.0, 0.05, 1.3)
-    for things in (standing(one), StandingObstacles()):
+def test_directed_people_walk_round_obstacles_too(kind: str, moves: object) -> None:
+    """People of events pass the obstacles in the query and walk on, and without them walk straight
+    through."""
+    obstacle = obstacle_at(kind, 0.0, 0.05, 1.3)
+    for obstacle_list in (standing(obstacle), StandingObstacles()):
         walker = Walker(x_m=-3.0, y_m=0.0, heading_rad=0.0)
         track = []
         for _ in range(160):
-            walker = moves(walker, 0.0, 1.3, Sight(asked(things)))  # type: ignore[operator]
+            walker = moves(walker, 0.0, 1.3, Sight(query_with(obstacle_list)))  # type: ignore[operator]
             track.append((walker.x_m, walker.y_m))
         assert walker.x_m > 3.0
-        assert (gap_m(np.array(track), one) > -TOUCHES_M) == bool(things.bodies)
+        assert (gap_m(np.array(track), obstacle) > -TOUCHES_M) == bool(obstacle_list.bodies)
 
 
-def test_a_director_is_told_of_what_is_near_alone() -> None:
-    """Of two things the one within reach of somebody is in the query, and it survives the wire."""
-    things = standing(thing("bin", 0.0), thing("planter", 12.0))
-    (near,) = things.near(np.array([[0.8, 0.0], [5.0, 0.0]]))
-    query = msgspec.structs.replace(asked(things), standing=(near,))
+def test_a_query_holds_only_nearby_obstacles() -> None:
+    """Of two obstacles the one near a person is in the query, and it survives encoding."""
+    obstacle_list = standing(obstacle_at("bin", 0.0), obstacle_at("planter", 12.0))
+    (near,) = obstacle_list.near(np.array([[0.8, 0.0], [5.0, 0.0]]))
+    query = msgspec.structs.replace(query_with(obstacle_list), standing=(near,))
     assert (near.x_m, near.y_m) == pytest.approx((0.0, 0.0))
     assert msgspec.json.decode(msgspec.json.encode(query), type=EventQuery) == query
-    assert things.near(np.array([[5.0, 0.0]])) == () and things.near(np.zeros((0, 2))) == ()
+    assert (
+        obstacle_list.near(np.array([[5.0, 0.0]])) == ()
+        and obstacle_list.near(np.zeros((0, 2))) == ()
+    )

@@ -1,4 +1,4 @@
-"""How one who walks steers round others."""
+"""Steering of a walking person round others."""
 
 from __future__ import annotations
 
@@ -24,11 +24,8 @@ def walk(
     speed_mps: float = 1.3,
     walls: bool = False,
 ) -> tuple[list[list[Vector]], float]:
-    """(paths, least distance in metres) of people who walk to their goals for 15 s, among others
-    who heed nobody.
-
-    walls: the ground ends 2 m left and right of the x axis.
-    """
+    """Return (paths, least distance in metres) of people who walk to goals for 15 s among others
+    who ignore them."""
     at = list(starts)
     moving = [(0.0, 0.0)] * len(starts)
     paths = [[xy] for xy in starts]
@@ -74,8 +71,8 @@ def walk(
     return paths, least_m
 
 
-def test_who_meets_nobody_walks_exactly_as_wanted() -> None:
-    """A person whom no one meets walks as wanted, to the bit."""
+def test_a_person_alone_walks_exactly_as_wanted() -> None:
+    """A person who meets no one walks as wanted, to the bit."""
     wanted = (1.1 / 3.0, -0.7 / 3.0)
     assert steered((3.3, 4.7), (0.0, 0.0), wanted, []) == wanted
     beside = [
@@ -87,8 +84,8 @@ def test_who_meets_nobody_walks_exactly_as_wanted() -> None:
     assert steered((3.3, 4.7), wanted, wanted, beside + leaving) == wanted
 
 
-def test_who_wants_to_stand_stands() -> None:
-    """Whoever comes: standing places are kept."""
+def test_a_person_who_wants_to_stand_stays() -> None:
+    """A person who wants to stand stays in place whoever approaches."""
     assert steered((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), [Neighbour(0.4, 0.0, -1.0, 0.0)]) == (
         0.0,
         0.0,
@@ -99,11 +96,8 @@ def test_who_wants_to_stand_stands() -> None:
     "standing", [[(0.0, 0.0)], TALKERS, QUEUE], ids=["one", "talkers", "queue"]
 )
 @pytest.mark.parametrize("start_m", [-6.0, -1.5])
-def test_who_is_blocked_by_people_who_stand_goes_round_all_of_them(
-    standing: list[Vector], start_m: float
-) -> None:
-    """From afar and from close by: never between them, and no more than a few seconds later at the
-    goal."""
+def test_a_group_in_the_way_is_passed_as_a_whole(standing: list[Vector], start_m: float) -> None:
+    """From far and near the person never walks between them, and arrives only a few seconds later."""
     (path,), least_m = walk(
         [(start_m, 0.2)], [(6.0, 0.2)], others=[Neighbour(*xy) for xy in standing]
     )
@@ -119,8 +113,8 @@ def test_who_is_blocked_by_people_who_stand_goes_round_all_of_them(
 
 
 @pytest.mark.parametrize("angle_deg", [180.0, 90.0, -90.0, 130.0, 40.0])
-def test_two_who_see_each_other_pass_and_arrive(angle_deg: float) -> None:
-    """Head-on, crossing at right angles in perfect symmetry, and obliquely."""
+def test_two_people_pass_each_other_and_arrive(angle_deg: float) -> None:
+    """They arrive after meeting head-on, at right angles in perfect symmetry, and obliquely."""
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     paths, least_m = walk(
         [(-6.0, 0.0), (-6.0 * cos, -6.0 * sin)], [(6.0, 0.0), (6.0 * cos, 6.0 * sin)]
@@ -131,8 +125,8 @@ def test_two_who_see_each_other_pass_and_arrive(angle_deg: float) -> None:
     )
 
 
-def test_a_stream_that_heeds_nobody_is_crossed_and_met() -> None:
-    """Through people who come towards one, and across people who come from the side."""
+def test_a_person_passes_streams_that_ignore_it() -> None:
+    """A person arrives through oncoming people and across people from the side, who all ignore it."""
     oncoming = [Neighbour(6.0 + 2.0 * k, 0.7 * (k % 3 - 1), -1.2, 0.0) for k in range(5)]
     for others in (oncoming, [Neighbour(0.0, -6.0, 0.0, 1.3), Neighbour(1.0, 5.0, 0.0, -1.2)]):
         (path,), least_m = walk([(-6.0, 0.0)], [(30.0, 0.0)], others=others)
@@ -140,8 +134,8 @@ def test_a_stream_that_heeds_nobody_is_crossed_and_met() -> None:
         assert path[-1][0] > 9.0
 
 
-def test_nobody_leaves_the_ground_or_is_faster_than_wanted() -> None:
-    """Between walls one passes those who stand on the side that is open."""
+def test_people_stay_on_the_ground_and_below_their_speed() -> None:
+    """Between walls they pass standing people on the open side."""
     (path,), least_m = walk(
         [(-6.0, 0.2)], [(6.0, 0.2)], others=[Neighbour(*xy) for xy in QUEUE], walls=True
     )

@@ -1,4 +1,4 @@
-"""People step round the robot."""
+"""Yielding: people step round the robot."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ def gap(xy: np.ndarray, robot: Pose) -> float:
 
 @pytest.mark.parametrize("aside_m", [0.0, 0.05, -0.3, 0.6])
 @pytest.mark.parametrize("heading", [0.0, 0.7, math.pi / 2])
-def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(
+def test_a_person_passes_a_standing_robot_without_touching_it(
     aside_m: float, heading: float
 ) -> None:
-    """From any lateral offset and against any heading the walker gets to the other side and never
-    overlaps."""
+    """From any lateral offset and against any robot heading the person arrives and never overlaps."""
     robot = Pose(0.0, 0.0, heading)
     xy = np.array([[4.0, aside_m]])
     goal = np.array([[-4.0, aside_m]])
@@ -38,9 +37,8 @@ def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(
     assert float(np.hypot(*(goal - xy)[0])) < 0.2
 
 
-def test_a_robot_that_drives_at_somebody_hits_them() -> None:
-    """Only a person's own steps are changed: who stands still is not moved out of the robot's
-    way."""
+def test_a_robot_that_drives_at_a_standing_person_hits_them() -> None:
+    """Only a person's own steps change, so a standing one is not moved out of the robot's way."""
     person = np.array([[1.0, 0.0]])
     for x_m in np.arange(0.0, 0.8, 0.1):
         assert np.array_equal(
@@ -49,16 +47,15 @@ def test_a_robot_that_drives_at_somebody_hits_them() -> None:
     assert gap(person, Pose(0.7, 0.0, 0.0)) < 0.0
 
 
-def test_people_who_are_not_near_walk_as_they_want() -> None:
+def test_people_far_from_the_robot_walk_as_wanted() -> None:
     """Far from the robot, beside it, and walking away from it nothing changes."""
     before = np.array([[5.0, 0.0], [0.0, 0.29 + 0.3 + STEP_ROUND_GAP_M + 0.05], [0.7, 0.0]])
     wanted = before + np.array([[-0.07, 0.0], [0.07, 0.0], [0.07, 0.0]])
     assert np.allclose(stepped_around(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF)), wanted)
 
 
-def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
-    """A person and a robot at 1.5 m/s meet head-on: the person gets out of its way before they
-    touch."""
+def test_a_person_steps_aside_for_an_oncoming_robot() -> None:
+    """A person and a robot at 1.5 m/s meet head-on, and the person moves aside before they touch."""
     xy = np.array([[6.0, 0.1]])
     nearest = math.inf
     for tick in range(80):
@@ -69,8 +66,8 @@ def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
     assert float(xy[0, 0]) < 1.5 * 0.05 * 80 - 1.0
 
 
-def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
-    """A slower person in front keeps walking and is run into: the robot has to watch out."""
+def test_a_person_does_not_see_a_robot_from_behind() -> None:
+    """A slower person in front keeps walking and is hit, so the robot has to watch out."""
     before = np.array([[0.8, 0.0]])
     wanted = before + np.array([[0.03, 0.0]])
     assert np.allclose(
@@ -79,8 +76,8 @@ def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
 
 
 @pytest.mark.parametrize("x_m", [-0.3, 0.0, 0.5])
-def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> None:
-    """A person who wants to stand where the robot is comes within a hand's breadth of it and stops."""
+def test_a_person_who_wants_to_stand_at_the_robot_stops_beside_it(x_m: float) -> None:
+    """The person comes within a hand's breadth of the robot and stops."""
     body = RobotBody(Pose(0.0, 0.0, 0.0), HALF)
     place = np.array([x_m, 0.45])
     xy = np.array([[2.0, 1.2]])

@@ -19,8 +19,8 @@ ROUTE = Polyline([(-20.0, 5.0), (0.0, 5.0), (0.0, -6.5)])
 CROSSING = RouteCrossing(id=":c0", enter_s_m=21.5, leave_s_m=28.5, signalised=True)
 
 
-def turned_over(y_m: float) -> StreetMap:
-    """The street whose corner in the north a car drives over, along x at y."""
+def street_with_turning_car(y_m: float) -> StreetMap:
+    """Return the street where a car turns over the northern corner, along x at y."""
     line = np.array([[-4.0, y_m], [4.0, y_m]])
     polygon = shapely.LineString(line).buffer(1.6, cap_style="flat")
     turn = Lane(":t_0", ":t", "road", line, 3.2, polygon, internal=True)
@@ -29,15 +29,14 @@ def turned_over(y_m: float) -> StreetMap:
 
 
 def test_a_robot_waits_directly_before_a_crossing_where_no_car_turns() -> None:
-    """Its front is as far from the crossing as always."""
+    """Its front has the usual distance from the crossing."""
     (wait_m,) = waits_before(tiny_map(), ROUTE, (CROSSING,), COURIER)
     assert wait_m == pytest.approx(21.5 - COURIER.length_m / 2 - STOP_SHORT_M)
 
 
 def test_a_robot_waits_outside_the_path_of_a_car_that_turns_over_the_corner() -> None:
-    """The robot is beside the car's path with a gap, and no farther from the crossing than
-    counts as waiting at it."""
-    (wait_m,) = waits_before(turned_over(3.6), ROUTE, (CROSSING,), COURIER)
+    """It has a gap to the car's path, and still counts as waiting at the crossing."""
+    (wait_m,) = waits_before(street_with_turning_car(3.6), ROUTE, (CROSSING,), COURIER)
     path = shapely.LineString([(-4.0, 3.6), (4.0, 3.6)]).buffer(CAR_WIDTH_M / 2)
     pose = ROUTE.at(wait_m)
     body = shapely.Point(pose.xy).buffer(COURIER.width_m / 2)

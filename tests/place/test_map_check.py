@@ -1,4 +1,4 @@
-"""What is said of a place: on a made-up one, small enough to count by hand."""
+"""The check of a place, on an invented one that is small enough to count by hand."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def place(strips: list[Strip], corners: list[Corner], lanes: list[Lane]) -> Stre
 
 
 def town() -> StreetMap:
-    """Two sidewalks of 200 m on both sides of a road, joined by a crossing in the east; and what is
-    wrong with it."""
+    """Two sidewalks of 200 m on both sides of a road, joined by a crossing in the east, with known
+    faults."""
     strips = [
         strip("south", (0, 0), (200, 0), corners=(None, "cs")),
         strip("north", (0, 12), (200, 12), corners=(None, "cn")),
@@ -72,8 +72,8 @@ def town() -> StreetMap:
     )
 
 
-def test_figures_of_a_made_up_place() -> None:
-    """Lengths, counts and shares are those one gets by hand."""
+def test_figures_of_a_small_place() -> None:
+    """Lengths, counts and shares equal those by hand."""
     check = check_map(town())
     assert (check.sidewalks, check.crossings, check.signalised, check.corners) == (6, 1, 1, 2)
     assert check.walkable_km == pytest.approx(0.5605)
@@ -95,8 +95,8 @@ def test_figures_of_a_made_up_place() -> None:
 
 
 def test_corners_that_cars_drive_over_are_counted_and_listed() -> None:
-    """A path of cars inside a junction that leads over a corner is one; over a crossing alone, or
-    of bicycles, none."""
+    """Car paths inside a junction over a corner count; those over a crossing alone, or of bicycles,
+    do not."""
     clear = town()
     turn = road("turn", (199, -0.5), (201, 1), (201, 11), internal=True)
     check = check_map(dataclasses.replace(clear, lanes={**clear.lanes, "turn_0": turn}))
@@ -116,13 +116,15 @@ def test_corners_that_cars_drive_over_are_counted_and_listed() -> None:
         )
 
 
-def test_a_place_in_pieces_is_warned_of() -> None:
-    """Where the largest island has less than 60 % of the length the check says what that means and
-    what to do."""
-    whole = town()
-    assert check_map(whole).warnings == ()
+def test_a_place_in_pieces_gives_a_warning() -> None:
+    """Where the largest island has less than 60 % of the length, the check explains the effect and
+    the remedy."""
+    connected = town()
+    assert check_map(connected).warnings == ()
     far = strip("far", (0, 90), (400, 90))
-    (warning,) = check_map(dataclasses.replace(whole, strips={**whole.strips, "far": far})).warnings
+    (warning,) = check_map(
+        dataclasses.replace(connected, strips={**connected.strips, "far": far})
+    ).warnings
     assert warning.startswith(
         "the largest of 6 islands of connected walkways has 42% of their length: scenarios are"
     )
@@ -130,7 +132,7 @@ def test_a_place_in_pieces_is_warned_of() -> None:
 
 
 def test_places_without_walks_or_corners_are_not_usable() -> None:
-    """The reason says which it is."""
+    """The reason names which of them is missing."""
     lonely = place([strip("a", (0, 0), (100, 0))], [], [])
     assert check_map(lonely).reasons[0].startswith("its sidewalks are not connected")
     bare = dataclasses.replace(lonely, strips={})
@@ -168,8 +170,8 @@ def net() -> ET.Element:
 
 
 def test_facts_of_a_net() -> None:
-    """Kinds of walkways, elevations, levels and signals are told apart; the last program of a
-    signal counts."""
+    """Kinds of walkways, elevations, levels and signals are counted separately, and the last
+    program of a signal counts."""
     facts: NetFacts = facts_of(net())
     assert (facts.version, facts.left_hand, facts.projected, facts.edges) == ("1.9", True, True, 4)
     assert (facts.pavement_km, facts.shared_km, facts.mixed_km) == (pytest.approx(0.51), 0.3, 0.2)
@@ -182,9 +184,8 @@ def test_facts_of_a_net() -> None:
     assert crossing_signals(net()).never == [":J_c0"]
 
 
-def test_notes_say_what_is_not_used() -> None:
-    """Elevations that are dropped or changed, bridges, level crossings and dead signals are named
-    in words."""
+def test_notes_list_what_is_not_used() -> None:
+    """Dropped or changed elevations, bridges, level crossings and dead signals are named."""
     land = Elevation(
         low_m=0.0, high_m=90.0, points=50, missing=7, false_share=0.1, clamped=3, moved_m=1.25
     )
@@ -195,11 +196,13 @@ def test_notes_say_what_is_not_used() -> None:
         "elevation 0 to 90 m is dropped, the ground is flat: it is the same"
         in check_map(false).notes[-1]
     )
-    kept = dataclasses.replace(
+    elevated = dataclasses.replace(
         town(), elevation=dataclasses.replace(land, steep=(next(iter(town().strips)),))
     )
-    notes = "\n".join(check_map(kept, None, facts_of(net())).notes)
-    assert [p.piece for p in check_map(kept).problems if p.kind == "steep"] == list(kept.steep)
+    notes = "\n".join(check_map(elevated, None, facts_of(net())).notes)
+    assert [p.piece for p in check_map(elevated).problems if p.kind == "steep"] == list(
+        elevated.steep
+    )
     for words in (
         "elevation 0 to 90 m is kept; 7 of 50 points had none or a false one",
         "3 places on streets were moved, by up to 1.2 m",
@@ -215,8 +218,8 @@ def test_notes_say_what_is_not_used() -> None:
         assert words in notes
 
 
-def test_foreign_widths(tmp_path: Path) -> None:
-    """A width of -1 means SUMO's own; one that is no number is refused."""
+def test_widths_of_imported_nets(tmp_path: Path) -> None:
+    """A width of -1 means SUMO's default, and one that is no number is refused."""
     path = tmp_path / "w.net.xml"
     text = """<net version="1.9"><location convBoundary="0,0,9,9"/><edge id="a"><lane id="a_0" allow="pedestrian"
         width="-1.00" length="9" shape="0,0 9,0"/></edge></net>"""

@@ -14,7 +14,7 @@ box = shapely.box
 
 
 def test_the_axis_of_a_sidewalk_is_its_middle() -> None:
-    """It runs from end to end, without branches into corners, as wide as the sidewalk."""
+    """It runs from end to end, without branches into corners, with the sidewalk's width."""
     axis = medial_axis(box(0, 0, 45, 3))
     (piece,) = axis.pieces
     assert np.abs(piece.line[:, 1] - 1.5).max() < 0.02
@@ -41,7 +41,7 @@ def test_the_axis_is_cut_where_the_width_changes() -> None:
 
 
 def test_forks_join_and_obstacles_are_passed_on_wide_sides() -> None:
-    """A cross has four arms at one node; a post near an edge is passed on its other side."""
+    """A cross has four arms at one node, and a post near an edge is passed on its wider side."""
     cross = medial_axis(overlay.union_all([box(-20, -1.5, 20, 1.5), box(-1.5, -20, 1.5, 20)]))
     degrees = np.bincount([end for piece in cross.pieces for end in (piece.start, piece.end)])
     assert len(cross.pieces) == 4 and degrees.max() == 4
@@ -54,7 +54,7 @@ def test_forks_join_and_obstacles_are_passed_on_wide_sides() -> None:
 
 
 def test_narrow_ground_has_no_axis() -> None:
-    """Ground that no robot passes is left out."""
+    """Ground too narrow for a robot is left out."""
     assert not medial_axis(box(0, 0, 20, 0.7)).pieces
     joined = overlay.union_all([box(0, 0, 20, 3), box(20, 1, 30, 1.6), box(30, 0, 50, 3)])
     assert len(medial_axis(joined).pieces) == 2

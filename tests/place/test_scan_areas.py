@@ -37,14 +37,15 @@ def feature(kind: str, geometry: dict[str, Any]) -> dict[str, Any]:
     return {"type": "Feature", "properties": {"kind": kind}, "geometry": geometry}
 
 
-def written(path: Path, *features: dict[str, Any], frame: str | None = "local") -> Path:
+def write_geojson(path: Path, *features: dict[str, Any], frame: str | None = "local") -> Path:
     stated = {} if frame is None else {"frame": frame}
     path.write_text(json.dumps({"type": "FeatureCollection", **stated, "features": features}))
     return path
 
 
 def test_local_and_wgs84_files_give_equal_areas(tmp_path: Path) -> None:
-    """Areas in degrees near the georeference are those in metres of the map, whose frame is named."""
+    """Areas in degrees near the georeference equal those in metres of the map, whose frame is
+    named."""
     degrees = np.array([[13.1955, 55.6982], [13.1957, 55.6982], [13.1957, 55.6983]])
     metres = to_local(degrees, LUND)
     assert metres[1, 0] - metres[0, 0] == pytest.approx(12.57, abs=0.02)
@@ -54,12 +55,12 @@ def test_local_and_wgs84_files_give_equal_areas(tmp_path: Path) -> None:
         for r in (degrees, metres)
     ]
     files = [
-        written(tmp_path / f"{i}.geojson", feature("sidewalk", ring), frame=frame)
+        write_geojson(tmp_path / f"{i}.geojson", feature("sidewalk", ring), frame=frame)
         for i, (ring, frame) in enumerate(zip(rings, (None, "local"), strict=True))
     ]
     one, other = (read_areas(path, GRID, LUND)[0].polygon for path in files)
     assert shapely.hausdorff_distance(one, other) < 1e-6
-    named = written(tmp_path / "named.geojson", feature("sidewalk", rings[0]), frame="wgs84")
+    named = write_geojson(tmp_path / "named.geojson", feature("sidewalk", rings[0]), frame="wgs84")
     assert read_areas(named, GRID, LUND)[0].polygon.equals(one)
 
 
@@ -90,23 +91,23 @@ CONFUSED: dict[str, tuple[dict[str, Any], str | None, Georeference | None, str]]
 @pytest.mark.parametrize("name", CONFUSED)
 def test_metres_and_degrees_are_not_confused(tmp_path: Path, name: str) -> None:
     """Areas and paths in another unit than their frame are refused with their range and remedy."""
-    geometry, frame, there, words = CONFUSED[name]
-    path = written(tmp_path / "a.geojson", feature("sidewalk", geometry), frame=frame)
+    geometry, frame, expected, words = CONFUSED[name]
+    path = write_geojson(tmp_path / "a.geojson", feature("sidewalk", geometry), frame=frame)
     with pytest.raises(MapError, match=words):
-        read_areas(path, GRID, there)
+        read_areas(path, GRID, expected)
     line = {"type": "LineString", "coordinates": geometry["coordinates"][0][:3]}
-    path = written(tmp_path / "way.geojson", feature("", line), frame=frame)
+    path = write_geojson(tmp_path / "way.geojson", feature("", line), frame=frame)
     with pytest.raises(MapError, match=r"are (no )?degrees"):
-        read_way(path, there)
-    if frame == "local" and there is None:
+        read_way(path, expected)
+    if frame == "local" and expected is None:
         route = {"route": line["coordinates"]}
         (tmp_path / "way.json").write_text(json.dumps(route))
         with pytest.raises(MapError, match=r"way\.json: .* are degrees, .* --georeference"):
-            read_way(tmp_path / "way.json", there)
+            read_way(tmp_path / "way.json", expected)
 
 
 def test_areas_survive_writing_and_reading(tmp_path: Path) -> None:
-    """What is written for editing reads back as it was, holes included."""
+    """Areas written for editing read back unchanged, holes included."""
     holed = shapely.box(1, 1, 9, 9) - shapely.box(3, 3, 5, 5)
     areas = [ScanArea("sidewalk", holed), ScanArea("obstacle", shapely.box(6, 6, 7, 7))]
     (tmp_path / "areas.geojson").write_bytes(encode_areas(areas, step_m=0.01))
@@ -140,7 +141,7 @@ WRONG = {
 def test_wrong_areas_are_refused(tmp_path: Path, name: str) -> None:
     """The error names file, feature and reason."""
     features, words = WRONG[name]
-    path = written(tmp_path / "areas.geojson", *features)
+    path = write_geojson(tmp_path / "areas.geojson", *features)
     with pytest.raises(MapError, match=rf"areas\.geojson: {words}"):
         read_areas(path, GRID, None)
 
@@ -152,7 +153,7 @@ def test_files_that_are_no_geojson_are_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.geojson").write_text("{")
     with pytest.raises(MapError, match="no JSON"):
         read_areas(tmp_path / "broken.geojson", GRID, None)
-    other = written(tmp_path / "other.geojson", feature("road", square(1, 1)), frame="utm")
+    other = write_geojson(tmp_path / "other.geojson", feature("road", square(1, 1)), frame="utm")
     with pytest.raises(MapError, match="frame is 'utm', but must be 'local' or 'wgs84'"):
         read_areas(other, GRID, None)
 
@@ -166,7 +167,7 @@ def test_walked_paths_of_both_formats_are_equal(tmp_path: Path) -> None:
     way = read_way(tmp_path / "way.json", LUND)
     assert way[0] == pytest.approx(to_local(origin, LUND)[0])
     line = {"type": "LineString", "coordinates": [*origin.tolist(), [13.1957, 55.6983]]}
-    path = written(
+    path = write_geojson(
         tmp_path / "way.geojson",
         {"type": "Feature", "properties": {}, "geometry": line},
         frame=None,
@@ -178,7 +179,7 @@ def test_walked_paths_of_both_formats_are_equal(tmp_path: Path) -> None:
 
 
 def test_a_corridor_covers_measured_ground_alone() -> None:
-    """It is as wide as wanted and ends where the scan has no ground."""
+    """It has the requested width and ends where the scan has no ground."""
     measured = GRID.measured.copy()
     measured[:, 121:] = False
     grid = dataclasses.replace(GRID, measured=measured)
@@ -192,7 +193,7 @@ def test_a_corridor_covers_measured_ground_alone() -> None:
         corridor(way + 100.0, 3.0, grid)
 
 
-def test_walkable_ground_is_drawn_ground_less_what_stands() -> None:
+def test_walkable_ground_is_drawn_ground_without_obstacles() -> None:
     """Obstacles, blocked cells and uncovered ground are left out."""
     blocked = STREET_GRID.blocked.copy()
     blocked[22:27, 60:65] = True  # x 10 to 11, y 0.5 to 1.5
@@ -210,7 +211,7 @@ def test_walkable_ground_is_drawn_ground_less_what_stands() -> None:
 
 
 def test_a_draft_is_the_largest_level_free_piece() -> None:
-    """Steep, blocked and unmeasured ground is left out, and so is what is behind it."""
+    """Steep, blocked and unmeasured ground is left out, and so is what lies behind it."""
     grade = np.zeros(GRID.heights.shape, dtype=np.float32)
     grade[:, 80:84] = 1.0  # a step at x = 20 to 21
     blocked = GRID.blocked.copy()
@@ -224,7 +225,7 @@ def test_a_draft_is_the_largest_level_free_piece() -> None:
 
 
 def test_areas_of_a_map_are_moved_to_free_ground() -> None:
-    """A sidewalk between two walls is found again after a shift, and the rest is told."""
+    """A sidewalk between two walls is found again after a shift, which is reported."""
     blocked = np.ones(GRID.heights.shape, dtype=bool)
     blocked[32:45] = False  # y 8 to 11
     grid = dataclasses.replace(GRID, blocked=blocked)

@@ -1,4 +1,4 @@
-"""The walking graph, on a small made-up street: two sidewalks, a crossing, and a way round."""
+"""The walking graph, on a small invented street: two sidewalks, a crossing, and a detour."""
 
 from __future__ import annotations
 
@@ -23,11 +23,8 @@ def strip(
 
 
 def square() -> StreetMap:
-    """A ring south -> east -> north -> west of four strips (north is a crossing), and an island
-    strip.
-
-    Corners sw, se, ne, nw; each corner is 2 m wide, and south is 40 m long, the others 20 m.
-    """
+    """A ring of four strips with an island strip: corners of 2 m, south 40 m long, the others 20 m,
+    north a crossing."""
     strips = [
         strip("south", [(1, 0), (41, 0)], ("sw", "se")),
         strip("east", [(42, 1), (42, 21)], ("se", "ne")),
@@ -50,7 +47,7 @@ HOP = math.sqrt(2.0)
 
 
 def test_shortest_takes_the_shorter_way_round() -> None:
-    """The way from the south-west to the north-west corner leads along west, not round by the
+    """From the south-west to the north-west corner the way leads along west, not round by the
     crossing."""
     path, length_m = WalkGraph(square()).shortest(Port("south", 0), Port(":n_c0", 1)) or ([], 0.0)
     assert path == [Port("south", 0), Port("west", 1), Port("west", 0), Port(":n_c0", 1)]
@@ -62,15 +59,15 @@ def test_a_closed_port_is_not_passed_in_either_direction() -> None:
     ring."""
     graph = WalkGraph(square())
     closed = frozenset({Port(":n_c0", 1)})
-    there = graph.shortest(Port("west", 0), Port(":n_c0", 1), closed)
+    forward = graph.shortest(Port("west", 0), Port(":n_c0", 1), closed)
     back = graph.shortest(Port(":n_c0", 1), Port("west", 0), closed)
-    assert there is not None and back is not None
-    assert there[0] == back[0][::-1]
-    assert there[0][-2] == Port(":n_c0", 0)
-    assert there[1] == pytest.approx(20 + HOP + 40 + HOP + 20 + HOP + 40)
+    assert forward is not None and back is not None
+    assert forward[0] == back[0][::-1]
+    assert forward[0][-2] == Port(":n_c0", 0)
+    assert forward[1] == pytest.approx(20 + HOP + 40 + HOP + 20 + HOP + 40)
 
 
-def test_no_way_is_none() -> None:
+def test_an_unreachable_goal_gives_none() -> None:
     """The island, and a strip closed at both ends, cannot be reached."""
     graph = WalkGraph(square())
     assert graph.shortest(Port("south", 0), Port("island", 0)) is None
@@ -82,7 +79,7 @@ def test_no_way_is_none() -> None:
     )
 
 
-def test_components_and_the_largest() -> None:
+def test_components_and_the_main_component() -> None:
     """The ring with its spur is one component and the main one; the island is another."""
     graph = WalkGraph(square())
     assert graph.main_strips == {"south", "east", ":n_c0", "west", "spur"}
@@ -105,8 +102,8 @@ def test_reach_is_limited_and_agrees_with_shortest() -> None:
         assert everything.to(goal) == pytest.approx(length_m)
 
 
-def test_others_are_the_ports_across_the_corner() -> None:
-    """At a corner one meets its other ports; none at a dead end, none through a closed port."""
+def test_the_other_ports_are_those_across_the_corner() -> None:
+    """A corner connects its ports; a dead end has none, and a closed port leads to none."""
     graph = WalkGraph(square())
     assert graph.others(Port("east", 1)) == (Port(":n_c0", 0), Port("spur", 0))
     assert graph.others(Port("east", 1), frozenset({Port("spur", 0)})) == (Port(":n_c0", 0),)
@@ -114,7 +111,7 @@ def test_others_are_the_ports_across_the_corner() -> None:
     assert graph.others(Port("spur", 1)) == ()
 
 
-def test_wander_is_connected_and_keeps_out_of_traps() -> None:
+def test_wander_is_connected_and_avoids_dead_ends() -> None:
     """A wanderer goes from strip to neighbouring strip, never into the dead end, and stops on a
     sidewalk."""
     street_map = square()

@@ -1,5 +1,5 @@
-"""`follow`: its graph made of published weights, people and ground in pictures, and the arcs that
-it takes."""
+"""`follow`: its graph from published weights, people and ground in pictures, and the arcs that it
+takes."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ NOBODY = np.zeros((0, 2))
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with both graphs, one of them made anew."""
+    """A folder with both graphs, one of them built by this test."""
     return make_weights(tmp_path_factory.mktemp("weights"))
 
 
@@ -62,8 +62,8 @@ def picture(name: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(cv2.imread(str(PICTURES / f"{name}.jpg"))[..., ::-1])
 
 
-def test_every_number_of_the_file_has_its_place_in_the_graph(weights: Path) -> None:
-    """NetworkFile with one array more, one less, or one of another name are refused."""
+def test_every_array_of_the_file_is_used_by_the_graph(weights: Path) -> None:
+    """A NetworkFile with an additional, a missing or a renamed array is refused."""
     arrays = read_torch_file((WEIGHTS / ESPNET_WEIGHTS.name).read_bytes())
     with pytest.raises(ValueError, match="holds 'more', and 0 more, of which there is no place"):
         street_graph({**arrays, "more": np.zeros(1)})
@@ -73,8 +73,8 @@ def test_every_number_of_the_file_has_its_place_in_the_graph(weights: Path) -> N
 
 
 def test_espnetv2_sees_a_sidewalk_between_two_verges(weights: Path) -> None:
-    """In pictures of our street the pavement is walkable, and grass and houses are not; mirrored it
-    is the mirrored."""
+    """In pictures of our street pavement is walkable, grass and houses are not, and mirrored
+    pictures give mirrored masks."""
     network = Graph(weights / ESPNET_GRAPH.name)
     street = picture("front_left")
     walkable = walkable_pixels(street, network)
@@ -87,7 +87,8 @@ def test_espnetv2_sees_a_sidewalk_between_two_verges(weights: Path) -> None:
 def test_follow_turns_back_to_the_sidewalk_and_a_mirrored_street_mirrors_its_turn(
     weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a robot that has turned 30 degrees away from it, without a goal."""
+    """A robot without a goal that has turned 30 degrees away turns back, mirrored to the other
+    side."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(weights))
     driver = load_policy("follow")
     assert len(driver.source_hash) == 16 and str(weights) in weights_in_words()
@@ -108,7 +109,7 @@ def test_follow_turns_back_to_the_sidewalk_and_a_mirrored_street_mirrors_its_tur
 def test_follow_without_its_weights_says_how_they_are_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command, the file that it takes, and where that is to be had; another file of the name is
+    """The message has the command, its input file and the source; another file of the name is
     refused."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
@@ -130,7 +131,7 @@ def test_follow_without_its_weights_says_how_they_are_made(
 
 
 def test_a_file_that_is_not_the_weights_is_refused_in_one_line(tmp_path: Path) -> None:
-    """Its size and hash, and those wanted; nothing is written."""
+    """The line has its size and hash and the required ones, and nothing is written."""
     (tmp_path / "w.pth").write_bytes(b"not weights")
     command = [
         sys.executable,
@@ -140,14 +141,14 @@ def test_a_file_that_is_not_the_weights_is_refused_in_one_line(tmp_path: Path) -
         "-o",
         tmp_path / "out",
     ]
-    told = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert told.returncode == 1 and told.stderr.count("\n") == 1
-    assert "w.pth: 11 bytes, BLAKE2b" in told.stderr and "1107690 bytes" in told.stderr
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 1 and result.stderr.count("\n") == 1
+    assert "w.pth: 11 bytes, BLAKE2b" in result.stderr and "1107690 bytes" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
 def test_a_file_of_weights_cannot_run_code() -> None:
-    """A pickle that asks for anything but tensors is refused, and so is what is no pickle."""
+    """A pickle with anything but tensors is refused, and so is a file that is no pickle."""
     begin = pickle.dumps(0x1950A86A20F9469CFC6C) + pickle.dumps(1001) + pickle.dumps({})
     with pytest.raises(ValueError, match=r"holds a \w+\.system: weights alone are read"):
         read_torch_file(begin + pickle.dumps(os.system))
@@ -156,15 +157,15 @@ def test_a_file_of_weights_cannot_run_code() -> None:
             read_torch_file(data)
 
 
-def test_boxes_are_where_the_network_says() -> None:
-    """A planted answer in the grid of 16 pixels, and its like beside it, become one box in the
-    picture's pixels."""
-    told = np.zeros((3549, 85), np.float32)
+def test_boxes_are_decoded_from_the_networks_answer() -> None:
+    """A planted answer in the grid of 16 pixels, and its duplicate beside it, become one box in
+    picture pixels."""
+    answer = np.zeros((3549, 85), np.float32)
     row = 52 * 52 + 10 * 26 + 5  # of the second grid, the row 10 and the column 5
-    told[row, :6] = 0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.9
-    told[row + 1, :6] = -0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.6
-    told[7, :6] = 0.0, 0.0, 0.0, 0.0, 0.9, 0.2
-    (box,) = decode_boxes(told, scale=416 / 512)
+    answer[row, :6] = 0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.9
+    answer[row + 1, :6] = -0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.6
+    answer[7, :6] = 0.0, 0.0, 0.0, 0.0, 0.9, 0.2
+    (box,) = decode_boxes(answer, scale=416 / 512)
     middle = np.array([5.5, 10.25]) * 16
     size = np.array([32.0, 64.0])
     assert np.allclose(
@@ -172,9 +173,9 @@ def test_boxes_are_where_the_network_says() -> None:
     )
 
 
-def test_feet_are_where_they_stand() -> None:
-    """A person 4 m ahead and 1 m left is located by the lower edge of its box; a box above the
-    horizon is left out."""
+def test_feet_are_located_on_the_ground() -> None:
+    """The lower edge of a box locates a person 4 m ahead and 1 m left; a box above the horizon is
+    left out."""
     x, y, depth = CAMERA.matrix @ (np.linalg.inv(CAMERA.on_robot) @ [4.0, 1.0, 0.0, 1.0])[:3]
     u, v = x / depth, y / depth
     feet = GROUND.ground_positions(
@@ -183,9 +184,9 @@ def test_feet_are_where_they_stand() -> None:
     assert np.allclose(feet, [[4.0, 1.0]], atol=0.01)
 
 
-def test_what_is_not_walkable_lies_on_the_ground_where_it_is_seen() -> None:
-    """A picture whose left half cannot be driven on blocks the cells to the left, as far as the
-    camera sees them."""
+def test_unwalkable_pixels_block_the_ground_they_show() -> None:
+    """A picture with an unwalkable left half blocks the cells to the left, as far as the camera
+    sees them."""
     walkable = np.ones((128, 256), np.bool_)
     walkable[:, :128] = False
     free = GROUND.free(walkable)
@@ -194,8 +195,8 @@ def test_what_is_not_walkable_lies_on_the_ground_where_it_is_seen() -> None:
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_arcs_keep_to_the_middle_and_lead_to_the_goal(robot: Robot) -> None:
-    """Straight on where all is free; to the goal's side; away from a wall, as far to the left as to
-    the right."""
+    """They lead straight on open ground, to the goal's side, and away from a wall, with mirrored
+    results."""
     assert best_arc(OPEN, NOBODY, robot, None).curvature == pytest.approx(0.0, abs=1e-9)
     assert command_along(best_arc(OPEN, NOBODY, robot, None), robot).v_mps == pytest.approx(
         0.8 * robot.cruise_mps
@@ -214,7 +215,7 @@ def test_arcs_keep_to_the_middle_and_lead_to_the_goal(robot: Robot) -> None:
     assert back.curvature == pytest.approx(-away.curvature)
 
 
-def test_it_goes_round_a_person_with_room_and_stops_before_one_without() -> None:
+def test_follow_passes_a_person_with_room_and_stops_without() -> None:
     """The policy passes a person on open ground and stops before one in a lane of 1.4 m."""
     person = np.array([[2.5, 0.0]])
     round_him = best_arc(OPEN, person, COURIER, None)
@@ -226,14 +227,14 @@ def test_it_goes_round_a_person_with_room_and_stops_before_one_without() -> None
     assert command_along(best_arc(lane, NOBODY, COURIER, None), COURIER).v_mps == pytest.approx(1.2)
 
 
-def test_it_turns_on_the_spot_to_the_freer_side() -> None:
-    """Left where more of the left is free."""
+def test_follow_turns_on_the_spot_to_the_freer_side() -> None:
+    """It turns left where more of the left is free."""
     half = OPEN.copy()
     half[round(1.0 / GROUND_CELL_M) :, :40] = False
     assert turn_aside(half, COURIER).w_radps > 0.0 > turn_aside(half[:, ::-1], COURIER).w_radps
 
 
-def test_it_stands_four_seconds_for_who_is_near_and_then_goes_round() -> None:
+def test_follow_waits_four_seconds_for_a_near_person_and_then_passes() -> None:
     """The policy waits four seconds for a person near it, even if the detector misses a frame, and
     then passes."""
     near = np.array([[2.0, 0.3]])

@@ -1,5 +1,4 @@
-"""What stands on the way: the room beside it, the line led round it, and the oracle driven past
-it."""
+"""Obstacles on the way: the clearance, the line led round them, and the oracle driven past them."""
 
 from __future__ import annotations
 
@@ -21,12 +20,12 @@ from cosim.policies.privileged.route_planner import DistanceField, RoutePlanner
 from cosim.spec.robot import COURIER
 
 GAP_M = COURIER.width_m + 0.5
-"""What is left free beside everything that stands on a way."""
+"""Width in metres that remains free beside every obstacle."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """A walkway about a route, what stands on it, and where the robot's middle may be."""
+    """A walkway about a route with its obstacles, and where the robot's centre may be."""
 
     walk: Polygon
     route: Polyline
@@ -38,7 +37,7 @@ class Course:
 
 
 def straight(*obstacles: Polygon, width_m: float = 3.0) -> Course:
-    """20 m along the x axis."""
+    """A straight route of 20 m along the x axis."""
     route = Polyline([(0.0, 0.0), (20.0, 0.0)])
     return Course(
         box(-1.0, -width_m / 2, 21.0, width_m / 2), route, shapely.union_all(list(obstacles))
@@ -46,8 +45,8 @@ def straight(*obstacles: Polygon, width_m: float = 3.0) -> Course:
 
 
 def drawn(seed: int) -> Course:
-    """25 m of a walkway that bends, with something every few metres, half of it on the middle;
-    GAP_M stays free."""
+    """25 m of a winding walkway with an obstacle every few metres, half of them in the middle, and
+    GAP_M free."""
     random = np.random.default_rng(seed)
     width_m, radius_m = random.uniform(2.4, 4.0), random.uniform(8.0, 30.0)
     turn = np.linspace(0.0, 25.0 / radius_m, 60)
@@ -70,7 +69,7 @@ def drawn(seed: int) -> Course:
 
 
 def passable(walk: Polygon, solid: BaseGeometry, route: Polyline) -> bool:
-    """Whether a disk as wide as GAP_M gets from the start to within reach of the goal."""
+    """Return whether a disk of diameter GAP_M gets from the start to the goal's radius."""
     room = shapely.buffer(shapely.difference(walk, solid), -GAP_M / 2)
     start = Point(route.points[0])
     goal = Point(route.points[-1])
@@ -80,8 +79,8 @@ def passable(walk: Polygon, solid: BaseGeometry, route: Polyline) -> bool:
 def driven(
     course: Course, pose: Pose, jump: tuple[float, Pose] | None = None, people: People = NO_PEOPLE
 ) -> Floats:
-    """(N, 3) x, y, heading of the oracle every 0.05 s until the goal, or for 60 s. jump: it is put
-    elsewhere once, when it has come so far on the route."""
+    """Return (N, 3) x, y, heading of the oracle every 0.05 s to the goal or 60 s; `jump` resets it
+    once at a route place."""
     oracle = Orca()
     free = course.free
     route = course.route
@@ -120,20 +119,20 @@ def driven(
 
 
 def bodies(track: Floats) -> list[Polygon]:
-    """The robot's outline at each pose."""
+    """Return the robot's outline at each pose."""
     length, width = COURIER.footprint_m
-    whole = box(-length / 2, -width / 2, length / 2, width / 2)
+    outline = box(-length / 2, -width / 2, length / 2, width / 2)
     return [
         affinity.translate(
-            affinity.rotate(whole, heading, origin=(0.0, 0.0), use_radians=True), x, y
+            affinity.rotate(outline, heading, origin=(0.0, 0.0), use_radians=True), x, y
         )
         for x, y, heading in track
     ]
 
 
 def test_clearance_is_the_distance_to_the_edge() -> None:
-    """To 3 cm beside what is straight, positive on free ground alone, and never positive far from
-    the route."""
+    """It is exact to 3 cm along straight edges, positive on free ground alone, and never positive
+    far from the route."""
     course = straight(box(8.0, -0.5, 9.0, 0.5))
     clearance = DistanceField(course.free, course.route)
     points = np.random.default_rng(0).uniform((0.5, -1.4), (19.5, 1.4), (2000, 2))
@@ -144,9 +143,8 @@ def test_clearance_is_the_distance_to_the_edge() -> None:
     assert (clearance.at(np.array([[10.0, 9.0], [-40.0, 0.0], [400.0, 900.0]])) < 0.0).all()
 
 
-def test_the_line_keeps_to_the_route_where_nothing_stands_and_goes_round_what_does() -> None:
-    """A box on the middle of 3 m leaves a gap on its left alone, 1.05 m wide: the line is led
-    through its middle."""
+def test_the_line_follows_the_route_and_passes_obstacles() -> None:
+    """A box in the middle of 3 m leaves a gap of 1.05 m on its left, whose middle the line takes."""
     bare = straight()
     blocked = straight(box(9.0, -1.5, 10.0, 0.45))
     lines = [
@@ -161,7 +159,7 @@ def test_the_line_keeps_to_the_route_where_nothing_stands_and_goes_round_what_do
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_oracle_gets_round_what_stands_on_its_way(seed: int) -> None:
+def test_the_oracle_passes_obstacles_on_its_way(seed: int) -> None:
     """Nothing is touched, the base centre stays on the walkway, the goal is reached at a walking
     pace or faster."""
     course = drawn(seed)
@@ -172,9 +170,8 @@ def test_the_oracle_gets_round_what_stands_on_its_way(seed: int) -> None:
     assert shapely.contains_xy(course.walk, track[:, 0], track[:, 1]).all()
 
 
-def test_a_robot_that_was_put_elsewhere_is_led_from_there() -> None:
-    """Put back behind what it had passed, and before the other side of it, it goes round that
-    anew."""
+def test_a_reset_robot_is_led_from_its_new_place() -> None:
+    """Reset to a place before an obstacle that it had passed, it passes the obstacle again."""
     course = straight(box(8.0, -1.5, 9.0, 0.45), box(12.0, -0.45, 13.0, 1.5))
     track = driven(course, Pose(0.0, 0.0, 0.0), jump=(10.5, Pose(6.9, -1.0, 0.0)))
     assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
@@ -182,18 +179,18 @@ def test_a_robot_that_was_put_elsewhere_is_led_from_there() -> None:
     assert min(course.solid.distance(body) for body in bodies(track)) > 0.0
 
 
-def test_another_way_is_found_where_somebody_stands_in_the_first() -> None:
-    """The oracle takes another way where a person blocks the first."""
+def test_another_way_is_found_where_a_person_blocks_the_first() -> None:
+    """The oracle passes through another gap."""
     course = straight(box(5.0, -1.1, 17.0, 0.8), width_m=4.6)
-    somebody = People.of(("p0",), [(15.0, 1.55)], [0.0], [0.0], ("stand",))
-    track = driven(course, Pose(0.0, 0.0, 0.0), people=somebody)
+    person = People.of(("p0",), [(15.0, 1.55)], [0.0], [0.0], ("stand",))
+    track = driven(course, Pose(0.0, 0.0, 0.0), people=person)
     assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
     assert min(body.distance(Point(15.0, 1.55)) for body in bodies(track)) > 0.3
     assert min(course.solid.distance(body) for body in bodies(track)) > 0.0
 
 
-def test_a_robot_that_was_kept_off_the_goal_comes_back_to_it() -> None:
-    """Two who talk just before the goal are passed at more than a metre from it; behind them the
+def test_a_robot_that_had_to_pass_the_goal_comes_back_to_it() -> None:
+    """Two talkers just before the goal are passed at more than a metre from it, and behind them the
     robot turns round."""
     talkers = People.of(
         ("p0", "p1"), [(19.6, -0.15), (19.6, 1.3)], [0.0, 0.0], [0.0, 0.0], ("talk", "talk")

@@ -1,4 +1,4 @@
-"""Policies by name: what cannot be loaded is wrong use, told with the policy's name, whatever its
+"""Policies by name: one that cannot be loaded is wrong use, reported with its name, whatever its
 code does."""
 
 from __future__ import annotations
@@ -117,8 +117,8 @@ BAD = {
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder in which a policy's module can be written."""
+def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for the module of a policy."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -130,54 +130,56 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_policy_that_cannot_be_loaded_is_named_with_the_reason(desk: Path, name: str) -> None:
-    """Whatever its module, its class or its manifest does, SystemExit included."""
-    source, told = BAD[name]
-    (desk / "mine.py").write_text(source)
+def test_a_policy_that_cannot_be_loaded_is_named_with_the_reason(
+    workspace: Path, name: str
+) -> None:
+    """The reason covers faults of module, class and manifest, SystemExit included."""
+    source, expected = BAD[name]
+    (workspace / "mine.py").write_text(source)
     with pytest.raises(UsageError) as caught:
         load_policy("mine:Mine")
-    assert "'mine:Mine'" in str(caught.value) and told in str(caught.value)
+    assert "'mine:Mine'" in str(caught.value) and expected in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("name", "meant"), [("ros2", "ros2:"), ("zenoh", "zenoh:NAME")], ids=["ros2", "zenoh"]
 )
-def test_a_policy_elsewhere_is_a_valid_choice(name: str, meant: str) -> None:
-    """A name without its colon gets the one that is meant, and all choices are listed."""
+def test_an_unknown_policy_is_answered_with_the_valid_choices(name: str, meant: str) -> None:
+    """A name without its colon gets the intended one, and all choices are listed."""
     with pytest.raises(UsageError, match=rf"Valid choices: cadrl, .* Did you mean {meant}\?"):
         load_policy(name)
 
 
-def test_loading_leaves_the_process_where_it_is(desk: Path) -> None:
-    """A module that changes the folder changes no relative path of the run."""
-    (desk / "mine.py").write_text("import os; os.chdir('/')" + GOOD.format(fields=""))
+def test_loading_keeps_the_working_folder(workspace: Path) -> None:
+    """A module that changes the working folder changes no relative path of the run."""
+    (workspace / "mine.py").write_text("import os; os.chdir('/')" + GOOD.format(fields=""))
     assert load_policy("mine:Mine").manifest.name == "mine"
-    assert Path.cwd() == desk
+    assert Path.cwd() == workspace
 
 
-def test_loading_is_timed(desk: Path) -> None:
-    """Whoever waits for it can be told."""
-    told: list[PolicyCall | None] = []
+def test_loading_is_timed(workspace: Path) -> None:
+    """The timer starts and stops around loading."""
+    calls: list[PolicyCall | None] = []
 
     class Notes:
         def starts(self, doing: PolicyCall, tick: int) -> None:
-            told.append(doing)
+            calls.append(doing)
 
         def stops(self) -> None:
-            told.append(None)
+            calls.append(None)
 
-    (desk / "mine.py").write_text(GOOD.format(fields=""))
+    (workspace / "mine.py").write_text(GOOD.format(fields=""))
     load_policy("mine:Mine", Notes()).reset("a", 0)
-    assert told == ["loading", None, "reset", None]
+    assert calls == ["loading", None, "reset", None]
 
 
-def test_an_edited_policy_has_another_hash(desk: Path) -> None:
+def test_an_edited_policy_has_another_hash(workspace: Path) -> None:
     """The hash follows the text of its file, wherever that lies, and that of a base class in
     another file."""
 
     def hash_of(text: str, base: str = "class Base: pass") -> str:
-        (desk / "mine.py").write_text(text)
-        (desk / "base.py").write_text(base)
+        (workspace / "mine.py").write_text(text)
+        (workspace / "base.py").write_text(base)
         for name in ("mine", "base"):
             sys.modules.pop(name, None)
         return load_policy("mine:Mine").source_hash
@@ -188,22 +190,22 @@ def test_an_edited_policy_has_another_hash(desk: Path) -> None:
     assert len(first) == 16 and hash_of(plain) == first
     assert hash_of(plain + "# a word") != first
     assert hash_of(child) != hash_of(child, "class Base: kept = 1")
-    (desk / "further").mkdir()
-    os.chdir(desk / "further")
+    (workspace / "further").mkdir()
+    os.chdir(workspace / "further")
     assert load_policy("mine:Mine").source_hash == hash_of(child, "class Base: kept = 1")
 
 
-def lay_out(desk: Path) -> None:
-    """A policy in this folder, one in another beside what it imports, one in a package that imports
-    its own parts."""
-    (desk / "mine.py").write_text(GOOD.format(fields=""))
-    (desk / "deeper").mkdir()
-    (desk / "deeper/alone.py").write_text("import sibling" + GOOD.format(fields=""))
-    (desk / "deeper/sibling.py").touch()
-    (desk / "whole/inner").mkdir(parents=True)
+def write_policies(workspace: Path) -> None:
+    """Write a policy in this folder, one beside its import in another, and one in a package that
+    imports its own modules."""
+    (workspace / "mine.py").write_text(GOOD.format(fields=""))
+    (workspace / "deeper").mkdir()
+    (workspace / "deeper/alone.py").write_text("import sibling" + GOOD.format(fields=""))
+    (workspace / "deeper/sibling.py").touch()
+    (workspace / "whole/inner").mkdir(parents=True)
     for part in ("whole/__init__.py", "whole/inner/__init__.py", "whole/part.py"):
-        (desk / part).touch()
-    (desk / "whole/inner/driving.py").write_text(
+        (workspace / part).touch()
+    (workspace / "whole/inner/driving.py").write_text(
         "from ..part import __name__ as part" + GOOD.format(fields="")
     )
 
@@ -213,20 +215,19 @@ def lay_out(desk: Path) -> None:
     [
         ("mine.py:Mine", "mine:Mine"),
         ("./mine.py:Mine", "mine:Mine"),
-        ("{desk}/mine.py:Mine", "mine:Mine"),
+        ("{workspace}/mine.py:Mine", "mine:Mine"),
         ("deeper/../mine.py:Mine", "mine:Mine"),
         ("deeper/alone.py:Mine", "alone:Mine"),
-        ("{desk}/deeper/alone.py:Mine", "alone:Mine"),
+        ("{workspace}/deeper/alone.py:Mine", "alone:Mine"),
         ("whole/inner/driving.py:Mine", "whole.inner.driving:Mine"),
     ],
 )
 def test_a_policy_is_named_by_its_file_or_its_module(
-    desk: Path, spelled: str, imported: str
+    workspace: Path, spelled: str, imported: str
 ) -> None:
-    """Both spellings load the same class with the same source hash; siblings and relative imports
-    work."""
-    lay_out(desk)
-    spelled = spelled.format(desk=desk)
+    """Both spellings load the same class and source hash, and sibling and relative imports work."""
+    write_policies(workspace)
+    spelled = spelled.format(workspace=workspace)
     assert importable_name(spelled) == imported and importable_name(imported) == imported
     by_file, by_module = load_policy(spelled), load_policy(imported)
     assert (
@@ -235,8 +236,8 @@ def test_a_policy_is_named_by_its_file_or_its_module(
     )
 
 
-def test_a_name_that_is_no_file_is_left_as_it_is() -> None:
-    """Shipped names, networks, served policies and modules."""
+def test_a_name_that_is_no_file_is_unchanged() -> None:
+    """Shipped policies, networks, served policies and modules are no files."""
     for name in (
         "orca",
         "onnx:my_network",
@@ -251,15 +252,15 @@ def test_a_name_that_is_no_file_is_left_as_it_is() -> None:
 MISNAMED = {
     "no such file": (
         "min.py:Mine",
-        "there is no file {desk}/min.py. Python files in {desk}: mine.py. Did you mean",
+        "there is no file {workspace}/min.py. Python files in {workspace}: mine.py. Did you mean",
     ),
     "a file elsewhere": (
         "alone.py:Mine",
-        "Python files in {desk}: mine.py. Did you mean deeper/alone.py?",
+        "Python files in {workspace}: mine.py. Did you mean deeper/alone.py?",
     ),
     "no such folder": (
         "lost/mine.py:Mine",
-        "there is no file {desk}/lost/mine.py. Python files in {desk}/lost: none.",
+        "there is no file {workspace}/lost/mine.py. Python files in {workspace}/lost: none.",
     ),
     "no class": ("mine.py", "names a file and no class: write mine.py:Mine. Classes in it: Mine"),
     "another class": (
@@ -276,66 +277,67 @@ MISNAMED = {
     ),
     "two of one name": (
         "deeper/mine.py:Mine",
-        "there is another module 'mine', loaded from {desk}/mine.py: rename",
+        "there is another module 'mine', loaded from {workspace}/mine.py: rename",
     ),
 }
 
 
 @pytest.mark.parametrize("name", MISNAMED)
-def test_a_file_that_cannot_be_loaded_is_named_with_the_remedy(desk: Path, name: str) -> None:
-    """The file, the choices there, and what to do instead."""
-    lay_out(desk)
+def test_a_file_that_cannot_be_loaded_is_named_with_the_remedy(workspace: Path, name: str) -> None:
+    """The message has the file, its valid choices, and what to do instead."""
+    write_policies(workspace)
     load_policy("mine:Mine")
-    spelled, told = MISNAMED[name]
+    spelled, expected = MISNAMED[name]
     if not name.startswith("no ") and "elsewhere" not in name:
-        (desk / spelled.partition(":")[0]).write_text(GOOD.format(fields=""))
+        (workspace / spelled.partition(":")[0]).write_text(GOOD.format(fields=""))
     with pytest.raises(UsageError) as caught:
         load_policy(spelled)
-    assert told.format(desk=desk) in str(caught.value)
+    assert expected.format(workspace=workspace) in str(caught.value)
 
 
-def test_a_module_that_is_not_found_says_where_it_was_searched(
-    desk: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_missing_module_is_reported_with_the_search_path(
+    workspace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All folders of the path but Python's own are listed, with the file of that name farther
-    down."""
-    monkeypatch.syspath_prepend(desk / "libraries")
-    lay_out(desk)
+    """All folders of the path but Python's own are listed, with a file of that name in a subfolder."""
+    monkeypatch.syspath_prepend(workspace / "libraries")
+    write_policies(workspace)
     with pytest.raises(UsageError) as caught:
         load_policy("alone:Mine")
-    said = str(caught.value)
+    message = str(caught.value)
     assert (
-        f"{desk / 'libraries'}, {desk}" in said.partition("Searched: ")[2]
-        and "lib-dynload" not in said
+        f"{workspace / 'libraries'}, {workspace}" in message.partition("Searched: ")[2]
+        and "lib-dynload" not in message
     )
-    assert said.endswith(
+    assert message.endswith(
         "Run the command in the folder that holds alone.py, add that folder to PYTHONPATH, or "
         "name the file: deeper/alone.py:Mine"
     )
-    (desk / "lost").mkdir()
+    (workspace / "lost").mkdir()
     with pytest.raises(
         UsageError, match=r"'lost' is a folder without code here. Searched: .*path/to/lost.py:Mine$"
     ):
         load_policy("lost:Mine")
-    (desk / "mine.py").write_text("import not_installed")
+    (workspace / "mine.py").write_text("import not_installed")
     with pytest.raises(UsageError) as caught:
         load_policy("mine.py:Mine")
-    assert f"Searched: {desk}" in str(caught.value)
+    assert f"Searched: {workspace}" in str(caught.value)
     assert f"Install 'not_installed' for {sys.executable}, or add its folder to PYTHONPATH" in str(
         caught.value
     )
 
 
-def test_every_policy_of_ours_has_its_own_hash() -> None:
-    """They are told apart by their files."""
-    assert all(load_policy(name).source_hash for name in POLICIES)
-    assert load_policy("route").source_hash != load_policy("orca").source_hash
+def test_shipped_policies_of_different_files_have_different_hashes() -> None:
+    """Two shipped policies have the same hash only if their classes are in the same file."""
+    loaded = [load_policy(name) for name in POLICIES]
+    files = {(one.source_hash, inspect.getfile(type(one.policy))) for one in loaded}
+    hashes, sources = zip(*files, strict=True)
+    assert all(hashes) and len({*hashes}) == len({*sources}) == len(files) > 2, files
 
 
-def test_a_bundled_policy_has_another_hash_when_a_module_in_its_folder_is_edited(
+def test_the_hash_of_a_shipped_policy_covers_its_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not only the file of its class."""
+    """An edit of any module in the folder of its class changes the hash."""
     route = Route()
     copied = shutil.copytree(Path(inspect.getfile(type(route))).parent, tmp_path / "privileged")
     monkeypatch.setattr(inspect, "getfile", lambda _: str(copied / "route.py"))

@@ -1,4 +1,4 @@
-"""The policy `nav` on scans of circles and walls that are computed here; one episode at the end."""
+"""The policy `nav` on computed scans of circles and walls, and one episode at the end."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROUTE = np.array([(-5.0, 0.0), (12.0, 0.0)])
 
 
 def scan_at(pose: Pose, circles: Floats) -> Scan:
-    """What the lidar sees of circles, (N, 3) x, y and radius, without noise."""
+    """Return a noiseless lidar scan of circles, (N, 3) x, y and radius."""
     angles = SPEC.angles_rad + pose.heading_rad
     unit = np.column_stack([np.cos(angles), np.sin(angles)])
     to = circles[:, :2] - pose.xy
@@ -43,7 +43,7 @@ def scan_at(pose: Pose, circles: Floats) -> Scan:
 
 
 def wall(x_m: float, low_m: float, high_m: float) -> Floats:
-    """Circles in a row across the way."""
+    """Return circles in a row across the way."""
     y = np.arange(low_m, high_m, 0.15)
     return np.column_stack([np.full_like(y, x_m), y, np.full_like(y, 0.1)])
 
@@ -90,8 +90,8 @@ def drive(
 
 
 def test_the_path_follows_the_route_of_a_patch_to_its_end() -> None:
-    """Round a corner and to the goal, within half a pixel, also from beside the route and turned
-    aside."""
+    """It turns a corner and ends at the goal, within half a pixel, also from beside the route and
+    rotated."""
     route = np.array([(-4.0, 0.0), (3.0, 0.0), (3.0, 2.5)])
     for pose in (START, Pose(-0.5, 0.6, 0.3), Pose(0.2, -0.7, -0.5)):
         path = path_to(RoutePatch(route_patch_at(pose, route)), -pose.heading_rad)
@@ -105,14 +105,14 @@ def test_the_path_follows_the_route_of_a_patch_to_its_end() -> None:
 
 
 def test_a_point_is_approached_straight_and_other_goals_are_refused() -> None:
-    """A point to the left ends the path; without a goal the error names the protocol."""
+    """The path ends at a point to the left, and without a goal the error names the protocol."""
     assert path_to(PointGoal(3.0, 4.0), 0.0)[-1] == pytest.approx([3.0, 4.0], abs=STEP_M)
     with pytest.raises(ValueError, match="--goal route_patch"):
         path_to(None, 0.0)
 
 
-def test_the_costmap_marks_what_is_hit_and_clears_what_is_passed() -> None:
-    """Distances hold while the robot drives and turns; a body that leaves is cleared."""
+def test_the_costmap_marks_hits_and_clears_seen_space() -> None:
+    """Distances hold while the robot drives and turns, and a body that leaves is cleared."""
     costmap, thing = Costmap(), np.array([(3.0, 0.5, 0.3)])
     for k in range(10):
         pose = Pose(0.13 * k, 0.05 * k, 0.1 * k)
@@ -125,8 +125,9 @@ def test_the_costmap_marks_what_is_hit_and_clears_what_is_passed() -> None:
     assert costmap.distances(np.array([(1.9, 0.0)]))[0] == 2.0
 
 
-def test_a_plan_passes_a_thing_and_ends_before_a_wall() -> None:
-    """With a gap on its free side; a closed way is blocked, and the robot stops before it."""
+def test_a_plan_passes_an_obstacle_and_ends_before_a_wall() -> None:
+    """It takes the gap on the free side; on a closed way it is blocked, and the robot stops before
+    the wall."""
     path = path_to(RoutePatch(route_patch_at(START, ROUTE)), 0.0)
     costmap = Costmap()
     costmap.update(scan_at(START, wall(3.0, -0.2, 2.5)), START)
@@ -140,8 +141,8 @@ def test_a_plan_passes_a_thing_and_ends_before_a_wall() -> None:
     assert pursue(plan, costmap, COURIER, 0.5, 1.5) == Command(0.0, 0.0)
 
 
-def test_a_track_has_the_velocity_of_a_walker_and_things_do_not_move() -> None:
-    """Seen from a robot that drives and turns: within 0.2 m/s, and nothing else moves."""
+def test_a_track_has_the_walkers_velocity_and_obstacles_have_none() -> None:
+    """From a driving and turning robot the velocity is exact to 0.2 m/s, and nothing else moves."""
     tracker = Tracker()
     things = np.array([(4.0, -2.0, 0.3), (2.5, 1.8, 0.2)])
     for k in range(20):
@@ -158,14 +159,14 @@ def test_a_track_has_the_velocity_of_a_walker_and_things_do_not_move() -> None:
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=list(ROBOTS))
 def test_any_robot_drives_a_slalom(robot: Robot) -> None:
-    """Past a thing on the left and one on the right, without touching either, to the goal."""
+    """It passes an obstacle on the left and one on the right to the goal without touching either."""
     things = np.vstack([wall(4.0, -0.3, 2.0), wall(8.0, -2.0, 0.3)])
     poses, least_m = drive(robot, things, until_s=40.0)
     assert math.hypot(*(ROUTE[-1] - poses[-1].xy)) < 1.0
     assert least_m > robot.width_m / 2 + 0.03
 
 
-def test_the_robot_lets_a_crossing_person_pass_and_goes_on() -> None:
+def test_the_robot_lets_a_crossing_person_pass_and_continues() -> None:
     """It slows down for the person, touches nobody, and reaches the goal."""
     walker = np.array([5.0, -4.0, 0.0, 1.2])
     poses, least_m = drive(COURIER, np.array([(6.0, 5.0, 0.3)]), walker)
@@ -181,8 +182,8 @@ def test_a_closed_way_makes_the_robot_wait_and_then_turn_slowly() -> None:
 
 
 @pytest.mark.engine
-def test_nav_solves_a_scenario_with_an_obstacle_and_the_same_one_twice() -> None:
-    """With the lidar of the engine; equal bits, without a camera or privileged knowledge."""
+def test_nav_solves_a_scenario_with_an_obstacle_reproducibly() -> None:
+    """With the engine's lidar two runs have equal bits, without a camera or privileged knowledge."""
     (scenario,) = (one for one in load_suite("unit").scenarios if one.id == "straight-001")
     records = [run_episode(scenario, Nav()).record for _ in range(2)]
     assert [one.measures["success"] for one in records] == [1.0, 1.0]

@@ -1,5 +1,4 @@
-"""Published networks: what their manifests say of them, and what they answer in pictures of this
-street."""
+"""Published networks: their manifests, and their answers to pictures of this street."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ PUBLISHED = ("dronet", "openbot")
 
 @pytest.fixture
 def weights(monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the networks' files, which are no part of this repository."""
+    """The folder of the networks' files, which are not in this repository."""
     names = [read_bundle_manifest(shipped_bundles()[name]).model for name in PUBLISHED]
     if missing := [name for name in names if not (WEIGHTS / name).is_file()]:
         pytest.skip(
@@ -37,32 +36,34 @@ def weights(monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_a_network_without_its_weights_says_where_they_are_to_be_had(
+def test_missing_weights_are_reported_with_their_source(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file, its size and hash, its source, the command that makes it, and where it was looked
-    for; the list says that it is missing."""
+    """The message has file, size, hash, source, the command that makes it, and the searched
+    folders; the list marks it as missing."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     bundle = read_bundle_manifest(shipped_bundles()[name])
     facts = bundle.files[bundle.model]
     with pytest.raises(UsageError) as caught:
         load_policy(name)
-    said = str(caught.value)
+    message = str(caught.value)
     assert (
         f"{bundle.model} is missing, {facts.bytes} bytes, BLAKE2b {facts.blake2b}: from "
-        f"{bundle.source}" in said
+        f"{bundle.source}" in message
     )
-    assert f"`python -m cosim.policies.published.{name} " in said and "pip install onnx" in said
-    assert str(tmp_path) in said and "\n" not in said
+    assert (
+        f"`python -m cosim.policies.published.{name} " in message and "pip install onnx" in message
+    )
+    assert str(tmp_path) in message and "\n" not in message
     assert f"weights missing ({bundle.model})" in bundle_in_words(shipped_bundles()[name])
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_another_file_of_the_name_is_refused(
+def test_another_file_of_the_same_name_is_refused(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A file that only has the name of the weights is none."""
+    """A file that only has the name of the weights is refused."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     (tmp_path / read_bundle_manifest(shipped_bundles()[name]).model).write_bytes(b"\x3a\x00")
     with pytest.raises(
@@ -77,7 +78,8 @@ def _picture(name: str) -> NDArray[np.uint8]:
 
 
 def test_dronet_turns_back_to_the_way_and_a_mirrored_street_mirrors_its_turn(weights: Path) -> None:
-    """Of a robot that has turned 30 degrees away from a sidewalk with nobody on it."""
+    """A robot that has turned 30 degrees away from an empty sidewalk turns back, mirrored to the
+    other side."""
     policy = OnnxPolicy(shipped_bundles()["dronet"])
     seen = example_observation(policy.manifest)
 
@@ -98,8 +100,8 @@ def test_dronet_turns_back_to_the_way_and_a_mirrored_street_mirrors_its_turn(wei
 
 
 def test_openbot_turns_to_where_the_instruction_says(weights: Path) -> None:
-    """Told to turn left it turns more to the left than told nothing, and to the right the other way
-    round."""
+    """With an instruction to turn left it turns more to the left than without, and to the right
+    likewise."""
     policy = OnnxPolicy(shipped_bundles()["openbot"])
     seen = example_observation(policy.manifest)
 

@@ -1,5 +1,4 @@
-"""The commands that make the graphs of published networks, of the files that their authors
-publish."""
+"""The commands that build the graphs of published networks from their authors' files."""
 
 from __future__ import annotations
 
@@ -28,21 +27,21 @@ from cosim.policies.published.openbot.lite_file import (
 
 WEIGHTS = Path(os.environ.get("COSIM_WEIGHTS") or Path(__file__).parents[3] / "shared" / "weights")
 UPSTREAM = {"dronet": "dronet_model_weights.h5", "openbot": "autopilot_float.tflite"}
-"""What the files are called in WEIGHTS."""
+"""Names of the files in WEIGHTS."""
 PACKAGES = {"dronet": "h5py", "openbot": "flatbuffers"}
-"""What each command imports besides onnx."""
+"""The package that each command imports besides onnx."""
 NETWORKS = [
     pytest.param(network, id=network.module.rpartition(".")[2]) for network in (DRONET, OPENBOT)
 ]
 
 
 def name_of(network: Converter) -> str:
-    """Its policy's name."""
+    """Return the name of the network's policy."""
     return network.module.rpartition(".")[2]
 
 
-def given(network: Converter) -> Path:
-    """The file upstream; where it or a package is missing, the test is skipped."""
+def upstream_file(network: Converter) -> Path:
+    """Return the file upstream; where it or a package is missing, the test is skipped."""
     policy = name_of(network)
     for package in ("onnx", PACKAGES[policy]):
         pytest.importorskip(package)
@@ -52,23 +51,22 @@ def given(network: Converter) -> Path:
     return path
 
 
-def taking(network: Converter, data: bytes) -> Converter:
-    """The same, of other weights upstream."""
+def accepting(network: Converter, data: bytes) -> Converter:
+    """Return the network with the hash of other weights upstream."""
     return replace(network, weights=replace(network.weights, facts=file_facts(data)))
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_the_command_makes_the_graph_that_runs_take(
+def test_the_command_makes_the_graph_that_runs_accept(
     network: Converter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Byte for byte the file that the manifest names, with which the policy loads and tells what
-    its example expects; so the same every time."""
-    command = [sys.executable, "-m", network.module, given(network), "-o", tmp_path]
-    told = subprocess.run(command, capture_output=True, text=True, check=True)
+    """It is the manifest's file byte for byte, and the policy loads and reproduces its example."""
+    command = [sys.executable, "-m", network.module, upstream_file(network), "-o", tmp_path]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
     folder = shipped_bundles()[name_of(network)]
     bundle = read_bundle_manifest(folder)
     made = tmp_path / bundle.model
-    assert told.stdout == f"{made}: {bundle.files[bundle.model].bytes} bytes\n"
+    assert result.stdout == f"{made}: {bundle.files[bundle.model].bytes} bytes\n"
     assert file_facts(made.read_bytes()).blake2b == bundle.files[bundle.model].blake2b
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     assert load_policy(name_of(network)).manifest.name == name_of(network)
@@ -80,37 +78,35 @@ def test_the_command_makes_the_graph_that_runs_take(
 def test_another_file_makes_no_graph(
     network: Converter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line its size and hash, and those wanted, of which file of whom; nothing is
-    written."""
+    """One line has its size, hash and origin and the required ones, and nothing is written."""
     (tmp_path / "other").write_bytes(b"not weights")
-    for path, said in (
+    for path, expected in (
         (tmp_path / "other", "other: 11 bytes, BLAKE2b"),
         (tmp_path / "none", "none: cannot be read"),
     ):
         with pytest.raises(SystemExit) as ended:
             network.command([str(path), "-o", str(tmp_path / "out")])
-        assert str(ended.value).startswith(f"error: {tmp_path / said}")
+        assert str(ended.value).startswith(f"error: {tmp_path / expected}")
         assert network.weights.source in str(ended.value) and "\n" not in str(ended.value)
     assert not (tmp_path / "out").exists() and not capsys.readouterr().out
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_a_package_that_is_missing_is_named_with_what_installs_it(
+def test_a_missing_package_is_named_with_its_install_command(
     network: Converter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command needs packages that a run does not."""
+    """The command needs packages that a run does not, and names the command that installs them."""
     (tmp_path / "file").write_bytes(b"\x20\0\0\0TFL3")
     monkeypatch.setitem(sys.modules, PACKAGES[name_of(network)], None)
     monkeypatch.setitem(sys.modules, "flatbuffers.table", None)
     with pytest.raises(MachineError, match=r"pip install -e '\.\[convert\]' in the checkout$"):
-        taking(network, b"\x20\0\0\0TFL3").write(tmp_path / "file", tmp_path)
+        accepting(network, b"\x20\0\0\0TFL3").write(tmp_path / "file", tmp_path)
 
 
 def test_a_graph_that_runs_would_refuse_is_not_written(tmp_path: Path) -> None:
-    """Where another version of onnx writes other bytes, the command says so, not the run after
-    it."""
+    """Where another version of onnx writes other bytes, the command reports it before a run would."""
     (tmp_path / "file").write_bytes(b"weights")
-    other = replace(taking(DRONET, b"weights"), make=lambda _: b"another graph")
+    other = replace(accepting(DRONET, b"weights"), make=lambda _: b"another graph")
     with pytest.raises(
         MachineError, match=r"dronet_200x200\.onnx: would be 13 bytes, .*pip install 'onnx<1\.24'"
     ):
@@ -119,8 +115,8 @@ def test_a_graph_that_runs_would_refuse_is_not_written(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_no_hdf5_is_refused(tmp_path: Path) -> None:
-    """What begins otherwise, and what is cut off; of a whole one all arrays are read by their
-    paths."""
+    """Files with another beginning or cut off are refused; all arrays of a complete one are read by
+    path."""
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "w.h5", "w") as file:
         file["layer/layer/kernel:0"] = np.arange(4, dtype=np.float32)

@@ -48,7 +48,7 @@ WEIGHTS = Path(os.environ.get("COSIM_WEIGHTS") or Path(__file__).parents[3] / "s
 
 @pytest.fixture
 def weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The published files, which are no part of this repository."""
+    """The published files, which are not in this repository."""
     names = [file.name for one in NETWORK_POLICIES.values() for file in one.files]
     if missing := [name for name in names if not (WEIGHTS / name).is_file()]:
         pytest.skip(f"the published files {', '.join(missing)} are not in {WEIGHTS}")
@@ -73,19 +73,19 @@ def test_cadrl_answers_as_the_notebook_of_its_authors(weights: None) -> None:
 
 
 def test_sarl_values_velocities_as_the_test_case_of_its_authors(weights: None) -> None:
-    """All 81 action values of four states, and the chosen velocities."""
+    """The 81 action values of four states, and the chosen velocities, are equal."""
     network = Sarl().network
     for robot, people, values, action in zip(
         *(CASES[f"sarl.{name}"] for name in ("robot", "people", "values", "action")), strict=True
     ):
-        seen = np.column_stack([people[:, :2] - robot[:2], people[:, 2:4]])
-        found = action_values(network, robot[5:7] - robot[:2], seen)
+        in_robot_frame_rows = np.column_stack([people[:, :2] - robot[:2], people[:, 2:4]])
+        found = action_values(network, robot[5:7] - robot[:2], in_robot_frame_rows)
         assert found == pytest.approx(values, abs=2e-6)
         assert VELOCITIES[int(np.argmax(found))] == pytest.approx(action, abs=1e-9)
 
 
 def test_dsrnn_remembers_as_the_test_case_of_its_authors(weights: None) -> None:
-    """The changes of 40 steps, each with the memory of the last."""
+    """The changes of 40 steps, each with the memory of the previous one, are equal."""
     network, memory = Dsrnn().network, EMPTY
     for robot, velocity, people, changes in zip(
         *(CASES[f"dsrnn.{name}"] for name in ("robot", "velocity", "people", "changes")),
@@ -96,7 +96,7 @@ def test_dsrnn_remembers_as_the_test_case_of_its_authors(weights: None) -> None:
 
 
 def test_lidar_networks_answer_as_the_code_of_their_authors(weights: None) -> None:
-    """The actors of TD3 and of PPO."""
+    """The actors of TD3 and of PPO give the published answers."""
     td3, ppo = Td3Lidar().network, MetaurbanPpo().network
     for given, action in zip(CASES["td3.states"], CASES["td3.actions"], strict=True):
         assert td3.answer(given, ())[0] == pytest.approx(action, abs=1e-6)
@@ -119,10 +119,10 @@ def scan(spec: ScanSpec, walls: dict[tuple[float, float], float] | None = None) 
     return Scan(ranges[None], spec)
 
 
-def seen(
+def observation_of(
     name: str, pose: Pose = START, side: float = 0.0, people: Tracks | None = None
 ) -> Observation:
-    """An observation in a free street, of a goal at (10, side), or of a route over it."""
+    """An observation in a free street with a goal at (10, side), or a route over it."""
     manifest = NETWORK_POLICIES[name].manifest
     route = Polyline([(0.0, 0.0), (40.0, 4.0 * side)])
     along = manifest.goal == "route_points"
@@ -146,13 +146,13 @@ def seen(
 @pytest.mark.parametrize("side", [4.0, -4.0], ids=["left", "right"])
 @pytest.mark.parametrize("name", ["cadrl", "dsrnn", "sarl", "metaurban-ppo"])
 def test_a_robot_reaches_a_goal_on_either_side(weights: None, name: str, side: float) -> None:
-    """Within 2 m, in a free street, with commands within the limits of a robot that obeys them."""
+    """It comes within 2 m in a free street, with commands within the limits of its robot."""
     policy = NETWORK_POLICIES[name]()
     pose, last, k = START, STILL, 0
     step_s = 1.0 / policy.manifest.rate_hz
     while math.dist(pose.xy, (10.0, side)) > 2.0:
         assert k * step_s < 20.0
-        now = replace(seen(name, pose, side), time_s=k * step_s)
+        now = replace(observation_of(name, pose, side), time_s=k * step_s)
         last = policy.act(replace(now, v_mps=last.v_mps, w_radps=last.w_radps))
         assert last == clipped(last, COURIER)
         heading = pose.heading_rad + step_s * last.w_radps
@@ -161,14 +161,14 @@ def test_a_robot_reaches_a_goal_on_either_side(weights: None, name: str, side: f
 
 
 def test_td3_turns_to_the_side_of_its_goal(weights: None) -> None:
-    """Between walls, to the left where the goal is left."""
+    """Between walls it turns left where the goal is left, and right where it is right."""
     policy = Td3Lidar()
     between = scan(policy.manifest.scan or ScanSpec(), {(-180.0, 180.0): 5.0})
 
     def turn(y_m: float) -> float:
         policy.reset("street", 0)
         return policy.act(
-            replace(seen("td3-lidar"), goal=PointGoal(3.0, y_m), scan=between)
+            replace(observation_of("td3-lidar"), goal=PointGoal(3.0, y_m), scan=between)
         ).w_radps
 
     assert turn(4.0) > 0.5 and turn(-4.0) < -0.5
@@ -176,13 +176,16 @@ def test_td3_turns_to_the_side_of_its_goal(weights: None) -> None:
 
 @pytest.mark.parametrize("name", ["cadrl", "sarl"])
 def test_people_change_the_command(weights: None, name: str) -> None:
-    """And the same observations give the same command again."""
+    """People change it, and the same observations give the same command again."""
     policy = NETWORK_POLICIES[name]()
     near = tracks((1.5, 0.2, -1.0, 0.0), (2.5, -0.6, 0.0, 0.3))
 
     def commands(people: Tracks) -> list[Command]:
         policy.reset("street", 0)
-        return [policy.act(replace(seen(name, people=people), time_s=0.1 * i)) for i in range(3)]
+        return [
+            policy.act(replace(observation_of(name, people=people), time_s=0.1 * i))
+            for i in range(3)
+        ]
 
     assert commands(near) == commands(near) != commands(tracks())
 
@@ -191,7 +194,7 @@ def test_people_change_the_command(weights: None, name: str) -> None:
 def test_missing_files_are_named_with_size_hash_and_source(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And a file of another content is refused."""
+    """The same message refuses a file with other content."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     policy = NETWORK_POLICIES[name]
@@ -211,15 +214,15 @@ def test_missing_files_are_named_with_size_hash_and_source(
 
 
 def test_sectors_are_from_right_to_left() -> None:
-    """The least distance of each, at most 10 m; what is behind counts in none."""
+    """Each has its least distance, at most 10 m, and returns from behind count in none."""
     spec = ScanSpec(rays=360, range_m=20.0)
     least = sectors(scan(spec, {(-90.0, -82.0): 3.0, (0.0, 4.0): 2.0, (150.0, 179.0): 1.0}))
     assert least.tolist() == [3.0, *(9 * [10.0]), 2.0, *(9 * [10.0])]
 
 
 def test_the_input_of_metaurban_is_relative_to_the_route() -> None:
-    """A robot 1 m to the left of a route that leads 45 degrees to the right, with a wall to the
-    left."""
+    """The robot is 1 m to the left of a route that leads 45 degrees to the right, with a wall to
+    the left."""
     spec = ScanSpec(rays=240, range_m=50.0)
     step = math.sqrt(2.0)
     way = np.array([(i * step - 1.0 / step, -i * step - 1.0 / step) for i in range(11)])
@@ -234,9 +237,9 @@ def test_the_input_of_metaurban_is_relative_to_the_route() -> None:
     assert driven(0.0, -1.0, 0.5, COURIER).v_mps == 0.0
 
 
-def test_people_stay_in_their_places() -> None:
-    """A person keeps a place while near, is moved on while unseen, and is then forgotten; a nearer
-    one takes the place of the farthest of five."""
+def test_people_keep_their_slots() -> None:
+    """A person holds a slot while near, is extrapolated while unseen, then forgotten; a nearer one
+    replaces the farthest of five."""
     places, here = Places(), np.zeros(2)
     rows = [(float(i + 2), 0.0, 0.0, 1.0) for i in range(5)]
     assert places.update(tracks(*rows), here, 0.0, 0.0) == [0, 1, 2, 3, 4]
@@ -252,7 +255,7 @@ def test_people_stay_in_their_places() -> None:
 
 
 def test_an_arena_lies_between_robot_and_goal() -> None:
-    """It rests while the robot drives, at most 12 m wide, and moves on near its end."""
+    """It is fixed while the robot drives, at most 12 m wide, and moves on near its end."""
     goal = np.array([20.0, 0.0])
     first = arena(None, np.zeros(2), goal)
     assert first.goal.tolist() == [GOAL_MOST_M, 0.0] and first.centre.tolist() == [6.0, 0.0]
@@ -281,7 +284,7 @@ def block(*entries: tuple[bytes, bytes]) -> bytes:
 
 
 def checkpoint(arrays: dict[str, NDArray[np.float32]]) -> tuple[bytes, bytes]:
-    """The index and the numbers of a checkpoint, as TensorFlow writes them."""
+    """Return index and numbers of a checkpoint, as TensorFlow writes them."""
     entries, numbers = [(b"", b"\x08\x01")], b""
     for name, array in sorted(arrays.items()):
         sides = b"".join(
@@ -300,7 +303,7 @@ def checkpoint(arrays: dict[str, NDArray[np.float32]]) -> tuple[bytes, bytes]:
 
 
 def test_a_checkpoint_is_read_without_tensorflow() -> None:
-    """Names that share beginnings, shapes and numbers; and damaged files are refused."""
+    """Names with shared prefixes, shapes and numbers are read, and damaged files are refused."""
     arrays = {
         "layer/kernel:0": np.arange(600, dtype=np.float32).reshape(3, 200),
         "layer/bias:0": np.ones(200, np.float32),
@@ -310,12 +313,12 @@ def test_a_checkpoint_is_read_without_tensorflow() -> None:
     found = read_checkpoint(index, numbers)
     assert found.keys() == arrays.keys()
     assert all((found[name] == array).all() for name, array in arrays.items())
-    for wrong, told in (
+    for wrong, expected in (
         (index[:-1], "it ends otherwise"),
         (index.replace(b"\x00crc ", b"\x01crc "), "compressed index"),
         (b"\xff" * 20 + index[20:], "TensorFlow checkpoint"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=expected):
             read_checkpoint(wrong, numbers)
     with pytest.raises(ValueError, match="not in the checkpoint's first data file"):
         read_checkpoint(index, numbers[:-4])

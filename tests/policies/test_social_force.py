@@ -1,5 +1,4 @@
-"""Social forces: against the potential that they are the slope of, and on cases seen at a
-glance."""
+"""Social forces: compared with the gradient of their potential, and in simple cases."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ def walker(x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> Peop
 
 
 def potential(people: People, d: np.ndarray, velocity: np.ndarray) -> float:
-    """A B exp(-b / B) with the paper's b, d (2,) metres from the person to the robot, between their
+    """Return A B exp(-b / B) with the paper's b; d (2,) is metres from person to robot, between
     outlines."""
     heading = people.heading[0]
     y = 0.5 * (people.speed[0] * np.array([math.cos(heading), math.sin(heading)]) - velocity)
@@ -39,7 +38,7 @@ def potential(people: People, d: np.ndarray, velocity: np.ndarray) -> float:
 
 @pytest.mark.parametrize("d", [(-1.3, 0.0), (-0.8, 0.6), (-1.2, -0.8)])
 def test_a_push_is_minus_the_slope_of_the_potential(d: tuple[float, float]) -> None:
-    """Differences of the potential over a thousandth of a metre agree with the push."""
+    """Differences of the potential over 1 mm agree with the push."""
     person = walker(2.0, 0.3, 2.8, 1.3)
     at = np.array(d)
     velocity = np.array([1.0, 0.2])
@@ -55,25 +54,24 @@ def test_a_push_is_minus_the_slope_of_the_potential(d: tuple[float, float]) -> N
     )
 
 
-def test_what_happens_behind_hardly_counts_and_pushes_lean_to_the_right() -> None:
-    """A push from ahead is felt whole, one from behind by 6 %; somebody straight ahead pushes a
-    little to the right."""
+def test_pushes_from_behind_are_weak_and_pushes_lean_to_the_right() -> None:
+    """A push from ahead has full weight, one from behind 6 %; a person straight ahead pushes
+    slightly to the right."""
     ahead, behind = weighted_pushes(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0]))
     assert np.hypot(*ahead) == pytest.approx(1.0) and np.hypot(*behind) == pytest.approx(0.06)
     assert ahead[0] < -0.9 and -0.3 < ahead[1] < -0.2
 
 
 def scene(y_m: float, others: People = NO_PEOPLE) -> Privileged:
-    """A robot at rest beside a route along the x axis, on a walkway free 1.5 m to either side of
-    it."""
+    """A robot at rest beside a route along the x axis, on a walkway free for 1.5 m on either side."""
     robot = RobotState(Pose(5.0, y_m, 0.0), 0.0)
     route = Polyline([(0.0, 0.0), (30.0, 0.0)])
     return Privileged(robot, route, 5.0, others, NO_VEHICLES, {}, (), box(-5.0, -1.5, 35.0, 1.5))
 
 
-def test_alone_it_is_pulled_along_its_route_and_pushed_off_edges() -> None:
-    """On the middle the goal pulls with v0 / tau; near the left edge the push is to the right,
-    beyond it stronger."""
+def test_a_robot_alone_is_pulled_along_its_route_and_off_edges() -> None:
+    """In the middle the goal pulls with v0 / tau; near and beyond the left edge the push is to the
+    right, and grows."""
     assert force(scene(0.0), COURIER, np.zeros(2))[0] == pytest.approx(
         DESIRED_MPS / RELAXATION_S, rel=1e-3
     )
@@ -85,8 +83,8 @@ def test_alone_it_is_pulled_along_its_route_and_pushed_off_edges() -> None:
     assert beyond[1] < near[1]
 
 
-def test_somebody_who_comes_from_ahead_on_the_left_pushes_back_and_to_the_right() -> None:
-    """A walker 2 m ahead, 0.3 m left, coming closer."""
+def test_an_oncoming_person_on_the_left_pushes_back_and_right() -> None:
+    """The walker is 2 m ahead, 0.3 m left, and comes closer."""
     alone, met = (
         force(scene(0.0, people), COURIER, np.zeros(2))
         for people in (NO_PEOPLE, walker(7.0, 0.3, math.pi, 1.3))

@@ -1,4 +1,4 @@
-"""What is measured of events from recorded tracks: by hand, and as a user asks for it."""
+"""Measurements of events from recorded tracks: by hand, and through the command."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TICK_S = 0.05
 
 
 def scenario_of(kind: str) -> Scenario:
-    """20 m along the x axis, the event at 12 m."""
+    """A scenario of 20 m along the x axis, with the event at 12 m."""
     event = Event(
         id="e0",
         kind=kind,
@@ -47,7 +47,7 @@ def scenario_of(kind: str) -> Scenario:
 
 
 def log_of(x_m: np.ndarray, tracks: np.ndarray) -> Log:
-    """A robot along the x axis."""
+    """The log of a robot along the x axis."""
     n = len(x_m)
     pose = np.column_stack([x_m, np.zeros(n), np.zeros(n)])
     travelled = np.diff(x_m, prepend=0.0)
@@ -58,8 +58,8 @@ def log_of(x_m: np.ndarray, tracks: np.ndarray) -> Log:
 
 
 def test_a_crossing_walker_is_measured_as_it_walked() -> None:
-    """Drawn by hand: triggered 3.95 m ahead of a robot at 2 m/s, walking to the right at 1.2 m/s
-    from 1 m left."""
+    """By hand: triggered 3.95 m ahead of a robot at 2 m/s, walking to the right at 1.2 m/s from 1 m
+    left."""
     x_m = 0.1 * np.arange(1, 121) - 0.05
     tick = int(np.flatnonzero(12.0 - x_m <= 4.0)[0]) + 1
     ticks = np.arange(tick, tick + 20)
@@ -83,7 +83,7 @@ def test_a_crossing_walker_is_measured_as_it_walked() -> None:
 
 
 def test_a_late_trigger_is_counted() -> None:
-    """One that comes half a metre late at 0.1 m a tick."""
+    """A trigger that comes half a metre late at 0.1 m a tick is counted as late."""
     import pandas as pd
 
     late = ("t", "frontal", 20.0, 19.5, 0.5, 0.1, 1.2, 1.2, 0.0, 180.0, 0.9)
@@ -94,11 +94,9 @@ def test_a_late_trigger_is_counted() -> None:
 
 
 @pytest.mark.engine
-def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """--event takes those alone, an unknown one is answered with those there are, --events shows
-    what was measured."""
+def test_the_command_runs_one_event_and_shows_its_sheet(tmp_path: Path, cosim: Cosim) -> None:
+    """--event selects it, an unknown one is answered with the valid ones, and --events shows the
+    measurements."""
     from cosim.place.walk_graph import WalkGraph
     from scenarios.places.nets import place
     from scenarios.suites.reactive import build_reactive
@@ -109,9 +107,11 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(
     fields = {"crowd": CrowdSpec(persons=4, radius_m=50.0, vehicles=0), "time_limit_s": 30.0}
     made = []
     for kind in ("frontal", "gesturing"):
-        whole = build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
+        scenario = build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
         made.append(
-            Scenario(**{name: getattr(whole, name) for name in Scenario.__struct_fields__} | fields)
+            Scenario(
+                **{name: getattr(scenario, name) for name in Scenario.__struct_fields__} | fields
+            )
         )
     write_suite(Suite(name="tiny", version="1", scenarios=tuple(made)), tmp_path / "tiny.json")
 

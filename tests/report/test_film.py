@@ -31,17 +31,17 @@ pytestmark = pytest.mark.engine
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
+def workspace(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     """A folder with a suite of one short scenario, and a run of it."""
     from scenarios.places.nets import place
     from scenarios.suites.long_horizon import build_long_horizon
 
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("workspace")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
+    scenario = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     short = msgspec.structs.replace(
-        whole,
+        scenario,
         crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2),
         time_limit_s=2.0,
         robot="courier",
@@ -60,11 +60,11 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     return folder
 
 
-def test_a_film_shows_the_seconds_asked_for(
-    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+def test_a_film_shows_the_requested_seconds(
+    workspace: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to
-    play. The waypoints that are planned from 1 s on are on the map and in the robot's picture."""
+    """It has 20 pictures a second of the requested size, all different, playable, with waypoints on
+    map and picture from 1 s on."""
     drawn = []
     add = Video.add
     monkeypatch.setattr(
@@ -83,20 +83,21 @@ def test_a_film_shows_the_seconds_asked_for(
         "-o",
         "film.mp4",
     )
-    done = cosim(*words, cwd=desk)
+    done = cosim(*words, cwd=workspace)
     assert done.returncode == 0, done.stderr
-    with av.open(str(desk / "film.mp4")) as film:
+    with av.open(str(workspace / "film.mp4")) as film:
         pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(pictures) == 20 and pictures[0].shape == (180, 320, 3)
     assert all(np.abs(a.astype(int) - b).max() > 10 for a, b in itertools.pairwise(pictures))
-    assert not list(desk.glob("*.part"))
+    assert not list(workspace.glob("*.part"))
+    assert len(drawn) == 20
     for area in (Layout.of(320, 180).second, Layout.of(320, 180).map):
         part = slice(area.y, area.y + area.height), slice(area.x, area.x + area.width)
         assert all((image[part] == PLANNED).all(axis=2).sum() > 5 for image in drawn)
 
 
-def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> None:
-    """--view puts another picture beside the same map, over the same bar."""
+def test_a_film_is_from_above_or_from_the_robot(workspace: Path, cosim: Cosim) -> None:
+    """--view selects another picture beside the same map, over the same bar."""
     seen = []
     for view in ("above", "robot"):
         words = (
@@ -112,9 +113,9 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
             "-o",
             f"{view}.mp4",
         )
-        done = cosim(*words, cwd=desk)
+        done = cosim(*words, cwd=workspace)
         assert done.returncode == 0, done.stderr
-        with av.open(str(desk / f"{view}.mp4")) as film:
+        with av.open(str(workspace / f"{view}.mp4")) as film:
             seen.append(next(film.decode(video=0)).to_ndarray(format="rgb24").astype(float))
     layout = Layout.of(320, 180)
     apart = np.abs(seen[0] - seen[1]).mean(axis=2)
@@ -122,8 +123,8 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
     assert apart[layout.map.y + 4 : layout.bar.y - 4, layout.map.x + 4 :].mean() < 3
 
 
-def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
-    """Without an episode the first that failed is filmed, from any view; when and why is
+def test_a_film_of_a_failure_ends_with_it(workspace: Path, cosim: Cosim) -> None:
+    """Without an episode the first failed one is filmed, from any view, and time and reason are
     printed."""
     words = (
         "film",
@@ -138,24 +139,26 @@ def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
         "-o",
         "failure.mp4",
     )
-    done = cosim(*words, cwd=desk)
+    done = cosim(*words, cwd=workspace)
     assert done.returncode == 0, done.stderr
     assert "t-0, 2.0 s: ran out of time after 2 s, with " in done.stdout
-    with av.open(str(desk / "failure.mp4")) as film:
+    with av.open(str(workspace / "failure.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 4
 
 
 def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
-    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+    workspace: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the last picture nothing is simulated, and before the first nothing is drawn; it is
-    said meanwhile."""
+    """Simulation ends with the last picture, nothing is drawn before the first, and progress is
+    reported."""
     simulated = []
     drawn = []
     add, render = Recorder.add, WorldCamera.render
-    monkeypatch.setattr(Recorder, "add", lambda self, *told: simulated.append(add(self, *told)))
     monkeypatch.setattr(
-        WorldCamera, "render", lambda self, *told: drawn.append(0) or render(self, *told)
+        Recorder, "add", lambda self, *arguments: simulated.append(add(self, *arguments))
+    )
+    monkeypatch.setattr(
+        WorldCamera, "render", lambda self, *arguments: drawn.append(0) or render(self, *arguments)
     )
     done = cosim(
         "film",
@@ -169,7 +172,7 @@ def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
         "320x180",
         "-o",
         "cut.mp4",
-        cwd=desk,
+        cwd=workspace,
     )
     assert done.returncode == 0, done.stderr
     assert (len(simulated), len(drawn)) == (14, 4)
@@ -178,52 +181,63 @@ def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
 
 
 @pytest.mark.parametrize("column", ["pose", "person_m", "reset_s_m"])
-def test_a_cut_that_is_not_as_recorded_is_no_film(desk: Path, cosim: Cosim, column: str) -> None:
-    """One bit of one tick of the trajectory: an error that names the moment, and no file; beyond
-    the cut it is none."""
-    path = desk / "run" / "episodes" / "t-0" / "trajectory.npz"
-    kept = path.read_bytes()
+def test_a_cut_that_differs_from_its_record_is_not_filmed(
+    workspace: Path, cosim: Cosim, column: str
+) -> None:
+    """One changed bit of a tick is an error with the time and no file; beyond the cut it does not
+    matter."""
+    path = workspace / "run" / "episodes" / "t-0" / "trajectory.npz"
+    original = path.read_bytes()
     with np.load(path) as arrays:
-        held = dict(arrays)
-    held[column] = held[column].copy()
-    held[column][5] = np.nextafter(held[column][5], 9e9) if column != "reset_s_m" else 1.0
-    np.savez(path, **held)
+        changed = dict(arrays)
+    changed[column] = changed[column].copy()
+    changed[column][5] = np.nextafter(changed[column][5], 9e9) if column != "reset_s_m" else 1.0
+    np.savez(path, **changed)
     words = ("film", "run", "t-0", "--size", "320x180", "--speed", "4")
     try:
         until, beyond = (
-            cosim(*words, "--to", "0.2", "-o", "until.mp4", cwd=desk),
-            cosim(*words, "--to", "0.5", "-o", "beyond.mp4", cwd=desk),
+            cosim(*words, "--to", "0.2", "-o", "until.mp4", cwd=workspace),
+            cosim(*words, "--to", "0.5", "-o", "beyond.mp4", cwd=workspace),
         )
     finally:
-        path.write_bytes(kept)
-    assert until.returncode == 0 and (desk / "until.mp4").exists(), until.stderr
+        path.write_bytes(original)
+    assert until.returncode == 0 and (workspace / "until.mp4").exists(), until.stderr
     assert (
         beyond.returncode == 2
         and "not the same when it was replayed (from 0.25 s on)" in beyond.stderr
     )
-    assert not list(desk.glob("beyond*"))
+    assert not list(workspace.glob("beyond*"))
     assert "of the same versions: of other code" in beyond.stderr
 
 
-def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None:
-    """A film of another episode than the recorded one is no film of it: an error, and no file."""
-    path = desk / "run" / "episodes" / "t-0" / "record.json"
-    kept = path.read_bytes()
-    record = json.loads(kept)
+def test_a_record_that_does_not_replay_is_not_filmed(workspace: Path, cosim: Cosim) -> None:
+    """A record of another episode is an error, without a file."""
+    path = workspace / "run" / "episodes" / "t-0" / "record.json"
+    original = path.read_bytes()
+    record = json.loads(original)
     path.write_text(json.dumps(record | {"state_hash": "0" * len(record["state_hash"])}))
     try:
         done = cosim(
-            "film", "run", "t-0", "--from", "1.9", "--size", "320x180", "-o", "wrong.mp4", cwd=desk
+            "film",
+            "run",
+            "t-0",
+            "--from",
+            "1.9",
+            "--size",
+            "320x180",
+            "-o",
+            "wrong.mp4",
+            cwd=workspace,
         )
     finally:
-        path.write_bytes(kept)
+        path.write_bytes(original)
     assert done.returncode == 2 and "not the same when it was replayed" in done.stderr
     assert "of the same versions: of other code" in done.stderr
-    assert not list(desk.glob("wrong*"))
+    assert not list(workspace.glob("wrong*"))
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("film", "run", "t-9"), "unknown finished episode"),
         (("film", "run"), "name one of its episodes, or give --failure: t-0"),
@@ -258,22 +272,22 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("look", "t-0", "--suite", "tiny.json", "-o", "nowhere/look.png"), "written"),
     ],
 )
-def test_what_cannot_be_shown_is_an_error_in_words(
-    desk: Path, cosim: Cosim, words: tuple[str, ...], told: str
+def test_invalid_film_and_look_requests_are_refused(
+    workspace: Path, cosim: Cosim, words: tuple[str, ...], expected: str
 ) -> None:
-    """Exit code 2, or 3 where the machine does not write; one message, no traceback."""
-    done = cosim(*words, cwd=desk)
+    """The exit code is 2, or 3 for the machine's faults, with one message and no traceback."""
+    done = cosim(*words, cwd=workspace)
     assert (
-        done.returncode == (3 if "written" in told else 2)
-        and told in done.stderr
+        done.returncode == (3 if "written" in expected else 2)
+        and expected in done.stderr
         and "Traceback" not in done.stderr
     )
     assert "starting" not in done.stderr or words[0] == "film"
 
 
-def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
-    """From the robot or from above: a picture of the size asked for, with something in it; what is
-    done meanwhile is said."""
+def test_a_look_is_a_picture_of_its_moment(workspace: Path, cosim: Cosim) -> None:
+    """From the robot or from above the picture has the requested size and content, and progress is
+    printed."""
     seen = {}
     for name, words in {
         "start": ("--at", "0"),
@@ -289,7 +303,7 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
             "160x90",
             "-o",
             f"{name}.png",
-            cwd=desk,
+            cwd=workspace,
         )
         assert done.returncode == 0, done.stderr
         driven = ["simulating to 1 s"] if name == "above" else []
@@ -300,33 +314,34 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
             *driven,
             "drawing",
         ]
-        said = done.stderr.splitlines()
-        assert len(said) == len(stages) and all(map(str.startswith, said, stages))
-        seen[name] = cv2.imread(str(desk / f"{name}.png"))
+        lines = done.stderr.splitlines()
+        assert len(lines) == len(stages) and all(map(str.startswith, lines, stages))
+        seen[name] = cv2.imread(str(workspace / f"{name}.png"))
         assert seen[name].shape == (90, 160, 3) and seen[name].std() > 10
     assert (seen["start"] != seen["above"]).mean() > 0.5
 
 
-def test_a_look_at_a_file_of_ones_own_needs_no_suite(desk: Path, cosim: Cosim) -> None:
-    """Of a sweep the first, or the one that is named or numbered; only that one is made, and its
-    faults are listed."""
+def test_a_look_at_a_scenario_file_needs_no_suite(workspace: Path, cosim: Cosim) -> None:
+    """Of a sweep only the first, named or numbered scenario is built, and its faults are listed."""
     text = (
         'name = "mine"\nseeds = 2\n[place]\ncity = 1\nsize_m = 500\n[way]\nkind = '
         '"straight"\nlength_m = 30\n'
     )
     text += '[[events]]\nkind = "frontal"\nat_m = [25, 2]\n'
-    (desk / "mine.toml").write_text(text)
-    for words, told in {
+    (workspace / "mine.toml").write_text(text)
+    for words, expected in {
         (): "mine-at_m25-s0 at 0.00 s, robot; 1 of 4 scenarios: --scenario chooses another)",
         ("--scenario", "2"): "mine-at_m25-s1 at",
         ("--scenario", "mine-at_m25-s1"): "mine-at_m25-s1 at",
     }.items():
-        done = cosim("look", "mine.toml", *words, "--size", "160x90", "-o", "mine.png", cwd=desk)
-        assert done.returncode == 0 and told in done.stdout, done.stderr
-        assert cv2.imread(str(desk / "mine.png")).std() > 10
-    done = cosim("look", "mine.toml", "--scenario", "3", "-o", "none.png", cwd=desk)
+        done = cosim(
+            "look", "mine.toml", *words, "--size", "160x90", "-o", "mine.png", cwd=workspace
+        )
+        assert done.returncode == 0 and expected in done.stdout, done.stderr
+        assert cv2.imread(str(workspace / "mine.png")).std() > 10
+    done = cosim("look", "mine.toml", "--scenario", "3", "-o", "none.png", cwd=workspace)
     assert done.returncode == 2 and "mine.toml: events[0]: at_m 2 does not do" in done.stderr
-    done = cosim("look", "mine.toml", "--scenario", "mine", "-o", "none.png", cwd=desk)
+    done = cosim("look", "mine.toml", "--scenario", "mine", "-o", "none.png", cwd=workspace)
     assert (
         done.returncode == 2
         and "unknown scenario 'mine'. Valid choices: mine-at_m2-s0, mine-" in done.stderr
@@ -334,8 +349,8 @@ def test_a_look_at_a_file_of_ones_own_needs_no_suite(desk: Path, cosim: Cosim) -
 
 
 def test_the_failure_of_an_episode_is_chosen_and_cut_out(tmp_path: Path) -> None:
-    """The first that failed in the order of the run, or the named one: ten seconds before its first
-    failure, two after. What did not fail is refused with what became of it."""
+    """The run's first failed or the named episode is cut from 10 s before its failure to 2 s after;
+    others are refused with their outcome."""
     ways = [short_way(f"s-{k}", ends_on_failure=False) for k in range(3)]
     run = run_of(tmp_path / "run", ["goal", HIT, HIT], scenarios=ways)
     first = failure_to_film(run, None)
@@ -355,7 +370,7 @@ def test_the_failure_of_an_episode_is_chosen_and_cut_out(tmp_path: Path) -> None
 
 
 def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:
-    """An exception while it is made: no file, no part of one."""
+    """An exception during the encoding leaves no complete or partial file."""
     with pytest.raises(KeyError), Video(tmp_path / "film.mp4", (64, 48), 20) as video:
         video.add(np.zeros((48, 64, 3), dtype=np.uint8))
         raise KeyError
@@ -363,7 +378,7 @@ def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_a_replay_ends_with_its_record() -> None:
-    """Beyond the last recorded tick there is nothing to say."""
+    """A replay has no figures beyond the last recorded tick."""
     replay = Replay(np.array([[1.0, 0.2]]))
     assert replay.act(Observation(0, 0.0, None, 0.0, 0.0, COURIER)).w_radps == 0.2
     with pytest.raises(RunError, match="ends after 1 ticks"):

@@ -1,4 +1,4 @@
-"""The page of `cosim report`: figures, choice, escapes, bad input; no engine, no browser."""
+"""The page of `cosim report`: figures, gallery, escaping and bad input; no engine, no browser."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ HOSTILE = (
 
 
 def page(*folders: Path, entries: tuple[Entry, ...] = (), maps: Maps | None = None) -> str:
-    """The page of runs, with nothing shown again."""
+    """The page of runs, without replays."""
     runs = read_runs(folders)
     maps = maps or Maps([], {}, dict(episode_counts(runs)))
     return render_page(runs, plots_of(runs, colours_of(runs)), entries, maps, "").decode()
 
 
 class Elements(HTMLParser):
-    """Counts elements, and keeps what scripts of JSON hold."""
+    """Counts elements, and collects the content of JSON scripts."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -67,18 +67,18 @@ class Elements(HTMLParser):
             self._json = False
 
 
-def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
-    """A cell of a policy is the summary of its episodes; rows of the paper are marked and appear
-    only with its suites."""
+def test_a_policys_cell_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
+    """A policy's cell is the summary of its episodes; rows of the paper are marked and appear only
+    with its suites."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])
     spec = msgspec.structs.replace(own.spec, suite="unit")
-    told = ReportedRun("mine", own.whole._replace(spec=spec))
-    mean, low, high = summary_of(told.table, ["success"]).iloc[0][["mean", "low", "high"]]
-    ours = next(table for table in tables_of([told]) if table.title == "Unit tests")
+    reported = ReportedRun("mine", own.whole._replace(spec=spec))
+    mean, low, high = summary_of(reported.table, ["success"]).iloc[0][["mean", "low", "high"]]
+    ours = next(table for table in tables_of([reported]) if table.title == "Unit tests")
     (row,) = ours.rows
     assert row.name == "mine" and row.cells[0][:4] == (mean, low, high, 5) and mean == 0.6
     assert ours.paper is UNIT_OF_PAPER
-    text = render_page([told], [], [], Maps([], {}, {}), "").decode()
+    text = render_page([reported], [], [], Maps([], {}, {}), "").decode()
     assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in text
     assert text.index("models, in another engine") < text.index("OpenPilot")
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
@@ -86,8 +86,8 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
 
 
-def test_figures_of_the_paper_are_below_the_heads_of_their_metrics(tmp_path: Path) -> None:
-    """A row of long ways has a cell for each column; V of the paper is below V, and it has no
+def test_figures_of_the_paper_are_in_the_columns_of_their_metrics(tmp_path: Path) -> None:
+    """A row of long ways has a cell for each column, the paper's V is in column V, and it has no
     falls."""
     way = short_way("s-000", suite="long-horizon", ends_on_failure=False, structure="route")
     runs = read_runs([run_of(tmp_path / "run", ["goal"], scenarios=[way])])
@@ -106,7 +106,7 @@ def test_figures_of_the_paper_are_below_the_heads_of_their_metrics(tmp_path: Pat
 
 
 def test_a_row_names_a_robot_other_than_the_default(tmp_path: Path) -> None:
-    """The note of a row in the tables names the scout, and not the courier."""
+    """The tables name the scout in a row's note, and not the courier."""
     ways = [short_way("s-0"), short_way("s-1", robot="scout")]
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", "goal"], "mine", ways)])
     (table,) = tables_of([own])
@@ -114,8 +114,8 @@ def test_a_row_names_a_robot_other_than_the_default(tmp_path: Path) -> None:
 
 
 def test_tables_hold_runs_of_one_sensor_track(tmp_path: Path) -> None:
-    """A run with tracked people and a blind one have tables of their own; a row names its track,
-    and so does the summary."""
+    """Runs with tracked people and blind runs have their own tables; rows and summary name the
+    track."""
     runs = read_runs([run_of(tmp_path / name, ["goal", HIT], name) for name in ("a", "b")])
     records = {
         name: msgspec.structs.replace(one, manifest=replace(one.manifest, people="seen"))
@@ -132,7 +132,7 @@ def test_tables_hold_runs_of_one_sensor_track(tmp_path: Path) -> None:
     assert [row.track for row in summary.rows] == ["blind", "people"]
 
 
-def test_tables_name_a_gait_of_the_user(tmp_path: Path) -> None:
+def test_tables_name_a_custom_gait(tmp_path: Path) -> None:
     """Rows and facts of a report, a comparison, and the table of a run have its file and hash."""
     folder = run_of(tmp_path / "run", ["goal"], robot="dog", gait="onnx:/gaits/walk.onnx")
     words = "gait walk.onnx (01234567)"
@@ -151,8 +151,8 @@ def test_tables_name_a_gait_of_the_user(tmp_path: Path) -> None:
 
 
 def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Path) -> None:
-    """Of four curves the page gives counts and the plot a bare point, of six straight ways both
-    have an interval; crashes have a column."""
+    """Four curves give counts and a bare point, six straight ways give intervals, and crashes have
+    a column."""
     ways = [short_way(f"s-{k}", structure="curve" if k < 4 else "straight") for k in range(10)]
     hows = ["goal", HIT, "goal", "goal", "crashed", *["goal"] * 5]
     (own,) = read_runs([run_of(tmp_path / "run", hows, "mine", ways)])
@@ -173,25 +173,25 @@ def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Pat
 
 
 def test_blind_schedules_are_a_row_of_the_tables_of_success(tmp_path: Path) -> None:
-    """With the share of each kind that was searched, below the runs of that suite alone."""
+    """Only the runs of that suite get the row, with the share of each kind that was searched."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT], "mine")])
-    told = ReportedRun(
+    reported = ReportedRun(
         "mine", own.whole._replace(spec=msgspec.structs.replace(own.spec, suite="unit"))
     )
     share = Estimate(0.95, 0.76, 0.99, 20, 19.0)
     blind = {"unit": {"straight": share}}
-    ours = next(table for table in tables_of([told], blind) if table.title == "Unit tests")
+    ours = next(table for table in tables_of([reported], blind) if table.title == "Unit tests")
     mine, row = ours.rows
     assert row.name == BEST_BLIND and row.cells[0] == share and len(row.cells) == len(mine.cells)
     assert sum(cell.n > 0 for cell in row.cells) == 1
-    text = render_page([told], [], [], Maps([], {}, {}), "", blind).decode()
+    text = render_page([reported], [], [], Maps([], {}, {}), "", blind).decode()
     assert text.index(BEST_BLIND) < text.index("models, in another engine")
     assert BEST_BLIND not in render_page([own], [], [], Maps([], {}, {}), "", blind).decode()
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
 def test_the_papers_figures_are_those_of_its_tables() -> None:
-    """Every row of ours is what stands in the table of the paper's source, figure by figure."""
+    """Every row for the paper equals the table of the paper's source, figure by figure."""
     text = PAPER.read_text()
 
     def row(table: str, name: str, nth: int = 0) -> tuple[float | None, ...]:
@@ -213,8 +213,8 @@ def test_the_papers_figures_are_those_of_its_tables() -> None:
         assert (None, *row("tab:hand_crafted_full", name, 1)) == apart
 
 
-def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_path: Path) -> None:
-    """Of many failures of few kinds one of each is chosen first, the earliest; the bound holds."""
+def test_the_gallery_shows_every_kind_and_cause_up_to_its_limit(tmp_path: Path) -> None:
+    """Of many failures of few kinds the earliest of each is chosen first, within the limit."""
     kinds = [("straight", "curve", "crosswalk")[i % 3] for i in range(38)]
     ways = [short_way(f"s-{i:03d}", structure=kind) for i, kind in enumerate(kinds)]
     runs = read_runs([run_of(tmp_path / "run", [HIT] * 38, "mine", ways)])
@@ -229,9 +229,9 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     )
 
 
-def test_a_failure_counts_where_so_many_people_were_near() -> None:
-    """Two people within 10 m in the second of the failure: it and that second's metres are in their
-    bin."""
+def test_a_failure_counts_in_the_bin_of_nearby_people() -> None:
+    """With two people within 10 m in the second of the failure, it and that second's metres are in
+    their bin."""
     way = short_way("s-000", ends_on_failure=False)
     record, log = episode_of(way, "h", HIT)
     assert log is not None
@@ -252,22 +252,21 @@ def test_a_failure_counts_where_so_many_people_were_near() -> None:
     ).failures.tolist() == [0.0, 1.0, 0.0]
 
 
-def test_no_rate_is_of_the_metres_of_invalid_episodes(tmp_path: Path) -> None:
-    """An invalid episode has a trajectory to its goal, which plots do not read."""
+def test_rates_exclude_the_metres_of_invalid_episodes(tmp_path: Path) -> None:
+    """Plots do not read the trajectory of an invalid episode that reached its goal."""
     (run,) = read_runs([run_of(tmp_path / "run", [HIT, "goal", "goal"], "mine")])
     records = {
         n: msgspec.structs.replace(r, status="invalid") if n == "s-001" else r
         for n, r in run.whole.records.items()
     }
-    told = ReportedRun("mine", run.whole._replace(records=records))
-    assert [record.scenario.id for record, _ in told.tracks()] == ["s-000", "s-002"]
+    reported = ReportedRun("mine", run.whole._replace(records=records))
+    assert [record.scenario.id for record, _ in reported.tracks()] == ["s-000", "s-002"]
 
 
-def test_a_run_without_a_failure_stands_at_0_beside_one_with(
+def test_a_run_without_failures_is_plotted_at_0_beside_one_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """39 ticks of 0.1 m began quick, the last with the failure, 41 slow; both runs have both
-    points; the clean one alone has no plot."""
+    """Both runs have a point for quick and for slow ticks, and the clean run alone has no plot."""
     runs = read_runs([run_of(tmp_path / how, [how] * 8, how) for how in (HIT, "goal")])
     speed = np.repeat([[0.5, 0.0], [1.0, 0.0]], 40, axis=0)
     nobody = np.zeros(0, dtype=int)
@@ -289,7 +288,7 @@ def test_a_run_without_a_failure_stands_at_0_beside_one_with(
     assert not [plot for plot in plots_of(runs[1:], colours_of(runs)) if "speed" in plot.title]
 
 
-def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_path: Path) -> None:
+def test_crashed_long_ways_are_noted_beside_their_rates(tmp_path: Path) -> None:
     """Rates of long ways leave out crashed episodes, and a note counts them."""
     ways = [short_way(f"s-{k}", ends_on_failure=False, time_limit_s=300.0) for k in range(3)]
     # 4 m to a failure in each: the rates of a run need 20 m
@@ -314,25 +313,22 @@ def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_pat
     assert dict(zip(bar["y"], bar["x"], strict=True)) == {"shaky": 2.0}
 
 
-def test_runs_of_other_scenarios_of_a_suite_are_told_apart(tmp_path: Path) -> None:
-    """One has all three of its scenarios, another two: it is said, with both counts; of two of all
-    nothing."""
+def test_runs_of_different_scenarios_of_a_suite_are_marked(tmp_path: Path) -> None:
+    """A run of two of three scenarios beside one of all gets a note with both counts, and otherwise
+    there is none."""
     runs = read_runs([run_of(tmp_path / name, ["goal"] * 3, name) for name in ("one", "other")])
     assert not any(warnings_of(runs))
     first = runs[0]
-    whole = runs[1].whole
-    spec = msgspec.structs.replace(whole.spec, scenarios=whole.spec.scenarios[:2])
-    part = ReportedRun(
-        "other", whole._replace(spec=spec, records=dict([*whole.records.items()][:2]))
-    )
+    run = runs[1].whole
+    spec = msgspec.structs.replace(run.spec, scenarios=run.spec.scenarios[:2])
+    part = ReportedRun("other", run._replace(spec=spec, records=dict([*run.records.items()][:2])))
     assert warnings_of([first, part]).mixed == (("s", "one 3, other 2"),)
     text = render_page([first, part], [], [], Maps([], {}, {}), "").decode()
     assert "not all runs are of the same scenarios (one 3, other 2)" in text
 
 
 def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:
-    """A structure, a policy and a reason that are markup are seen as they are: no element comes of
-    them."""
+    """Markup in a structure, a policy and a reason is shown as text, without any element."""
     plain, hostile = (
         Elements(page(folder, entries=(entry,), maps=maps))
         for folder, entry, maps in (
@@ -346,7 +342,7 @@ def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:
 
 
 def _named(path: Path, name: str) -> tuple[Path, Entry, Maps]:
-    """A run in which everything that can be named is called so, and a card and a map of it."""
+    """A run in which every name is the given one, with a card and a map of it."""
     ways = [short_way("s-000", structure=name), short_way("s-001", structure=f"{name} 2")]
     run = run_of(path, [HIT, "goal"], name, ways)
     entry = Entry(
@@ -375,7 +371,7 @@ def _named(path: Path, name: str) -> tuple[Path, Entry, Maps]:
 
 
 def test_the_page_is_one_file_that_loads_nothing(tmp_path: Path) -> None:
-    """Its policy forbids every address, and no element names one."""
+    """Its content policy forbids every address, and no element names one."""
     text = page(run_of(tmp_path / "run", [HIT, "goal"]))
     assert (
         "content=\"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src"
@@ -385,8 +381,8 @@ def test_the_page_is_one_file_that_loads_nothing(tmp_path: Path) -> None:
     assert not re.findall(r'(?:src|href)="(?!#|data:)[^"]*"', head) and "<link" not in head
 
 
-def test_two_runs_of_one_policy_and_suite_are_told_apart_by_their_folders(tmp_path: Path) -> None:
-    """One run of a policy is called as the policy, two as their folders."""
+def test_two_runs_of_one_policy_and_suite_have_the_names_of_their_folders(tmp_path: Path) -> None:
+    """A single run has the name of its policy."""
     first = run_of(tmp_path / "first", ["goal"], "mine")
     second = run_of(tmp_path / "second", [HIT], "mine")
     assert [run.label for run in read_runs([first])] == ["mine"]
@@ -432,26 +428,26 @@ def _edited(run: Path) -> str:
 def test_a_damaged_run_is_refused_by_the_name_of_its_file(
     tmp_path: Path, cosim: Cosim, damage: Callable[[Path], str]
 ) -> None:
-    """One line with the file and the remedy, exit code 2, and no page."""
+    """One line has the file and the remedy, the exit code is 2, and there is no page."""
     run = run_of(tmp_path / "run", [HIT, "goal"])
     file = damage(run)
-    said = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
-    (line,) = [line for line in said.stderr.splitlines() if line.startswith("error:")]
-    assert said.returncode == 2 and file in line and "again" in line
+    result = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("error:")]
+    assert result.returncode == 2 and file in line and "again" in line
     assert not list(tmp_path.glob("*.html*"))
 
 
 def test_no_run_a_run_twice_and_a_run_without_an_episode_are_refused(
     tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Each in one line that says what to do."""
+    """Each refusal is one line with the remedy."""
     run = run_of(tmp_path / "run", [HIT])
     with RunFolder.create(
         tmp_path / "empty", read_spec(run), read_suite(run / "scenarios.json")
-    ) as held:
+    ) as folder:
         assert (
             "in use by process"
-            in cosim("report", str(held.path), "-o", "r.html", cwd=tmp_path).stderr
+            in cosim("report", str(folder.path), "-o", "r.html", cwd=tmp_path).stderr
         )
     words = {
         ("nowhere",): "unknown run",
@@ -459,25 +455,25 @@ def test_no_run_a_run_twice_and_a_run_without_an_episode_are_refused(
         ("empty",): "no episode of it has ended",
     }
     for folders, expected in words.items():
-        said = cosim("report", *folders, "-o", "r.html", cwd=tmp_path)
-        assert said.returncode == 2 and expected in said.stderr, said.stderr
+        result = cosim("report", *folders, "-o", "r.html", cwd=tmp_path)
+        assert result.returncode == 2 and expected in result.stderr, result.stderr
     assert not list(tmp_path.glob("*.html*"))
 
 
-def test_two_suites_of_one_name_do_not_stand_in_one_table(tmp_path: Path, cosim: Cosim) -> None:
-    """The line names both folders and both hashes."""
+def test_two_suites_of_one_name_are_not_put_in_one_table(tmp_path: Path, cosim: Cosim) -> None:
+    """The refusal names both folders and both hashes."""
     run_of(tmp_path / "one", [HIT], "mine")
     run_of(tmp_path / "two", [HIT], "mine", [short_way("s-000", time_limit_s=20.0)])
-    said = cosim("report", "one", "two", "-o", "r.html", cwd=tmp_path)
-    assert said.returncode == 2 and re.search(
-        r"two and one are of different suites 's' \(\w{16}, \w{16}\)", said.stderr
+    result = cosim("report", "one", "two", "-o", "r.html", cwd=tmp_path)
+    assert result.returncode == 2 and re.search(
+        r"two and one are of different suites 's' \(\w{16}, \w{16}\)", result.stderr
     )
 
 
 def test_a_full_disk_leaves_nothing_half_written(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The page that was there before stays, nothing lies beside it; exit code 3."""
+    """The previous page stays, no other file is left, and the exit code is 3."""
     run_of(tmp_path / "run", ["goal", "goal"])
     (tmp_path / "report.html").write_text("the page before")
 
@@ -486,7 +482,9 @@ def test_a_full_disk_leaves_nothing_half_written(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    said = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
-    assert said.returncode == 3 and "report.html: cannot be written: No space left" in said.stderr
+    result = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
+    assert (
+        result.returncode == 3 and "report.html: cannot be written: No space left" in result.stderr
+    )
     assert [path.name for path in tmp_path.glob("report*")] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "the page before"

@@ -1,4 +1,4 @@
-"""The page of `cosim report` in a browser: it opens from disk, every failure plays, on a desk, a
+"""The page of `cosim report` in a browser: it opens from disk, plays failures, and fits desktop,
 phone and paper."""
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ CUT_OFF = """[...document.querySelectorAll('.drawing')].flatMap((plot) => {
   const covered = still.filter((a, k) => still.slice(0, k).some((b) => covers(a, b)));
   return [...texts.filter((t) => !within(box(t))), ...covered].map((t) => t.textContent);
 })"""
-"""The texts of plots that are not whole in their plot, or lie on another."""
+"""Script that lists texts of plots that leave their plot or overlap another."""
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
-    """The report of a run of two scenarios that a blind policy fails, in place of a file that was
-    there."""
+    """The report of a run of two scenarios that a blind policy fails, written over an existing
+    file."""
     folder = tmp_path_factory.mktemp("report")
     ways = (event_way("lateral", "a", at_m=8.0), event_way("obstructing", "b", at_m=11.0))
     write_suite(Suite(name="ways", version="1", scenarios=ways), folder / "ways.json")
@@ -80,8 +80,7 @@ def browser() -> Iterator[Page]:
 
 @pytest.fixture
 def page(report: Path, browser: Page) -> Iterator[Page]:
-    """The report, opened on a desk. Afterwards nothing was wrong with it, and nobody was asked for
-    anything."""
+    """The report, opened on a desktop; at the end it has logged no error and sent no request."""
     browser.size(1280, 900)
     browser.open(report)
     yield browser
@@ -89,9 +88,9 @@ def page(report: Path, browser: Page) -> Iterator[Page]:
     assert browser.asked == []
 
 
-def test_what_is_planned_is_drawn_from_above_and_in_the_picture(page: Page) -> None:
-    """Blind answers a command, and from 1 s on waypoints: the page has these, the third is
-    followed; both pictures show them, and the legend says which of both it is."""
+def test_plans_are_drawn_on_the_map_and_in_the_picture(page: Page) -> None:
+    """A command, then from 1 s on waypoints with the third followed, appear in both pictures and
+    the legend."""
     drawn = (
         "[...document.querySelectorAll('#way circle')].map((c) => [c.cx.baseVal.value, "
         "c.cy.baseVal.value])"
@@ -104,12 +103,12 @@ def test_what_is_planned_is_drawn_from_above_and_in_the_picture(page: Page) -> N
         page.until(PICTURED)
         last = scene["plans"][-1][1]
         legend = page.js("document.querySelector('#key-way').textContent")
-        asked = np.array(last[:2])
+        touched = np.array(last[:2])
         points = np.array(last).reshape(-1, 2)[1:]
         begun = scene["plans"][0][0] > 0
         assert legend.startswith("what was commanded" if begun else "planned waypoints")
         assert (
-            np.allclose(np.hypot(*(points - asked).T), 100.0 * np.hypot(*BEND.T), atol=1.0)
+            np.allclose(np.hypot(*(points - touched).T), 100.0 * np.hypot(*BEND.T), atol=1.0)
             and scene["follows"] == 3
         )
         page.key("End", code=35)
@@ -128,8 +127,7 @@ def test_what_is_planned_is_drawn_from_above_and_in_the_picture(page: Page) -> N
 
 
 def test_every_failure_plays_to_its_end(page: Page) -> None:
-    """Play runs until the moment of the failure; the picture from above and both cameras change on
-    the way."""
+    """Play runs until the failure while the map and both cameras change."""
     cards = page.js("document.querySelectorAll('[data-entry]').length")
     assert cards == 2
     page.js(
@@ -156,9 +154,8 @@ def test_every_failure_plays_to_its_end(page: Page) -> None:
     assert any("who stood ahead" in reason for reason in reasons)
 
 
-def test_the_viewer_is_worked_by_keys_alone(page: Page) -> None:
-    """Enter opens, arrows step, End goes to the failure, Shift and arrow to another, Escape
-    closes."""
+def test_the_viewer_works_with_the_keyboard(page: Page) -> None:
+    """Enter opens, arrows step, End goes to the failure, Shift and arrow to another, Escape closes."""
     page.js("document.querySelector('[data-entry=\"0\"]').focus()")
     page.key("Enter", code=13)
     page.until("document.querySelector('#viewer').open")
@@ -178,9 +175,8 @@ def test_the_viewer_is_worked_by_keys_alone(page: Page) -> None:
     page.until("!document.querySelector('#viewer').open")
 
 
-def test_a_phone_and_paper_show_all_of_it(page: Page) -> None:
-    """At 400 px nothing is wider than the screen, but for tables that scroll in themselves; it
-    prints."""
+def test_a_phone_and_paper_show_the_whole_page(page: Page) -> None:
+    """At 400 px only tables that scroll exceed the screen, and the page prints."""
     assert page.js(WIDE) <= 1280
     page.size(400, 850, phone=True)
     page.until(f"{WIDE} <= 400 && document.querySelector('.main-svg').clientWidth <= 400")
@@ -193,9 +189,8 @@ def test_a_phone_and_paper_show_all_of_it(page: Page) -> None:
 
 
 @pytest.fixture(scope="module")
-def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A page of six runs of policies with long names, in scenarios with long names; nothing is
-    shown again."""
+def crowded_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of six runs with long names of policies and scenarios, without replays."""
     folder = tmp_path_factory.mktemp("crowded")
     rng = np.random.default_rng(1)
     kinds = ["straight", "curve", "crosswalk"]
@@ -230,12 +225,11 @@ def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_no_text_is_cut_off_or_covered(crowded: Path, browser: Page) -> None:
-    """At 1280 px, then at 400: every text of every plot lies in its plot, none on another, the
-    figures that show when a point is touched too; of a table the names leave more than half of the
-    width to the figures."""
+def test_no_text_is_cut_off_or_covered(crowded_page: Path, browser: Page) -> None:
+    """At 1280 and 400 px texts of plots, also of touched points, fit without overlap, and names
+    take under half of a table."""
     browser.size(1280, 900)
-    browser.open(crowded)
+    browser.open(crowded_page)
     plots = "[...document.querySelectorAll('.drawing')]"
     for wide in (1280, 400):
         browser.size(wide, 900, phone=wide == 400)
@@ -261,8 +255,8 @@ def test_no_text_is_cut_off_or_covered(crowded: Path, browser: Page) -> None:
 
 
 def test_plots_and_maps_are_drawn(page: Page) -> None:
-    """Every plot has marks in it, the map of the chosen place its failures; there is a choice for
-    each place."""
+    """Every plot has marks, the map of the chosen place has its failures, and each place can be
+    chosen."""
     plots = page.js("document.querySelectorAll('[data-plot]').length")
     marks = (
         "[...document.querySelectorAll('[data-plot]')].filter((p) => p.querySelector('.point, "
@@ -281,8 +275,8 @@ def test_plots_and_maps_are_drawn(page: Page) -> None:
     assert places == page.js("document.querySelectorAll('#places tbody tr').length") > 0
 
 
-def test_filters_show_what_was_asked_for(page: Page) -> None:
-    """One kind chosen: its cards alone, and how many of how many."""
+def test_a_filter_shows_only_its_kind(page: Page) -> None:
+    """A chosen kind shows its cards alone, and how many of how many."""
     page.js("const kind = document.querySelector('[data-field=kind]'); kind.value = 'lateral'; 0")
     page.js("document.querySelector('[data-field=kind]').dispatchEvent(new Event('change'))")
     shown = page.js(

@@ -1,4 +1,4 @@
-"""Why an episode failed, in words."""
+"""The reason of an episode's failure, in words."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ EVENT = Event(
 WAY = short_way("s-000", events=(EVENT,), structure="lateral")
 
 
-def told(
+def reason_of_failure(
     failure: Failure, other: MetBody | None = None, scenario: Scenario = WAY, **fields: object
 ) -> str:
-    """The reason of an episode that this failure ended."""
+    """Return the reason of an episode that ended with this failure."""
     record, log = episode_of(scenario, "h", HIT)
     record = msgspec.structs.replace(record, events=())
     record = msgspec.structs.replace(record, failures=(failure,), **fields)
@@ -113,33 +113,31 @@ def car(speed_mps: float = 1.2) -> Failure:
         "vehicle unseen, stood",
     ],
 )
-def test_a_collision_tells_from_where_and_how_fast_the_other_came(
+def test_a_collision_describes_direction_and_speed_of_the_other(
     failure: Failure, other: MetBody | None, words: str
 ) -> None:
-    """Sides are the robot's, its left is y > 0; who does not move stood; who is slower ahead went
-    ahead."""
-    assert told(failure, other) == words
+    """Sides are the robot's, with left at y > 0; a still person stood, and a slower one ahead
+    walked ahead."""
+    assert reason_of_failure(failure, other) == words
 
 
-def test_a_collision_with_who_is_of_an_event_tells_when_it_began() -> None:
-    """Ticks are of 0.05 s: the end of tick 79 is 4.00 s, and a trigger at 0.90 s was 3.1 s
-    before."""
+def test_a_collision_with_an_event_pedestrian_has_the_time_since_the_trigger() -> None:
+    """With ticks of 0.05 s the end of tick 79 is 4.00 s, 3.1 s after a trigger at 0.90 s."""
     events = (
         TriggeredEvent(
             id="e0", kind="lateral", passed=False, triggered_at_s=0.9, trigger_distance_m=4.0
         ),
     )
-    words = told(person(), MetBody(0.6, 0.4, 0.0, -1.2), events=events)
+    words = reason_of_failure(person(), MetBody(0.6, 0.4, 0.0, -1.2), events=events)
     assert words == "drove into a person who came from the left at 1.2 m/s, 3.1 s after the trigger"
     waiting = (TriggeredEvent(id="e0", kind="lateral", passed=False),)
-    assert told(person(), MetBody(0.6, 0.4, 0.0, -1.2), events=waiting).endswith(
+    assert reason_of_failure(person(), MetBody(0.6, 0.4, 0.0, -1.2), events=waiting).endswith(
         ", before its event began"
     )
 
 
-def test_the_tracks_of_an_event_tell_who_came_from_where() -> None:
-    """Without a replay: the robot heads east on x, the event's person comes from the south at 1
-    m/s."""
+def test_the_tracks_of_an_event_give_the_direction_without_a_replay() -> None:
+    """The robot heads east on x, and the event's person comes from the south at 1 m/s."""
     record, log = episode_of(WAY, "h", HIT)
     ticks = np.arange(60, 80)
     rows = np.column_stack(
@@ -151,12 +149,12 @@ def test_the_tracks_of_an_event_tell_who_came_from_where() -> None:
     assert reason == "drove into a person who came from the right at 1.0 m/s"
 
 
-def test_things_lanes_and_standing_still_have_words_too() -> None:
-    """A thing by its name, a side of the route for who left it, how long for who froze."""
+def test_obstacles_lanes_and_freezing_have_reasons() -> None:
+    """An obstacle has its name, a left lane its side of the route, and freezing its duration."""
     _, log = episode_of(WAY, "h", HIT)
     assert log is not None
     thing = Failure("collision", 79, 4.0, 0.0, 4.0, 1.0, "obstacle:0:bike", "object")
-    assert told(thing) == "drove into a parked bike at 1.0 m/s"
+    assert reason_of_failure(thing) == "drove into a parked bike at 1.0 m/s"
     named = {
         "barrier::n13x9_c1:0": "a barrier",
         "prop:s612:3": "a piece of street furniture",
@@ -164,20 +162,22 @@ def test_things_lanes_and_standing_still_have_words_too() -> None:
     }
     for name, words in (named | {"obstacle:2:bin": "a bin"}).items():
         assert (
-            told(Failure("collision", 79, 4.0, 0.0, 4.0, 1.0, name, "object"))
+            reason_of_failure(Failure("collision", 79, 4.0, 0.0, 4.0, 1.0, name, "object"))
             == f"drove into {words} at 1.0 m/s"
         )
     off = Failure("out_of_lane", 79, 4.0, 1.5, 4.0, 1.0)
-    assert told(off) == "left the sidewalk on its left side at 1.0 m/s, 1.5 m off the route"
     assert (
-        told(failure_at(log, 79, "freezing"))
+        reason_of_failure(off)
+        == "left the sidewalk on its left side at 1.0 m/s, 1.5 m off the route"
+    )
+    assert (
+        reason_of_failure(failure_at(log, 79, "freezing"))
         == "stayed within 0.5 m for 10 s, the nearest person 1.5 m away"
     )
 
 
-def test_an_episode_without_a_failure_of_the_referees_has_a_reason() -> None:
-    """Time, a stopping hand that was passed, a group that was driven through, a policy that
-    crashed."""
+def test_episodes_that_failed_without_a_referee_failure_have_a_reason() -> None:
+    """Reasons are the time limit, a passed stopping hand, a crossed group, and a crashed policy."""
     record, log = episode_of(WAY, "h", "goal")
     lost = msgspec.structs.replace(
         record, measures=record.measures | {"success": 0.0, "route_completion": 0.4}
@@ -191,15 +191,15 @@ def test_an_episode_without_a_failure_of_the_referees_has_a_reason() -> None:
         ),
     }
     for how, (cause, words) in ended.items():
-        one = msgspec.structs.replace(lost, ended=how)
-        (mishap,) = mishaps_of(one)
-        assert (mishap.cause, reason_of(WAY, one, mishap, log)) == (cause, words)
+        ended_record = msgspec.structs.replace(lost, ended=how)
+        (mishap,) = mishaps_of(ended_record)
+        assert (mishap.cause, reason_of(WAY, ended_record, mishap, log)) == (cause, words)
     crashed, _ = episode_of(WAY, "h", "crashed")
     assert reason_of(WAY, crashed, mishaps_of(crashed)[0], None) == "the policy crashed: it said so"
 
 
-def test_who_succeeded_or_is_invalid_has_no_mishap() -> None:
-    """There is nothing to be explained."""
+def test_successful_and_invalid_episodes_have_no_failure_reason() -> None:
+    """Successful and invalid episodes have no moment of failure to explain."""
     found: list[list[Mishap]] = [
         mishaps_of(episode_of(WAY, "h", how)[0]) for how in ("goal", "invalid")
     ]
@@ -207,6 +207,6 @@ def test_who_succeeded_or_is_invalid_has_no_mishap() -> None:
 
 
 def test_every_failure_has_a_cause() -> None:
-    """By its kind, and by what was touched."""
+    """The cause follows from its kind and from what was touched."""
     record: Record = episode_of(WAY, "h", HIT)[0]
     assert [cause_of(one) for one in (*record.failures, person())] == ["obstacle", "person"]

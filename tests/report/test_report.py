@@ -1,5 +1,4 @@
-"""What is drawn of an episode without an engine: legends, labels, the layout of films, the
-minimap."""
+"""Drawings of an episode without an engine: legends, labels, the layout of films, the minimap."""
 
 from __future__ import annotations
 
@@ -21,9 +20,8 @@ from cosim.spec.scenario import City, Scenario
 @pytest.mark.parametrize(
     "size", [(320, 180), (640, 360), (960, 540), (1280, 720), (1920, 1080), (500, 800)]
 )
-def test_nothing_covers_anything_in_a_film(size: tuple[int, int]) -> None:
-    """View, second view, map and bar fill the picture and do not overlap; the second view is
-    4:3."""
+def test_the_parts_of_a_film_do_not_overlap(size: tuple[int, int]) -> None:
+    """View, second view, map and bar fill the picture, and the second view is 4:3."""
     layout = Layout.of(*size)
     boxes = [shapely.box(a.x, a.y, a.x + a.width, a.y + a.height) for a in layout]
     assert sum(box.area for box in boxes) == size[0] * size[1]
@@ -34,7 +32,7 @@ def test_nothing_covers_anything_in_a_film(size: tuple[int, int]) -> None:
 
 
 def minimap() -> Minimap:
-    """A route of 60 m along the x axis, on a sidewalk 4 m wide."""
+    """A minimap with a route of 60 m along the x axis, on a sidewalk 4 m wide."""
     line = np.array([[0.0, 0.0], [60.0, 0.0]])
     polygon = shapely.LineString(line).buffer(2.0, cap_style="flat")
     strip = Strip("s", "sidewalk", line, 4.0, polygon, (None, None))
@@ -52,13 +50,13 @@ def minimap() -> Minimap:
 
 
 def where(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:  # type: ignore[type-arg]
-    """(N, 2) columns and rows of the pixels of a colour."""
+    """Return (N, 2) columns and rows of the pixels of a colour."""
     return np.argwhere((image == colour).all(axis=2))[:, ::-1]
 
 
-def test_the_map_shows_who_is_where_and_faces_where() -> None:
-    """East is right and north up; event people are orange, others violet, both with a nose; the
-    hand that stops is red, between its person and the robot."""
+def test_the_map_shows_places_and_headings_of_people() -> None:
+    """With east right and north up, event people are orange, others violet, and a stopping hand is
+    a red line to the robot."""
     robot = RobotState(Pose(30.0, 0.0, 0.0))
     xy = [[34.0, 5.0], [36.0, 0.0]]
     doing = ("walk", "stop")
@@ -80,14 +78,13 @@ def test_the_map_shows_who_is_where_and_faces_where() -> None:
 
 
 def test_the_map_follows_its_robot() -> None:
-    """The same street ten metres on: what stands on the ground moves by ten metres in the picture,
-    to half a pixel."""
-    one = minimap()
+    """Ten metres on, everything on the ground moves by ten metres in the picture, to half a pixel."""
+    drawn = minimap()
     people = People.of(("e0",), [[36.0, 1.0]], [0.0], [0.0], ("stand",), kind=PersonKind.EVENT)
     east = np.array([1.0, 0.0])
     shift = []
     for x in (30.0, 32.0):
-        image = one.picture(RobotState(Pose(x, 0.0, 0.0)), Street(0, people), (300, 200), east)
+        image = drawn.picture(RobotState(Pose(x, 0.0, 0.0)), Street(0, people), (300, 200), east)
         assert image.shape == (200, 300, 3)
         shift.append(where(image, EVENT).mean(axis=0))
     assert shift[0] - shift[1] == pytest.approx((2.0 * 200 / (2.0 * MINIMAP_REACH_M), 0.0), abs=0.5)

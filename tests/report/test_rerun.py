@@ -1,5 +1,4 @@
-"""Recordings for the Rerun viewer: what is in the file, read back by its own SDK, and what is
-refused."""
+"""Recordings for the Rerun viewer: their content, read back by its own SDK, and refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ from tests.support.blind_policy import BEND, Blind
 
 
 @pytest.mark.parametrize(
-    "name, episodes, told",
+    "name, episodes, expected",
     [
         ("e.mp4", 1, "use a name that ends in .rrd"),
         ("e.rrd", 0, "and none are chosen"),
@@ -34,26 +33,25 @@ from tests.support.blind_policy import BEND, Blind
     ],
     ids=["another ending", "no episode", "several"],
 )
-def test_a_recording_is_of_one_episode_in_a_file_of_its_kind(
-    tmp_path: Path, name: str, episodes: int, told: str
+def test_a_recording_needs_one_episode_and_an_rrd_file(
+    tmp_path: Path, name: str, episodes: int, expected: str
 ) -> None:
-    """Anything else is refused before something runs."""
-    with pytest.raises(UsageError, match=told):
+    """Anything else is refused before a simulation starts."""
+    with pytest.raises(UsageError, match=expected):
         check_rerun(tmp_path / name, episodes)
 
 
-def test_without_the_package_the_remedy_is_told(
+def test_a_missing_package_is_reported_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The extra that brings it, by name."""
+    """The extra that installs it is named."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MachineError, match=r"pip install -e '\.\[rerun\]' in the checkout"):
         check_rerun(tmp_path / "e.rrd", 1)
 
 
 class Tape:
-    """A recording read back: for each entity the columns of its rows, in the order in which they
-    were written."""
+    """A recording read back: for each entity the columns of its rows, in the order of writing."""
 
     def __init__(self, path: Path) -> None:
         from rerun.chunk import RrdReader
@@ -75,22 +73,21 @@ class Tape:
 
 
 class Sensing(Blind):
-    """Drives as the blind policy, with every sensor but a camera."""
+    """A policy that drives as the blind one, with every sensor but a camera."""
 
     manifest = replace(Blind.manifest, scan=ScanSpec(rays=90), imu="noisy", people="seen")
 
 
 @pytest.mark.engine
 def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Cosim) -> None:
-    """Read back: each tick's pose, people, velocities and plots, each picture with depth and
-    labels; waypoints from where the robot was when it was asked; what it sensed then; and the ground. A record that was
-    changed leaves no file."""
+    """Ground, poses, people, velocities, plots, pictures, waypoints and sensors are read back; a
+    changed record leaves no file."""
     pytest.importorskip("rerun")
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
     suite = Suite(name="brief", version="1", scenarios=(scenario,))
     product.run(suite, Sensing(), out=tmp_path / "run")
-    said = cosim("show", "run", "--episode", scenario.id, "--rerun", "e.rrd", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim("show", "run", "--episode", scenario.id, "--rerun", "e.rrd", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     tape = Tape(tmp_path / "e.rrd")
     log = Log.load(tmp_path / "run" / "episodes" / scenario.id / "trajectory.npz")
     moving = ("robot", "robot/plan", "people", "people/velocity", "vehicles", "signals")
@@ -113,9 +110,9 @@ def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Co
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
         assert np.allclose(dot, BEND @ [[cos, sin], [-sin, cos]] + (x_m, y_m), atol=1e-3)
     assert tape.column("/world/waypoints/points", "tick") == [21, 25, 29, 33, 37]
-    asked = [*range(0, len(log), 4)]
+    query_ticks = [*range(0, len(log), 4)]
     for entity in ("/world/robot/scan", "/world/robot/tracks", "/plots/imu/gyro_z"):
-        assert tape.column(entity, "tick") == asked, entity
+        assert tape.column(entity, "tick") == query_ticks, entity
     returns = tape.column("/world/robot/scan", "Points3D:positions")
     assert all(10 < len(one) <= 90 for one in returns)
     speeds = [speed for (speed,) in tape.column("/plots/speed/robot", "Scalars:scalars")]

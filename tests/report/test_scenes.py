@@ -1,5 +1,5 @@
-"""Failures shown again: one replay for all of an episode, held against its record, each picture
-drawn once."""
+"""Replayed failures: one replay for each episode, checked against its record, each picture drawn
+once."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ def run(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     return folder / "run"
 
 
-def test_failures_that_follow_one_another_share_their_pictures(
+def test_consecutive_failures_share_their_pictures(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The failure and, as if there were one, a moment a second before it: each has its last 5 s,
-    four a second, and the moment itself; what both show is drawn once, and is the same. What is
-    done rises to what was announced."""
+    """Two moments 1 s apart have 5 s at 4 Hz each, shared pictures are drawn once, and progress
+    rises to its total."""
     drawn = []
     done = []
     render = WorldCamera.render
-    monkeypatch.setattr(WorldCamera, "render", lambda *told: drawn.append(0) or render(*told))
+    monkeypatch.setattr(
+        WorldCamera, "render", lambda *arguments: drawn.append(0) or render(*arguments)
+    )
     (last,) = mishaps_of(load_recorded(run, NAME).record)
     before = last._replace(tick=last.tick - 20, failure=None)
     shown = show_again(run, NAME, [last, before], "auto", done.append)
@@ -57,30 +58,30 @@ def test_failures_that_follow_one_another_share_their_pictures(
 
 
 @pytest.mark.parametrize("column", ["pose", "person_m"])
-def test_an_episode_that_comes_out_otherwise_is_not_shown(run: Path, column: str) -> None:
-    """One bit of one tick before the failure: an error that names the moment."""
+def test_an_episode_that_replays_differently_is_not_shown(run: Path, column: str) -> None:
+    """One changed bit of a tick before the failure is an error with the time."""
     path = run / "episodes" / NAME / "trajectory.npz"
-    kept = path.read_bytes()
+    original = path.read_bytes()
     with np.load(path) as arrays:
-        held = dict(arrays)
-    held[column] = held[column].copy()
-    held[column][5] = np.nextafter(held[column][5], 9e9)
-    np.savez(path, **held)
+        changed = dict(arrays)
+    changed[column] = changed[column].copy()
+    changed[column][5] = np.nextafter(changed[column][5], 9e9)
+    np.savez(path, **changed)
     try:
         with pytest.raises(RunError, match=r"not the same when it was replayed \(from 0.25 s on\)"):
             show_again(run, NAME, mishaps_of(load_recorded(run, NAME).record), "auto")
     finally:
-        path.write_bytes(kept)
+        path.write_bytes(original)
 
 
 def test_a_replay_without_measures_has_no_result(run: Path) -> None:
     """It ends when the recorded one did, and its result raises UsageError."""
-    told = load_recorded(run, NAME)
-    episode, policy = replay_episode(told, without_measures=True)
+    recorded = load_recorded(run, NAME)
+    episode, policy = replay_episode(recorded, without_measures=True)
     with episode:
         observation = episode.reset()
         while not episode.over:
             observation = episode.advance(policy.act(observation))
-        assert episode.moment.tick == told.record.ticks
+        assert episode.moment.tick == recorded.record.ticks
     with pytest.raises(UsageError, match="no measures"):
         episode.result()

@@ -1,4 +1,4 @@
-"""Comparisons of runs: what is grouped, what flipped, what is written, and what is refused."""
+"""Comparisons of runs: groups, changed outcomes, exports, and refusals."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from tests.support.driven_runs import HIT, run_of, short_way
 GOALS = "goal"
 
 
-def several(count: int) -> tuple[Scenario, ...]:
-    """Half of them straight, half curves; every fifth in test; every fourth with somebody frontal
-    on its way."""
+def scenarios_of(count: int) -> tuple[Scenario, ...]:
+    """Scenarios, half straight, half curves; every fifth in test; every fourth with a `frontal`
+    event."""
 
     def one(i: int) -> Scenario:
         event = Event(
@@ -66,20 +66,22 @@ def several(count: int) -> tuple[Scenario, ...]:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """20 scenarios by three policies: `a` solves every second one; `b` all but one that a solves
-    and one that it does not; `c` crashes once and has one that is invalid, else it is as `a`."""
+    """20 scenarios by three policies: `a` solves half; `b` nearly all; `c` is as `a` with one crash
+    and one invalid episode."""
     folder = tmp_path_factory.mktemp("runs")
     a = [GOALS if i % 2 else HIT for i in range(20)]
     b = [GOALS if i % 2 or i < 18 else HIT for i in range(20)]
     b[19] = HIT
     c = [*a[:10], "crashed", "invalid", *a[12:]]
     for name, hows in (("a", a), ("b", b), ("c", c)):
-        run_of(folder / name, hows, name, several(20))
+        run_of(folder / name, hows, name, scenarios_of(20))
     return folder
 
 
-def row(told: RunComparison, metric: str, group: str = "s", after: str = "b") -> pd.Series[float]:
-    table = told.differences
+def row(
+    comparison: RunComparison, metric: str, group: str = "s", after: str = "b"
+) -> pd.Series[float]:
+    table = comparison.differences
     (one,) = table.index[
         (table["metric"] == metric) & (table["group"] == group) & (table["after"] == after)
     ]
@@ -88,9 +90,9 @@ def row(told: RunComparison, metric: str, group: str = "s", after: str = "b") ->
 
 
 def test_groups_are_suite_event_structure_and_split() -> None:
-    """Each scenario stands in every group that it belongs to; a group of the same scenarios as
-    another stands once."""
-    groups = groups_of("s", several(20))
+    """Each scenario is in every group that it belongs to, and groups of the same scenarios appear
+    once."""
+    groups = groups_of("s", scenarios_of(20))
     assert [*groups] == [
         ("suite", "s"),
         ("event", "frontal"),
@@ -101,28 +103,28 @@ def test_groups_are_suite_event_structure_and_split() -> None:
     ]
     assert groups["event", "frontal"] == {f"s-{i:03d}" for i in (0, 4, 8, 12, 16)}
     assert len(groups["split", "test"]) == 4 and len(groups["suite", "s"]) == 20
-    assert [*groups_of("s", several(1))] == [("suite", "s")]
+    assert [*groups_of("s", scenarios_of(1))] == [("suite", "s")]
 
 
 def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
-    """Nine won and one lost of twenty: by name, and in every group."""
-    told = compare_runs([runs / "a", runs / "b"])
-    whole = row(told, "success")
-    assert (whole["value_before"], whole["value_after"], whole["n"], whole["changed"]) == (
+    """Nine won and one lost of twenty are listed by name, and in every group."""
+    comparison = compare_runs([runs / "a", runs / "b"])
+    success = row(comparison, "success")
+    assert (success["value_before"], success["value_after"], success["n"], success["changed"]) == (
         0.5,
         0.9,
         20,
         10,
     )
-    assert whole["low"] > 0.0 and whole["verdict"] == "better"
-    assert row(told, "failures")["verdict"] == "better" and row(told, "failures")[
+    assert success["low"] > 0.0 and success["verdict"] == "better"
+    assert row(comparison, "failures")["verdict"] == "better" and row(comparison, "failures")[
         "difference"
     ] == pytest.approx(-0.4)
     assert (
-        row(told, "success", "curve")["difference"] == 0.9
-        and row(told, "success", "straight")["changed"] == 1
+        row(comparison, "success", "curve")["difference"] == 0.9
+        and row(comparison, "success", "straight")["changed"] == 1
     )
-    rate = row(told, "failures_per_100m")
+    rate = row(comparison, "failures_per_100m")
     metres = [
         compare_runs([runs / "a", runs / name]).others[0].table["path_length_m"].sum()
         for name in ("a", "b")
@@ -130,19 +132,19 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
     assert (rate["value_before"], rate["value_after"]) == pytest.approx(
         (1000.0 / metres[0], 200.0 / metres[1])
     )
-    won, lost = flips_in_words(told, told.others[0])
+    won, lost = flips_in_words(comparison, comparison.others[0])
     assert won == "solved by b alone, 9: " + ", ".join(f"s-{i:03d}" for i in range(0, 18, 2))
     assert lost == "solved by a alone, 1: s-019"
-    assert told.flipped.loc[
-        told.flipped["flip"] == "lost", ["ended_before", "ended_after"]
+    assert comparison.flipped.loc[
+        comparison.flipped["flip"] == "lost", ["ended_before", "ended_after"]
     ].values.tolist() == [["goal", "failure"]]
 
 
-def test_runs_by_other_terms_are_called_neither_better_nor_worse(
+def test_runs_under_other_conditions_get_no_verdict(
     runs: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Another goal protocol, odometry, sensor track or latency is named, and no verdict given; the
-    differences stay."""
+    """Another goal protocol, odometry, sensor track or latency is named; differences remain,
+    without a verdict."""
     run = rewritten(
         runs / "b",
         tmp_path / "b",
@@ -151,57 +153,62 @@ def test_runs_by_other_terms_are_called_neither_better_nor_worse(
         privileged=True,
         latency_ms=200.0,
     )
-    told = compare_runs([runs / "a", run])
-    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
-    assert row(told, "success")["verdict"] == "differs" and row(told, "success")["low"] > 0.0
-    (note,) = told.notes
+    comparison = compare_runs([runs / "a", run])
+    assert {*comparison.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    assert (
+        row(comparison, "success")["verdict"] == "differs"
+        and row(comparison, "success")["low"] > 0.0
+    )
+    (note,) = comparison.notes
     assert note == (
         "No verdict of b against a: they drove by other terms, goal none (a) and route_point (b); "
         "odometry none (a) and exact (b); sensor track blind (a) and privileged (b); "
         "latency 0 ms (a) and 200 ms (b). What differs is called neither better nor worse"
     )
-    said = cosim("compare", str(runs / "a"), str(run))
-    assert said.returncode == 0 and note in said.stdout
-    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", said.stdout)
+    result = cosim("compare", str(runs / "a"), str(run))
+    assert result.returncode == 0 and note in result.stdout
+    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", result.stdout)
 
 
 def test_runs_by_other_robots_are_paired_without_a_verdict(runs: Path, tmp_path: Path) -> None:
-    """Runs of one suite by two robots are paired by scenario, named by robot, and no difference is
-    called better or worse."""
-    courier = run_of(tmp_path / "c", [HIT] * 20, "p", several(20))
-    dog = run_of(tmp_path / "d", [GOALS] * 20, "p", several(20), robot="dog")
-    told = compare_runs([courier, dog])
-    assert (told.before.label, told.others[0].label) == ("p, courier", "p, dog")
-    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
-    success = row(told, "success", after="p, dog")
+    """Runs of two robots are paired by scenario and named by robot, and no difference is called
+    better or worse."""
+    courier = run_of(tmp_path / "c", [HIT] * 20, "p", scenarios_of(20))
+    dog = run_of(tmp_path / "d", [GOALS] * 20, "p", scenarios_of(20), robot="dog")
+    comparison = compare_runs([courier, dog])
+    assert (comparison.before.label, comparison.others[0].label) == ("p, courier", "p, dog")
+    assert {*comparison.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    success = row(comparison, "success", after="p, dog")
     assert (success["n"], success["difference"], success["verdict"]) == (20, 1.0, "differs")
     assert any(
         "No verdict of p, dog against p, courier" in note
         and "robot courier (p, courier) and dog (p, dog)" in note
-        for note in told.notes
+        for note in comparison.notes
     )
 
 
 def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     tmp_path: Path, cosim: Cosim
 ) -> None:
-    """A run in rain is named so, is no resumption of one in clear weather, and is called neither
-    better nor worse; both are in a table by weather."""
-    ways = several(20)
+    """A run in rain is named, cannot resume one in clear weather, has no verdict, and is in a table
+    by weather."""
+    ways = scenarios_of(20)
     clear = run_of(tmp_path / "c", [GOALS] * 20, "p", ways)
     rain = run_of(tmp_path / "r", [HIT] * 20, "p", ways, weather="rain")
     difference = read_spec(clear).difference_from(read_spec(rain))
     assert difference is not None and difference[:3] == ("weather", "", "rain")
-    told = compare_runs([clear, rain])
-    assert (told.before.label, told.others[0].label) == ("p, own weather", "p, rain")
-    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
-    assert any("weather clear (p, own weather) and rain (p, rain)" in n for n in told.notes)
-    said = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "weather.png"))
-    assert said.returncode == 0, said.stderr
-    assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", said.stdout)
+    comparison = compare_runs([clear, rain])
+    assert (comparison.before.label, comparison.others[0].label) == ("p, own weather", "p, rain")
+    assert {*comparison.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    assert any("weather clear (p, own weather) and rain (p, rain)" in n for n in comparison.notes)
+    result = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "weather.png"))
+    assert result.returncode == 0, result.stderr
+    assert re.search(r"clear +p +1\.00 .*\n rain +p +0\.00 ", result.stdout)
     assert (tmp_path / "weather.png").read_bytes().startswith(b"\x89PNG")
-    said = cosim("compare", str(clear), str(rain), "-o", str(tmp_path / "p.png"), "--by", "policy")
-    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG"), said.stderr
+    result = cosim(
+        "compare", str(clear), str(rain), "-o", str(tmp_path / "p.png"), "--by", "policy"
+    )
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG"), result.stderr
     printed = io.StringIO()
     table = table_of(read_verified_run(rain).records.values())
     print_table(Console(file=printed, width=200), table, 20, rain)
@@ -212,8 +219,8 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
 def test_runs_of_other_sensor_tracks_get_no_verdict_but_blind_ones_do(
     runs: Path, tmp_path: Path, track: str
 ) -> None:
-    """A policy with a lidar, or with tracked people, is not compared with one with a camera; a
-    blind baseline is. Records without these keys are read as before."""
+    """Lidar and tracked people are not compared with a camera, a blind baseline is; older records
+    are read as before."""
     sensors: dict[str, object] = {"lidar": {}} if track == "lidar" else {"people": "seen"}
     sensing = rewritten(runs / "b", tmp_path / "sensing", **sensors)
     seeing = rewritten(runs / "b", tmp_path / "seeing", camera={"width": 64, "height": 48})
@@ -231,22 +238,21 @@ def test_runs_of_other_sensor_tracks_get_no_verdict_but_blind_ones_do(
     assert table_row(Record.decoded(json.dumps(old).encode(), path))["track"] == "blind"
 
 
-def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:
-    """A camera is the policy's own choice; a run without one is a blind baseline, of which nothing
-    is said."""
+def test_another_camera_is_noted_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:
+    """The camera is the policy's own choice; a run without one is a blind baseline without a note."""
     small, large = (
         rewritten(runs / name, tmp_path / name, camera=CameraSpec(width, 48))
         for name, width in (("a", 64), ("b", 96))
     )
-    told = compare_runs([small, large])
-    assert row(told, "success")["verdict"] == "better"
+    comparison = compare_runs([small, large])
+    assert row(comparison, "success")["verdict"] == "better"
     a, b = (f"front, {width} x 48 px, 75 deg, at 4 Hz" for width in (64, 96))
-    assert f"a sees by {a}; b by {b}: a difference may be the camera's" in told.notes
+    assert f"a sees by {a}; b by {b}: a difference may be the camera's" in comparison.notes
     assert not any("sees by" in note for note in compare_runs([runs / "a", large]).notes)
 
 
 def test_another_look_of_a_scan_is_reported(runs: Path, tmp_path: Path) -> None:
-    """Splats against mesh, other splats or another sun are named; equal looks are not."""
+    """Splats against mesh, other splats and another sun are named; equal looks are not."""
     looks = {
         "a": ScanLook(
             appearance="splats",
@@ -270,8 +276,7 @@ def test_another_look_of_a_scan_is_reported(runs: Path, tmp_path: Path) -> None:
 def test_a_run_with_injected_pedestrians_is_marked(
     runs: Path, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """In results.csv, below the table and in a comparison; a run without them has no such
-    column."""
+    """results.csv, table and comparison mark it, and a run without them has no such column."""
     injected = rewritten(
         runs / "a", tmp_path / "a", "s-001", injections=[{"tick": 3, "injection": EVE}]
     )
@@ -291,8 +296,7 @@ EVE = {"id": "eve", "path": [[4.0, 1.0], [4.0, -1.0]]}
 
 
 def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
-    """A copy of a run whose records have other fields. of: the scenario of the record, "" for all
-    of them."""
+    """A copy of a run with changed fields in the record of scenario `of`, or in all for ""."""
     with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
         for record in read_records(run):
             other = fields if of in ("", record.scenario.id) else {}
@@ -305,122 +309,139 @@ def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
 
 
 def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
-    """In every metric and group, without a verdict below five scenarios, and nothing flipped; of a
-    name twice the second has a number."""
-    told = compare_runs([runs / "a", runs / "a"])
-    enough, few = (told.differences[told.differences["n"].between(*of)] for of in ((5, 99), (1, 4)))
+    """No metric or group differs, below five scenarios there is no verdict, and a repeated name
+    gets a number."""
+    comparison = compare_runs([runs / "a", runs / "a"])
+    enough, few = (
+        comparison.differences[comparison.differences["n"].between(*of)] for of in ((5, 99), (1, 4))
+    )
     assert {*enough["verdict"]} == {"within noise"} and {*few["verdict"]} == {""}
     assert (enough[["difference", "low", "high"]] == 0.0).all(axis=None)
     assert few[["low", "high"]].isna().all(axis=None) and {*few["group"]} == {"test"}
-    assert not len(told.flipped) and told.notes == () and told.others[0].label == "a (2)"
-    said = cosim("compare", str(runs / "a"), str(runs / "a"))
-    assert said.returncode == 0 and "better" not in said.stdout and "worse" not in said.stdout
-    assert "solved by a (2) alone, 0: none" in said.stdout
+    assert (
+        not len(comparison.flipped)
+        and comparison.notes == ()
+        and comparison.others[0].label == "a (2)"
+    )
+    result = cosim("compare", str(runs / "a"), str(runs / "a"))
+    assert result.returncode == 0 and "better" not in result.stdout and "worse" not in result.stdout
+    assert "solved by a (2) alone, 0: none" in result.stdout
 
 
-def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> None:
-    """A crash counts as failed, and takes all else of its groups away, so that no metric with a
-    direction gains by it; an invalid episode is in no pair; both told."""
-    told = compare_runs([runs / "a", runs / "c"])
+def test_a_crashing_run_is_compared_at_its_worst_without_rates(runs: Path) -> None:
+    """A crash counts as failed and removes its groups' other metrics; an invalid episode is in no
+    pair; both are noted."""
+    comparison = compare_runs([runs / "a", runs / "c"])
     assert (
-        row(told, "success", after="c")["n"] == 19
-        and row(told, "success", after="c")["value_after"] == 9 / 19
+        row(comparison, "success", after="c")["n"] == 19
+        and row(comparison, "success", after="c")["value_after"] == 9 / 19
     )
     assert (
-        row(told, "failures_per_100m", after="c")["n"] == 0
-        and row(told, "failures_per_100m", "straight", "c")["n"] == 9
+        row(comparison, "failures_per_100m", after="c")["n"] == 0
+        and row(comparison, "failures_per_100m", "straight", "c")["n"] == 9
     )
-    assert not len(told.flipped)
-    whole = told.differences[told.differences["group"] == "s"].set_index("metric")
+    assert not len(comparison.flipped)
+    suite_rows = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
     ranked = [name for name, metric in METRICS.items() if metric.higher_is_better is not None]
-    assert {*whole.index[whole["n"] > 0].intersection(ranked)} == {*WORST}
-    assert "better" not in {*told.differences["verdict"]}
+    assert {*suite_rows.index[suite_rows["n"] > 0].intersection(ranked)} == {*WORST}
+    assert "better" not in {*comparison.differences["verdict"]}
     assert (
         "c: 1 crashed, counted as failed, with SR, RC, SPL and V of 0; groups with them have "
-        "neither rates nor other means" in told.notes
+        "neither rates nor other means" in comparison.notes
     )
     assert (
-        "c is not to be quoted: 1 of 20 scheduled episodes are invalid, more than 2 %" in told.notes
+        "c is not to be quoted: 1 of 20 scheduled episodes are invalid, more than 2 %"
+        in comparison.notes
     )
 
 
-def test_who_crashes_in_every_episode_is_better_in_nothing(runs: Path, tmp_path: Path) -> None:
-    """Against a policy that fails everywhere: no rate and no other mean, nothing better; SR as low,
-    route completion and speed lower."""
+def test_a_run_that_always_crashes_is_better_in_nothing(runs: Path, tmp_path: Path) -> None:
+    """Against a run that always fails it has no rates, nothing better, equal SR, and lower
+    completion and speed."""
     bad, crashing = (
-        run_of(tmp_path / how, [how] * 20, how, several(20)) for how in (HIT, "crashed")
+        run_of(tmp_path / how, [how] * 20, how, scenarios_of(20)) for how in (HIT, "crashed")
     )
-    told = compare_runs([bad, crashing])
-    assert {*told.differences["verdict"]} <= {"worse", "within noise", "too few", "differs", ""}
-    whole = told.differences[told.differences["group"] == "s"].set_index("metric")
-    assert whole.loc[["route_completion", "velocity_mean_mps"], "verdict"].eq("worse").all()
-    assert whole.loc["success", ["value_after", "verdict"]].tolist() == [0.0, "within noise"]
-    assert not len(told.flipped)
+    comparison = compare_runs([bad, crashing])
+    assert {*comparison.differences["verdict"]} <= {
+        "worse",
+        "within noise",
+        "too few",
+        "differs",
+        "",
+    }
+    suite_rows = comparison.differences[comparison.differences["group"] == "s"].set_index("metric")
+    assert suite_rows.loc[["route_completion", "velocity_mean_mps"], "verdict"].eq("worse").all()
+    assert suite_rows.loc["success", ["value_after", "verdict"]].tolist() == [0.0, "within noise"]
+    assert not len(comparison.flipped)
 
 
 def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
-    """CSV holds every metric in full; Markdown and LaTeX the tables that are printed; the same each
-    time."""
-    files = [tmp_path / f"told{end}" for end in (".csv", ".md", ".tex")]
+    """CSV has every metric in full, Markdown and LaTeX have the printed tables, reproducibly."""
+    files = [tmp_path / f"comparison{end}" for end in (".csv", ".md", ".tex")]
     words = [
         "compare",
         *(str(runs / name) for name in "abc"),
         *(w for file in files for w in ("-o", str(file))),
     ]
-    said = cosim(*words)
-    assert said.returncode == 0, said.stderr
+    result = cosim(*words)
+    assert result.returncode == 0, result.stderr
     assert (
-        "b (B) against a (A), suite s" in said.stdout
-        and "c (B) against a (A), suite s, by" in said.stdout
+        "b (B) against a (A), suite s" in result.stdout
+        and "c (B) against a (A), suite s, by" in result.stdout
     )
     assert re.search(
-        r"success +0\.50 +0\.90 +\+0\.400 +\+\d\.\d{3} to \+\d\.\d{3} +20 +better", said.stdout
+        r"success +0\.50 +0\.90 +\+0\.400 +\+\d\.\d{3} to \+\d\.\d{3} +20 +better", result.stdout
     )
     read = pd.read_csv(files[0], keep_default_na=False, na_values=[""])
-    told = compare_runs([runs / name for name in "abc"])
-    assert read["low"].dropna().tolist() == told.differences["low"].dropna().tolist() and len(
+    comparison = compare_runs([runs / name for name in "abc"])
+    assert read["low"].dropna().tolist() == comparison.differences["low"].dropna().tolist() and len(
         read
-    ) == len(told.differences)
+    ) == len(comparison.differences)
     assert (
-        pd.read_csv(tmp_path / "told.flipped.csv")["scenario"].tolist()
-        == told.flipped["scenario"].tolist()
+        pd.read_csv(tmp_path / "comparison.flipped.csv")["scenario"].tolist()
+        == comparison.flipped["scenario"].tolist()
     )
-    assert files[1].read_text() == as_markdown(told) and files[2].read_text() == as_latex(told)
+    assert files[1].read_text() == as_markdown(comparison) and files[2].read_text() == as_latex(
+        comparison
+    )
     assert not [*tmp_path.glob("*.part")]
 
 
 def test_below_five_scenarios_a_comparison_shows_counts(runs: Path) -> None:
-    """Four scenarios of `test`: solved of all, failures in metres, neither interval nor verdict, in
-    every format; the .csv has the counts of larger groups, too."""
-    told = compare_runs([runs / "a", runs / "b"])
-    of_test = row(told, "success", "test")
+    """Four scenarios of `test` have counts without interval or verdict in every format; the CSV
+    counts larger groups, too."""
+    comparison = compare_runs([runs / "a", runs / "b"])
+    of_test = row(comparison, "success", "test")
     assert (of_test["counts_before"], of_test["counts_after"]) == ("2/4", "4/4")
     assert np.isnan(of_test["low"]) and of_test["verdict"] == ""
-    (_, grouped) = tables_of_comparison(told, told.others[0])
+    (_, grouped) = tables_of_comparison(comparison, comparison.others[0])
     by_metric = {cells[1]: cells[2:] for cells in grouped.rows if cells[0] == "test"}
     assert by_metric["SR"] == ("2/4", "4/4", "-", "-", "4", "")
     assert by_metric["FC"] == ("2 in 24 m", "0 in 32 m", "-", "-", "4", "")
     assert by_metric["RC"][0] == "0.72" and by_metric["RC"][-3:] == ("-", "4", "")
-    assert "| test     | SR | 2/4 | 4/4 |" in re.sub(" +", " ", as_markdown(told)).replace(
+    assert "| test     | SR | 2/4 | 4/4 |" in re.sub(" +", " ", as_markdown(comparison)).replace(
         "| test |", "| test     |"
     )
-    assert "test & SR & 2/4 & 4/4 & - & - & 4 &" in as_latex(told)
-    assert row(told, "success")["counts_after"] == "18/20"
-    assert row(told, "route_completion")["counts_after"] == ""
+    assert "test & SR & 2/4 & 4/4 & - & - & 4 &" in as_latex(comparison)
+    assert row(comparison, "success")["counts_after"] == "18/20"
+    assert row(comparison, "route_completion")["counts_after"] == ""
 
 
 def test_names_are_escaped(runs: Path) -> None:
-    """A name of all that means something to LaTeX, Markdown or HTML ends no cell, begins no command
+    """A name of all special characters of LaTeX, Markdown and HTML ends no cell, starts no command,
     and is no tag."""
     odd = r"<script>_a&b|c$1%#{2}~^\input{x}*`d`[e](f)"
-    told = compare_runs([runs / "a", runs / "b"])
-    other = told.others[0]._replace(label=odd)
+    comparison = compare_runs([runs / "a", runs / "b"])
+    other = comparison.others[0]._replace(label=odd)
     frames = [
-        frame.replace({"b": odd, "frontal": odd}) for frame in (told.differences, told.flipped)
+        frame.replace({"b": odd, "frontal": odd})
+        for frame in (comparison.differences, comparison.flipped)
     ]
-    told = told._replace(others=(other,), differences=frames[0], flipped=frames[1], notes=(odd,))
-    tables = tables_of_comparison(told, other)
-    latex = as_latex(told)
+    comparison = comparison._replace(
+        others=(other,), differences=frames[0], flipped=frames[1], notes=(odd,)
+    )
+    tables = tables_of_comparison(comparison, other)
+    latex = as_latex(comparison)
     assert r"\input" not in latex.replace(r"\textbackslash{}input", "") and "<" not in latex
     assert "$+0.400$ & $+" in latex
     plain = re.sub(r"\\[&%$#_{}]|\\text\w+\{\}|\$[-+][\d.]+\$", "", latex)
@@ -429,7 +450,7 @@ def test_names_are_escaped(runs: Path) -> None:
     assert len(rows) == sum(len(table.rows) + 1 for table in tables)
     assert {line.count("&") for line in rows} == {len(table.heads) - 1 for table in tables}
     assert plain.count("{") == plain.count("}")
-    markdown = as_markdown(told)
+    markdown = as_markdown(comparison)
     assert "<script" not in markdown and "&lt;script&gt;" in markdown
     bars = [
         len(re.findall(r"(?<!\\)\|", line))
@@ -509,60 +530,57 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_cannot_be_compared_is_refused_in_one_line(
-    tmp_path: Path, cosim: Cosim, name: str
-) -> None:
-    """File or folder and the remedy are named, nothing is printed or written beside that; exit code
-    2."""
+def test_unreadable_runs_are_refused_in_one_line(tmp_path: Path, cosim: Cosim, name: str) -> None:
+    """File or folder and the remedy are named, no other output is printed or written, and the exit
+    code is 2."""
     first, run = (run_of(tmp_path / which, [GOALS, HIT], which) for which in ("first", "second"))
     spoil, words = BAD[name]
     spoil(run)
-    said = cosim("compare", str(first), str(run), "-o", str(tmp_path / "out.csv"))
-    assert said.returncode == 2 and not said.stdout and not (tmp_path / "out.csv").exists()
-    comparing, told = said.stderr.splitlines()
-    assert comparing == "comparing 2 runs ..." and told.startswith("error: ")
-    assert words.format(run=run, first=first) in told
+    result = cosim("compare", str(first), str(run), "-o", str(tmp_path / "out.csv"))
+    assert result.returncode == 2 and not result.stdout and not (tmp_path / "out.csv").exists()
+    comparing, error = result.stderr.splitlines()
+    assert comparing == "comparing 2 runs ..." and error.startswith("error: ")
+    assert words.format(run=run, first=first) in error
 
 
-def test_a_run_that_goes_on_is_not_compared(tmp_path: Path, cosim: Cosim) -> None:
-    """The process is named; one that was stopped and lacks episodes is compared in what it has, and
-    that is told."""
+def test_a_run_in_progress_is_not_compared(tmp_path: Path, cosim: Cosim) -> None:
+    """Its process is named; a stopped run is compared in its finished episodes, with a note."""
     first, run = (
         run_of(tmp_path / which, [GOALS, HIT, GOALS], which) for which in ("first", "second")
     )
     with hold(run):
-        said = cosim("compare", str(first), str(run))
-    assert said.returncode == 2 and f"{run} is in use by process {os.getpid()}" in said.stderr
+        result = cosim("compare", str(first), str(run))
+    assert result.returncode == 2 and f"{run} is in use by process {os.getpid()}" in result.stderr
     with closing(sqlite3.connect(run / "results.sqlite")) as database, database:
         database.execute("delete from episodes where scenario = 's-002'")
-    said = cosim("compare", str(first), str(run))
+    result = cosim("compare", str(first), str(run))
     assert (
-        said.returncode == 0
-        and "second is not to be quoted: 1 of 3 scheduled episodes have not ended" in said.stdout
+        result.returncode == 0
+        and "second is not to be quoted: 1 of 3 scheduled episodes have not ended" in result.stdout
     )
     assert (
         "scenarios that only one of both runs has are left out: 1 of first, 0 of second"
-        in said.stdout
+        in result.stdout
     )
 
 
-def test_wrong_words_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
-    """One run alone, a format that there is none of, a folder that cannot be written to."""
+def test_invalid_arguments_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
+    """A single run, an unknown format, and an unwritable folder are refused."""
     one, other = str(runs / "a"), str(runs / "b")
-    said = cosim("compare", one)
+    result = cosim("compare", one)
     assert (
-        said.returncode == 2
-        and "a comparison needs two runs or more: cosim compare RUN OTHER ..." in said.stderr
+        result.returncode == 2
+        and "a comparison needs two runs or more: cosim compare RUN OTHER ..." in result.stderr
     )
-    said = cosim("compare", one, other, "-o", "table.pdf")
+    result = cosim("compare", one, other, "-o", "table.pdf")
     assert (
-        said.returncode == 2
-        and "table.pdf: its name must end in .csv, .png, .md, .tex" in said.stderr
+        result.returncode == 2
+        and "table.pdf: its name must end in .csv, .png, .md, .tex" in result.stderr
     )
-    said = cosim("compare", one, other, "--by", "city")
-    assert said.returncode == 2 and "unknown axis of --by 'city'" in said.stderr
-    said = cosim("compare", one, other, "-o", str(tmp_path / "gone/table.md"))
+    result = cosim("compare", one, other, "--by", "city")
+    assert result.returncode == 2 and "unknown axis of --by 'city'" in result.stderr
+    result = cosim("compare", one, other, "-o", str(tmp_path / "gone/table.md"))
     assert (
-        said.returncode == 3
-        and "gone/table.md: cannot be written: No such file or directory" in said.stderr
+        result.returncode == 3
+        and "gone/table.md: cannot be written: No such file or directory" in result.stderr
     )

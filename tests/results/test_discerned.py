@@ -1,4 +1,5 @@
-"""Discerned: pairs of an event and its decoy, in tables, comparisons, reports and files."""
+"""The metric discerned (D): pairs of an event and its decoy, in tables, comparisons, reports and
+files."""
 
 from __future__ import annotations
 
@@ -47,14 +48,14 @@ STATIC = short_way("static-000", suite="reactive", structure="static")
 EVERY = (*PAIRS, STATIC)
 """Five events of two kinds, each followed by its decoy; and one scenario without an event."""
 MIXED = [GOAL, GOAL, GOAL, HIT, HIT, GOAL, GOAL, "crashed", "invalid", GOAL]
-"""Of `lateral`: both solved; either unsolved; a decoy that crashed; an event that is invalid."""
+"""Outcomes of pairs of `lateral`: both solved; either unsolved; a decoy that crashed; an event that is invalid."""
 FRONTAL = [GOAL, GOAL] * 3 + [GOAL, "invalid"] + [HIT, HIT]
-"""Of `frontal`: three pairs solved, one with an invalid decoy, one unsolved."""
+"""Outcomes of pairs of `frontal`: three pairs solved, one with an invalid decoy, one unsolved."""
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`a` as above; `b` solves all; `events` is of the former suite, without decoys."""
+    """Runs: `a` as above, `b` solves everything, `events` is of the former suite without decoys."""
     folder = tmp_path_factory.mktemp("runs")
     run_of(folder / "a", [*MIXED, *FRONTAL, GOAL], "a", EVERY)
     run_of(folder / "b", [GOAL] * 21, "b", EVERY)
@@ -67,32 +68,32 @@ def table(run: Path) -> pd.DataFrame:
 
 
 def test_a_pair_counts_only_if_both_are_solved(runs: Path) -> None:
-    """One of four of `lateral`, a crash is unsolved, a pair with an invalid member is left out and
-    counted; three of four of `frontal`; D of the run is over both, whatever is not paired."""
-    whole = table(runs / "a")
+    """Crashes count as unsolved, pairs with an invalid member are excluded and counted, and D is
+    over all pairs."""
+    episodes = table(runs / "a")
     for kind, mean in (("lateral", 0.25), ("frontal", 0.75)):
-        part = whole[whole["structure"] == kind]
+        part = episodes[episodes["structure"] == kind]
         found = summary_of(part, ["discerned"]).loc["discerned"]
         assert (found["mean"], found["n"]) == (mean, 4)
         assert episode_pairs(part).in_words == "4 pairs; left out: 1 with an invalid member"
-    found = summary_of(whole).loc["discerned"]
+    found = summary_of(episodes).loc["discerned"]
     assert (found["mean"], found["low"], found["high"], found["n"]) == (0.5, *wilson(4.0, 8), 8)
     assert summary_of(table(runs / "b")).loc["discerned", ["mean", "n"]].tolist() == [1.0, 10]
 
 
 def test_every_other_mean_is_over_scenarios_without_decoys(runs: Path) -> None:
-    """The rows of the events alone give the same: a crash of a decoy takes no rate away."""
-    whole = table(runs / "a")
-    events = whole[whole["decoy_of"] == ""]
-    summary = summary_of(whole).drop("discerned")
+    """The rows of the events alone give the same values, so that a decoy's crash removes no rate."""
+    episodes = table(runs / "a")
+    events = episodes[episodes["decoy_of"] == ""]
+    summary = summary_of(episodes).drop("discerned")
     pd.testing.assert_frame_equal(summary, summary_of(events))
     assert summary.loc["success"].tolist()[3] == 10 and summary.loc["failures_per_100m", "n"] == 10
 
 
 def test_without_the_other_member_there_is_no_pair(runs: Path) -> None:
     """D of events alone, of decoys alone and of halves is absent, not 0; halves are counted."""
-    whole = table(runs / "b")
-    events, decoys = whole[whole["decoy_of"] == ""], whole[whole["decoy_of"] != ""]
+    episodes = table(runs / "b")
+    events, decoys = episodes[episodes["decoy_of"] == ""], episodes[episodes["decoy_of"] != ""]
     assert "discerned" not in summary_of(events).index
     alone = summary_of(decoys).loc[["discerned", "success"]]
     assert alone["n"].tolist() == [0, 0] and alone["mean"].isna().all()
@@ -102,19 +103,18 @@ def test_without_the_other_member_there_is_no_pair(runs: Path) -> None:
     assert summary_of(nothing).loc["discerned", "n"] == 0
 
 
-def test_files_say_whose_decoy_an_episode_is(runs: Path) -> None:
+def test_files_record_the_event_of_a_decoy(runs: Path) -> None:
     """record.json and results.csv have the column, so that no table needs the suite."""
-    told = json.loads((runs / "a/episodes/lateral-000-decoy/record.json").read_bytes())
-    assert told["decoy_of"] == "lateral-000"
+    fields = json.loads((runs / "a/episodes/lateral-000-decoy/record.json").read_bytes())
+    assert fields["decoy_of"] == "lateral-000"
     rows = pd.read_csv(runs / "a/results.csv").set_index("scenario")["decoy_of"]
     assert rows["lateral-000-decoy"] == "lateral-000" and pd.isna(rows["lateral-000"])
 
 
 def test_a_run_shows_d_beside_sr(runs: Path, cosim: Cosim) -> None:
-    """Over all, per kind with the number of pairs, and what was left out; without decoys nothing
-    of it."""
-    said = cosim("show", str(runs / "a"))
-    lines = [" ".join(line.replace("│", " ").split()) for line in said.stdout.splitlines()]
+    """D is shown over all and per kind with its pairs and exclusions, and not without decoys."""
+    result = cosim("show", str(runs / "a"))
+    lines = [" ".join(line.replace("│", " ").split()) for line in result.stdout.splitlines()]
     text = " ".join(" ".join(lines).split())
     assert any(line.startswith("discerned (D) 0.50") and line.endswith("8") for line in lines)
     assert "decoys count in D alone, over 8 pairs; left out: 2 with an invalid member" in text
@@ -122,30 +122,30 @@ def test_a_run_shows_d_beside_sr(runs: Path, cosim: Cosim) -> None:
     assert "of all rows 10 are decoys" in text
     assert any(line.startswith("lateral 4 3/4 - 1/4 - 4") for line in lines), lines
     assert "decoy" not in cosim("show", str(runs / "events")).stdout.replace("of decoys: go", "")
-    said = cosim("show", str(runs / "a"), "--episode", "lateral-000-decoy")
-    assert said.stdout.startswith("lateral-000-decoy (decoy of lateral-000): done goal"), said
+    result = cosim("show", str(runs / "a"), "--episode", "lateral-000-decoy")
+    assert result.stdout.startswith("lateral-000-decoy (decoy of lateral-000): done goal"), result
 
 
 def test_a_comparison_pairs_the_pairs(runs: Path, tmp_path: Path) -> None:
-    """The difference of D is over pairs that both runs have, for the suite and each kind; SR is
-    over events; the exports have it."""
-    told = compare_runs([runs / "a", runs / "b"])
-    rows = told.differences.set_index(["metric", "group"])
-    whole = rows.loc[("discerned", "reactive")]
-    assert (whole["n"], whole["value_before"], whole["value_after"]) == (8, 0.5, 1.0)
+    """D is compared over common pairs, for the suite and each kind; SR is over events; exports have
+    both."""
+    comparison = compare_runs([runs / "a", runs / "b"])
+    rows = comparison.differences.set_index(["metric", "group"])
+    suite_row = rows.loc[("discerned", "reactive")]
+    assert (suite_row["n"], suite_row["value_before"], suite_row["value_after"]) == (8, 0.5, 1.0)
     assert rows.loc[("discerned", "lateral"), "changed"] == 3
     assert (
         rows.loc[("success", "reactive"), "n"] == 10 and rows.loc[("success", "static"), "n"] == 1
     )
-    assert "a: D is over 8 pairs; left out: 2 with an invalid member" in told.notes
-    for text in (as_markdown(told), as_latex(told)):
+    assert "a: D is over 8 pairs; left out: 2 with an invalid member" in comparison.notes
+    for text in (as_markdown(comparison), as_latex(comparison)):
         assert "discerned" in text and "D share of events solved with their decoys" in text
         assert any("lateral" in line and " D " in line for line in text.splitlines())
 
 
 def test_a_report_has_d_in_tables_and_a_plot(runs: Path) -> None:
-    """In the summary beside SR, in a table and a plot by event without `static`; decoys are a bar
-    of their own among the endings."""
+    """It is beside SR and in a plot by event without `static`, and decoys have their own bar of
+    endings."""
     reported = read_runs([runs / "a", runs / "b"])
     colours = colours_of(reported)
     summary = summary_table(reported, colours)
@@ -168,8 +168,8 @@ def test_a_report_has_d_in_tables_and_a_plot(runs: Path) -> None:
 
 
 def refused(runs: Sequence[Path], target: Path) -> dict[str, str]:
-    """What a comparison, a report and a merge of runs say."""
-    said = {}
+    """Return the refusals of a comparison, a report and a merge of runs."""
+    refusals = {}
     for name, of in (
         ("compare", lambda: compare_runs(runs)),
         ("report", lambda: read_runs(runs)),
@@ -177,23 +177,22 @@ def refused(runs: Sequence[Path], target: Path) -> dict[str, str]:
     ):
         with pytest.raises(RunError) as caught:
             of()
-        said[name] = str(caught.value)
-    return said
+        refusals[name] = str(caught.value)
+    return refusals
 
 
 def test_runs_of_the_former_suite_are_refused(runs: Path, tmp_path: Path) -> None:
-    """A suite without decoys is another one: refused by comparison, report and merge, with both
-    hashes or the field that is apart."""
-    said = refused([runs / "b", runs / "events"], tmp_path / "merged")
-    assert "run both on the same version of it (former suite, edited" in said["compare"]
-    assert "are of different suites 'reactive'" in said["report"]
-    assert "its suite_hash is" in said["merge"]
+    """Comparison, report and merge refuse a suite without decoys, with both hashes or the differing
+    field."""
+    refusals = refused([runs / "b", runs / "events"], tmp_path / "merged")
+    assert "run both on the same version of it (former suite, edited" in refusals["compare"]
+    assert "are of different suites 'reactive'" in refusals["report"]
+    assert "its suite_hash is" in refusals["merge"]
     assert not (tmp_path / "merged").exists()
 
 
-def test_a_decoy_of_nothing_is_refused_in_a_whole_suite_alone(tmp_path: Path) -> None:
-    """A part of a suite, as in a run folder, may lack the event; a suite's file may not. No decoy
-    has a decoy, and one that ends at a stop has no go-on rule."""
+def test_a_decoy_without_its_event_is_refused_in_a_suite_file_only(tmp_path: Path) -> None:
+    """A part of a suite may lack the event; decoys of decoys and go-on rules at stops are refused."""
     part = Suite(name="reactive", version="1", scenarios=PAIRS[1:])
     write_suite(part, tmp_path / "s.json")
     assert len(read_suite(tmp_path / "s.json").scenarios) == 19

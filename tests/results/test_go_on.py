@@ -1,4 +1,4 @@
-"""The go-on rule of decoys: where its window ends, what breaks it, and how a record is checked."""
+"""The go-on rule of decoys: the end of its window, its violations, and the check of a record."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ EVENT = Event(
 def window_end(
     kind: str, robot_mps: float, person: Callable[[float], float | None], **fields: object
 ) -> int | None:
-    """The tick after the window of a robot from 8 m on; person: arc length at a time, None for
-    gone."""
+    """Return the tick after the window of a robot from 8 m on; `person` gives arc length at a time,
+    None for gone."""
     event = msgspec.structs.replace(EVENT, **fields)
     window = PassingWindow(ROUTE, event, EVENT_KINDS[kind])
     for tick in range(200):
@@ -44,17 +44,17 @@ def window_end(
 
 
 def test_the_window_ends_one_metre_past_the_person() -> None:
-    """Of one who stands at 10 m: at 11 m, after 60 ticks of 0.05 m; of one who walks on ahead,
-    never; of one who leaves the street, then."""
+    """It ends at 11 m for a person at 10 m, never for one who walks ahead, and when one leaves the
+    street."""
     assert window_end("lateral", 1.0, lambda s: 10.0) == 60
     assert window_end("lateral", 1.0, lambda s: 10.0 + 1.2 * s) is None
     assert window_end("lateral", 1.0, lambda s: None if s > 2.0 else 10.0 + s) == 41
     assert window_end("lateral", 0.1, lambda s: 10.0) is None
 
 
-def test_the_window_of_one_who_overtakes_ends_by_the_robots_place_alone() -> None:
-    """7.8 m after the trigger, 1 m behind the event: at 18.8 m, wherever the person is or whether
-    there still is one. A trigger of the scenario's own decides like the kind's."""
+def test_the_window_of_an_overtaking_person_ends_by_the_robots_place() -> None:
+    """It ends at 18.8 m wherever the person is, and a trigger of the scenario's own counts like the
+    kind's."""
     places: list[Callable[[float], float | None]] = [lambda s: 7.0 + 2.0 * s, lambda s: None]
     for place in places:
         assert window_end("overtaking", 2.0, place) == 108
@@ -62,9 +62,9 @@ def test_the_window_of_one_who_overtakes_ends_by_the_robots_place_alone() -> Non
         assert window_end("overtaking", 0.9, place) is None
 
 
-def test_no_motion_gives_way_and_goes_on() -> None:
-    """Of 500 random motions, with and without stops, at limits that the mean speed exceeds or not:
-    each that passes meets the rule of the event or of the decoy, one that does not pass neither."""
+def test_no_motion_meets_both_the_event_rule_and_the_go_on_rule() -> None:
+    """Of 500 random motions each that passes the person meets exactly one rule, and one that does
+    not pass neither."""
     rng = np.random.default_rng(29)
     decoy = msgspec.structs.replace(EVENT, kind="overtaking", decoy=True)
     event = msgspec.structs.replace(decoy, decoy=False)
@@ -92,7 +92,7 @@ def test_no_motion_gives_way_and_goes_on() -> None:
 
 
 def test_mean_speed_and_stops_are_those_of_the_window() -> None:
-    """Ticks before and after it count neither; backwards is slower than a stop; 0.45 s is none."""
+    """Ticks outside do not count, backwards is slower than a stop, and 0.45 s is no stop."""
     v_mps = np.array([0.0] * 20 + [2.0] * 10 + [0.0] * 9 + [2.0] * 21 + [0.0] * 40)
     route_s_m = np.cumsum(v_mps) * 0.05
     assert passing_of(route_s_m, v_mps, 0.05, 20, 60) == pytest.approx((3.1 / 2.0, 0.45))
@@ -105,14 +105,14 @@ def test_mean_speed_and_stops_are_those_of_the_window() -> None:
 
 
 def shipped() -> Scenario:
-    """A decoy of `reactive`: a person beside the way shows another gesture. The fences, which a
-    robot that drives straight ahead hits, are left out, and slow robots have the time."""
+    """A decoy of `reactive` with another gesture, without fences, and with more time for slow
+    robots."""
     (one,) = (s for s in load_suite("reactive").scenarios if s.id == "gesturing-064-decoy")
     return msgspec.structs.replace(one, obstacles=(), time_limit_s=60.0)
 
 
 def drive(scenario: Scenario, speed: Callable[[float, float], float]) -> tuple[Record, Log]:
-    """An episode at a speed by time, s, and arc length, m, straight ahead."""
+    """Drive an episode straight ahead at a speed by time, s, and arc length, m."""
     with Episode(scenario, Manifest("ahead", camera=None)) as episode:
         episode.reset()
         while not episode.over:
@@ -122,9 +122,9 @@ def drive(scenario: Scenario, speed: Callable[[float, float], float]) -> tuple[R
 
 
 @pytest.mark.engine
-def test_a_decoy_is_solved_by_going_on_and_by_nothing_else() -> None:
-    """At 1.2 m/s it is; a stop breaks the rule at any mean speed, a crawl without a stop, too. All
-    reach the goal in time without a failure, and the files say the same."""
+def test_a_decoy_is_solved_only_by_going_on() -> None:
+    """1.2 m/s solves it; a stop at any mean speed and a crawl break the rule though they reach the
+    goal; the files agree."""
     scenario = shipped()
     (event,) = scenario.events
     record, log = drive(scenario, lambda time_s, s_m: 1.2)
@@ -176,8 +176,8 @@ def test_a_decoy_is_solved_by_going_on_and_by_nothing_else() -> None:
 
 @pytest.mark.engine
 def test_a_robot_that_never_passes_has_not_gone_on() -> None:
-    """It stays before the person until the time is over: no window ends, and the rule is not
-    met; without the rule it is none."""
+    """A robot that stays before the person does not meet the rule; without the rule there is no
+    result."""
     scenario = msgspec.structs.replace(shipped(), time_limit_s=9.0)
     (event,) = scenario.events
     waits = lambda time_s, s_m: 0.0 if s_m > event.route_s_m - 3.0 else 1.5  # noqa: E731
@@ -191,8 +191,8 @@ def test_a_robot_that_never_passes_has_not_gone_on() -> None:
 
 @pytest.mark.engine
 def test_a_decoy_that_the_robot_never_saw_is_not_solved() -> None:
-    """The same rule as for an event: the goal without a failure, and a gesture that begins beside
-    the robot, where its camera does not look."""
+    """As for an event, reaching the goal does not count when the gesture begins outside the
+    camera's view."""
     scenario = shipped()
     unseen = msgspec.structs.replace(scenario.events[0], trigger_m=0.2)
     scenario = msgspec.structs.replace(scenario, events=(unseen,))

@@ -1,4 +1,4 @@
-"""Intervals against published values, and counts where there are too few episodes for them."""
+"""Intervals against published values, and counts where there are too few episodes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from cosim.results.table import estimate_of
     ],
 )
 def test_wilson_is_as_published(counted: int, n: int, low: float, high: float) -> None:
-    """The four cases of Newcombe (1998), table I, method 3, and the same formula by hand."""
+    """The four cases of Newcombe (1998), table I, method 3, agree, and the same formula by hand."""
     assert wilson(counted, n) == pytest.approx((low, high), abs=6e-5)
 
 
@@ -48,12 +48,12 @@ def test_wilson_is_as_published(counted: int, n: int, low: float, high: float) -
     ],
 )
 def test_garwood_is_as_published(counted: int, low: float, high: float) -> None:
-    """Exact limits of a Poisson count, as in the tables of the method."""
+    """Exact limits of a Poisson count equal the published tables."""
     assert garwood(counted) == pytest.approx((low, high), abs=6e-5)
 
 
-def test_the_interval_of_a_share_covers_what_is_true() -> None:
-    """Of 20 episodes with a true share of 0.02 to 0.98, in 93 of 100 runs on the mean."""
+def test_the_interval_of_a_share_covers_the_true_share() -> None:
+    """For 20 episodes with true shares of 0.02 to 0.98 it does so in 93 to 97 of 100 runs."""
     rng = np.random.default_rng(5)
     true = rng.uniform(0.02, 0.98, 4000)
     bounds = [wilson(k, 20) for k in rng.binomial(20, true).tolist()]
@@ -61,9 +61,9 @@ def test_the_interval_of_a_share_covers_what_is_true() -> None:
     assert 0.93 <= np.mean(covered) <= 0.97
 
 
-def test_a_rate_with_few_failures_has_the_exact_interval_and_one_with_more_is_drawn() -> None:
-    """Three failures on 1000 m: Garwood's limits by ten; at RARE failures the episodes are drawn
-    again."""
+def test_a_rate_has_an_exact_interval_for_few_failures_else_a_bootstrap() -> None:
+    """Three failures on 1000 m give Garwood's limits by ten; from RARE failures on episodes are
+    resampled."""
     counts, metres = np.array([1.0, 0.0, 2.0, 0.0, 0.0]), np.full(5, 200.0)
     few = estimate_of_rate(counts, metres)
     assert (few.mean, few.n, few.counted, few.metres) == (0.3, 5, 3.0, 1000.0)
@@ -76,12 +76,12 @@ def test_a_rate_with_few_failures_has_the_exact_interval_and_one_with_more_is_dr
     assert (drawn.low, drawn.high) != pytest.approx([c / 10 for c in garwood(RARE)])
 
 
-def test_means_are_drawn_again() -> None:
-    """Of values it is the bootstrap of their mean; with equal weights the same."""
+def test_means_have_a_bootstrap_interval() -> None:
+    """It is the bootstrap of the mean of values, and with equal weights the same."""
     values = np.array([0.0, 0.5, 1.0, 1.0, 0.2, 1.0])
-    one = estimate_of_mean(values)
-    assert (one.low, one.high) == bootstrap(values) == bootstrap(values, np.ones(6))
-    assert 0.0 <= one.low < values.mean() < one.high <= 1.0
+    unweighted = estimate_of_mean(values)
+    assert (unweighted.low, unweighted.high) == bootstrap(values) == bootstrap(values, np.ones(6))
+    assert 0.0 <= unweighted.low < values.mean() < unweighted.high <= 1.0
 
 
 @pytest.mark.parametrize("n", range(MIN_N + 1))
@@ -107,7 +107,7 @@ def test_below_five_episodes_there_are_only_counts(n: int) -> None:
 
 
 def test_metrics_have_the_interval_of_their_kind() -> None:
-    """Success is a share by its definition; a route completion of 0 or 1 throughout is none."""
+    """Success is a share by definition, and a route completion of only 0 and 1 is not."""
     values = [1.0, 1.0, 1.0, 1.0, 0.0, 1.0]
     table = pd.DataFrame({"status": "done", "success": values, "route_completion": values})
     success, completion = (estimate_of(table, name) for name in ("success", "route_completion"))

@@ -1,4 +1,4 @@
-"""Shards of a run, and the run that is made of them."""
+"""Shards of a run, and the run merged from them."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ HOWS = {
 }
 
 
-def kept(path: Path, spec: RunSpec, ways: Sequence[Scenario], wall_s: float = 1.0) -> Path:
-    """A run folder that has come to the end of these scenarios, after so many seconds each."""
+def finished_run(path: Path, spec: RunSpec, ways: Sequence[Scenario], wall_s: float = 1.0) -> Path:
+    """A run folder with these finished scenarios, after so many seconds each."""
     with RunFolder.create(path, spec, SUITE) as folder:
         for way in reversed(ways):
             record, log = episode_of(way, SUITE.content_hash, HOWS[way.id])
@@ -44,11 +44,10 @@ def kept(path: Path, spec: RunSpec, ways: Sequence[Scenario], wall_s: float = 1.
 
 
 def shards(folder: Path, of: int, **fields: object) -> list[Path]:
-    """All shards of the run, each in a folder of its own. fields: what is otherwise in all of
-    them."""
+    """All shards of the run, each in its own folder; `fields` change run.json of all."""
     cut = [Shard(number, of) for number in range(1, of + 1)]
     return [
-        kept(folder / f"{one.number}", changed(SPEC, shard=one, **fields), one.select(WAYS))
+        finished_run(folder / f"{one.number}", changed(SPEC, shard=one, **fields), one.select(WAYS))
         for one in cut
     ]
 
@@ -62,23 +61,23 @@ def bytes_of(*folders: Path) -> dict[Path, bytes]:
     }
 
 
-def whole_table(folder: Path) -> bytes:
-    """results.csv of the same run in one piece."""
-    with RunFolder.resume(kept(folder / "whole", SPEC, WAYS), SPEC) as held:
-        held.finish()
+def undivided_table(folder: Path) -> bytes:
+    """Return results.csv of the same run without shards."""
+    with RunFolder.resume(finished_run(folder / "whole", SPEC, WAYS), SPEC) as run:
+        run.finish()
     return (folder / "whole/results.csv").read_bytes()
 
 
 @pytest.mark.parametrize("of", [1, 3, 7])
-def test_shards_are_merged_to_the_run_that_they_are_of(tmp_path: Path, of: int) -> None:
-    """Cut in any way: the same run.json, scenarios.json and results.csv, the same records; the
-    shards are untouched."""
+def test_merged_shards_equal_the_undivided_run(tmp_path: Path, of: int) -> None:
+    """For any division run.json, scenarios.json, results.csv and records are the same, and the
+    shards are unchanged."""
     parts = shards(tmp_path, of)
     (parts[0] / "logs/worker-0.log").write_text("what it printed")
     before = bytes_of(*parts)
     merged = merge_runs(parts, tmp_path / "deep/merged", ignore)
     assert bytes_of(*parts) == before and (merged.missing, merged.twice) == ((), ())
-    assert (tmp_path / "deep/merged/results.csv").read_bytes() == whole_table(tmp_path)
+    assert (tmp_path / "deep/merged/results.csv").read_bytes() == undivided_table(tmp_path)
     for name in (
         "run.json",
         "scenarios.json",
@@ -93,7 +92,7 @@ def test_shards_are_merged_to_the_run_that_they_are_of(tmp_path: Path, of: int) 
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["merged"]
 
 
-def test_a_shard_that_was_killed_is_read_as_it_lies(tmp_path: Path) -> None:
+def test_a_killed_shard_is_read_without_changes(tmp_path: Path) -> None:
     """A merge reads a killed shard completely and changes none of its bytes."""
     parts = shards(tmp_path, 2)
     with closing(sqlite3.connect(parts[0] / "results.sqlite")) as database:
@@ -108,27 +107,26 @@ def test_a_shard_that_was_killed_is_read_as_it_lies(tmp_path: Path) -> None:
     )
 
 
-def test_what_is_missing_is_named_and_can_be_run(tmp_path: Path, cosim: Cosim) -> None:
-    """A merge without one shard says which scenarios it lacks, writes no results.csv, and is a run
-    to be resumed."""
+def test_missing_scenarios_are_named_and_can_be_run(tmp_path: Path, cosim: Cosim) -> None:
+    """A merge without one shard names its scenarios, writes no results.csv, and can be resumed."""
     parts = shards(tmp_path, 3)
-    said = cosim("merge", str(parts[0]), str(parts[2]), "--out", str(tmp_path / "merged"))
-    assert said.returncode == 1
+    result = cosim("merge", str(parts[0]), str(parts[2]), "--out", str(tmp_path / "merged"))
+    assert result.returncode == 1
     assert (
         "2 scenarios are missing: s-001, s-004: give the command of the run without --shard"
-        in said.stderr
+        in result.stderr
     )
     assert not (tmp_path / "merged/results.csv").exists()
     with RunFolder.resume(tmp_path / "merged", SPEC) as folder:
         assert folder.finished_ids() == set(SPEC.scenarios) - {"s-001", "s-004"}
 
 
-def test_equal_episodes_are_taken_once(tmp_path: Path) -> None:
-    """Wall times and compression may differ; nothing else does."""
-    parts = [*shards(tmp_path, 2), kept(tmp_path / "again", SPEC, WAYS[2:5], wall_s=9.0)]
+def test_equal_episodes_are_merged_once(tmp_path: Path) -> None:
+    """Wall times and compression may differ, and nothing else."""
+    parts = [*shards(tmp_path, 2), finished_run(tmp_path / "again", SPEC, WAYS[2:5], wall_s=9.0)]
     merged = merge_runs(parts, tmp_path / "merged", ignore)
     assert merged.twice == ("s-002", "s-003", "s-004")
-    assert (tmp_path / "merged/results.csv").read_bytes() == whole_table(tmp_path)
+    assert (tmp_path / "merged/results.csv").read_bytes() == undivided_table(tmp_path)
 
 
 @pytest.mark.parametrize("what", ["record", "trajectory"])
@@ -146,12 +144,12 @@ def test_different_episodes_of_a_scenario_are_a_conflict(
         else:
             log.pose[0, 2] += 1e-16
         folder.write_episode(record, log.encoded())
-    said = cosim("merge", *map(str, parts), str(other), "--out", str(tmp_path / "merged"))
-    assert said.returncode == 2 and not (tmp_path / "merged").exists()
-    assert f"CONFLICT: {other} and {parts[0]} have different episodes of 's-002'" in said.stderr
+    result = cosim("merge", *map(str, parts), str(other), "--out", str(tmp_path / "merged"))
+    assert result.returncode == 2 and not (tmp_path / "merged").exists()
+    assert f"CONFLICT: {other} and {parts[0]} have different episodes of 's-002'" in result.stderr
     assert (
         "state_hash is 'f00'" if what == "record" else "trajectory.npz is another one"
-    ) in said.stderr
+    ) in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -181,22 +179,23 @@ def test_folders_of_different_runs_are_refused(
     tmp_path: Path, cosim: Cosim, field: str, value: object, words: str
 ) -> None:
     """The field and both values are named, and nothing is written."""
-    mine = kept(tmp_path / "mine", msgspec.structs.replace(SPEC, shard=Shard(1, 2)), WAYS[:1])
-    theirs = kept(
+    mine = finished_run(
+        tmp_path / "mine", msgspec.structs.replace(SPEC, shard=Shard(1, 2)), WAYS[:1]
+    )
+    theirs = finished_run(
         tmp_path / "theirs", changed(SPEC, shard=Shard(2, 2), **{field: value}), WAYS[1:2]
     )
-    said = cosim("merge", str(mine), str(theirs), "--out", str(tmp_path / "merged"))
+    result = cosim("merge", str(mine), str(theirs), "--out", str(tmp_path / "merged"))
     assert (
-        said.returncode == 2
-        and f"{theirs} is of another run than {mine}" in said.stderr
-        and words in said.stderr
+        result.returncode == 2
+        and f"{theirs} is of another run than {mine}" in result.stderr
+        and words in result.stderr
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "theirs"]
 
 
-def test_what_is_damaged_in_use_or_in_the_way_is_refused(tmp_path: Path) -> None:
-    """A folder without a run, one that is written to, a truncated record, a target that is
-    there."""
+def test_damaged_busy_and_existing_folders_are_refused(tmp_path: Path) -> None:
+    """They are a folder without a run, one in use, a truncated record, and an existing target."""
     parts = shards(tmp_path, 2)
     with pytest.raises(UsageError, match="unknown run"):
         merge_runs([*parts, tmp_path / "nothing"], tmp_path / "merged", ignore)
@@ -215,7 +214,7 @@ def test_what_is_damaged_in_use_or_in_the_way_is_refused(tmp_path: Path) -> None
 
 
 def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
-    """Another one, or the whole run, is refused: the shards are named as they are asked for."""
+    """Another shard, or the whole run, is refused with the shards in the form of the option."""
     (first, _) = shards(tmp_path, 2)
     with pytest.raises(RunError, match="its shard is 1/2, and this command has 2/2"):
         RunFolder.resume(first, msgspec.structs.replace(SPEC, shard=Shard(2, 2)))
@@ -226,15 +225,14 @@ def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "words", ["0/2", "3/2", "1", "1/0", "-1/2", "a/b", "1/2/3", "²/3"], ids=ascii
 )
-def test_a_shard_that_is_none_is_refused(words: str) -> None:
-    """In one line that says how it is written."""
+def test_an_invalid_shard_is_refused(words: str) -> None:
+    """One line says how it is written."""
     with pytest.raises(UsageError, match="give i/n, with i from 1 to n"):
         Shard.parse(words, 100)
 
 
-def test_shards_share_out_every_scenario_once() -> None:
-    """Whatever they are cut in; of more shards than scenarios some would be empty, which is
-    refused."""
+def test_every_scenario_is_in_exactly_one_shard() -> None:
+    """This holds for any number of shards; more shards than scenarios are refused."""
     for of in range(1, 8):
         cut = [Shard.parse(f"{number}/{of}", 7).select(range(7)) for number in range(1, of + 1)]
         assert sorted(itertools.chain(*cut)) == list(range(7)) and all(cut)
@@ -243,18 +241,18 @@ def test_shards_share_out_every_scenario_once() -> None:
 
 
 def test_a_shard_needs_the_seed_of_its_run(cosim: Cosim) -> None:
-    """Drawn anew for each shard it would be another run's."""
-    said = cosim("run", "reactive", "--policy", "straight", "--shard", "1/2")
-    assert said.returncode == 2 and "--shard needs --seed: shards are of one run" in " ".join(
-        said.stderr.split()
+    """A seed drawn for each shard would give another run."""
+    result = cosim("run", "reactive", "--policy", "straight", "--shard", "1/2")
+    assert result.returncode == 2 and "--shard needs --seed: shards are of one run" in " ".join(
+        result.stderr.split()
     )
 
 
 def test_a_finished_run_is_a_shard_too(tmp_path: Path) -> None:
-    """The parts of a run that was begun on two machines without shards are merged all the same."""
-    whole = run_of(tmp_path / "a", ["goal", "hit"])
-    merged = merge_runs([whole], tmp_path / "merged", ignore)
+    """Parts of a run from two machines without shards are merged, too."""
+    run = run_of(tmp_path / "a", ["goal", "hit"])
+    merged = merge_runs([run], tmp_path / "merged", ignore)
     assert (
         merged.missing == ()
-        and (tmp_path / "merged/results.csv").read_bytes() == (whole / "results.csv").read_bytes()
+        and (tmp_path / "merged/results.csv").read_bytes() == (run / "results.csv").read_bytes()
     )

@@ -16,7 +16,7 @@ from tests.logs import log_with
 def log(
     s_m: list[float], *, resets: dict[int, float] | None = None, person_m: float = np.inf
 ) -> Log:
-    """A robot on the x axis that is at s_m after each tick; the first tick begins at 0."""
+    """The log of a robot on the x axis at s_m after each tick; the first tick begins at 0."""
     s = np.array(s_m)
     n = len(s)
     reset = np.full(n, np.nan)
@@ -43,13 +43,13 @@ def failure(kind: str, other_kind: str = "") -> Failure:
 
 
 def episode(
-    one: Log, *failures: Failure, ended: str = "timeout", length_m: float = 100.0
+    trajectory: Log, *failures: Failure, ended: str = "timeout", length_m: float = 100.0
 ) -> EpisodeFacts:
-    return EpisodeFacts(one, failures, 0, ended, length_m)  # type: ignore[arg-type]
+    return EpisodeFacts(trajectory, failures, 0, ended, length_m)  # type: ignore[arg-type]
 
 
 def test_a_clean_drive_to_the_goal() -> None:
-    """100 m at 1 m/s in 2,000 ticks, nobody near: the textbook values."""
+    """100 m at 1 m/s in 2,000 ticks without people give the textbook values."""
     measures = compute_metrics(episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal"))
     expected = {
         "success": 1.0,
@@ -72,16 +72,15 @@ def test_a_clean_drive_to_the_goal() -> None:
 
 
 def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
-    """40 m there and 20 m back, two collisions and a freezing: 3 failures on 60 m travelled and on
-    40 m of progress."""
-    there = [0.1 * (i + 1) for i in range(400)]
+    """40 m forward and 20 m back with 3 failures give 3 on 60 m travelled and on 40 m of progress."""
+    forward = [0.1 * (i + 1) for i in range(400)]
     back = [40.0 - 0.1 * (i + 1) for i in range(200)]
     failures = (
         failure("collision", "pedestrian"),
         failure("collision", "vehicle"),
         failure("freezing"),
     )
-    measures = compute_metrics(episode(log(there + back), *failures))
+    measures = compute_metrics(episode(log(forward + back), *failures))
     assert measures["path_length_m"] == pytest.approx(60.0)
     assert measures["progress_m"] == pytest.approx(40.0)
     assert measures["failures_per_100m"] == pytest.approx(5.0)
@@ -94,8 +93,7 @@ def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
 
 
 def test_rates_count_a_detour_up_to_a_bound() -> None:
-    """100 m of progress are rated as at most 135 m: walking round somebody counts, 400 m of circles
-    do not; speed and path length are of all metres."""
+    """100 m of progress count as at most 135 m; speed and path length use all metres."""
     ahead = [0.1 * (i + 1) for i in range(500)]
     circles = [50.0 - 0.1 * (i % 2) for i in range(4001)]
     onward = [50.0 + 0.1 * (i + 1) for i in range(500)]
@@ -118,8 +116,8 @@ def test_rates_count_a_detour_up_to_a_bound() -> None:
     assert pooled_on == {"rated_m", "progress_m", "route_length_m"}
 
 
-def test_who_circles_without_getting_on_has_ten_metres() -> None:
-    """400 s of circles at the start, or after a reset: a failure on 10 m, not on 400."""
+def test_circling_without_progress_counts_as_ten_metres() -> None:
+    """400 s of circles at the start, or after a reset, give a failure on 10 m, not on 400."""
     circles = [0.1 * (i % 2) for i in range(8000)]
     stuck = compute_metrics(episode(log(circles), failure("collision", "wall")))
     assert stuck["path_length_m"] == pytest.approx(799.9) and stuck["progress_m"] == 0.1
@@ -139,8 +137,7 @@ def test_the_total_is_the_sum_of_its_parts() -> None:
 
 
 def test_a_reset_is_neither_travel_nor_progress() -> None:
-    """Forward jumps are taken off the progress; ground driven a second time after a jump back
-    counts once."""
+    """Forward jumps reduce the progress, and ground driven again after a jump back counts once."""
     assert progress_of(
         np.array([4.0, 6.0, 12.0]), np.array([np.nan, 10.0, np.nan])
     ) == pytest.approx(8.0)
@@ -168,8 +165,8 @@ def test_a_rate_without_distance_is_absent_not_zero() -> None:
 
 
 def test_space_metrics_have_the_signs_of_their_names() -> None:
-    """At 1 m from a person the intimate space is kept and the personal space violated, at 0.4 m
-    both are lost."""
+    """At 1 m from a person the intimate space is respected and the personal space violated, at 0.4
+    m both are violated."""
     at_1m, at_40cm = (compute_metrics(episode(log([0.05] * 10, person_m=d))) for d in (1.0, 0.4))
     assert (at_1m["space_compliance"], at_1m["personal_space_violation"]) == (1.0, 1.0)
     assert (at_40cm["space_compliance"], at_40cm["personal_space_violation"]) == (0.0, 1.0)
@@ -177,46 +174,46 @@ def test_space_metrics_have_the_signs_of_their_names() -> None:
 
 
 def test_time_on_the_carriageway_and_braking_vehicles_are_summed() -> None:
-    """Thirty ticks on the road are 1.5 s; two vehicles that begin to brake at one tick and one
-    later are three."""
-    one = log([0.05 * (i + 1) for i in range(100)])
-    one.on_carriageway[20:50] = True
-    one.vehicles_braked[25], one.vehicles_braked[40] = 2, 1
-    measures = compute_metrics(episode(one))
+    """Thirty ticks on the road are 1.5 s, and two vehicles that brake at one tick and one later are
+    three."""
+    trajectory = log([0.05 * (i + 1) for i in range(100)])
+    trajectory.on_carriageway[20:50] = True
+    trajectory.vehicles_braked[25], trajectory.vehicles_braked[40] = 2, 1
+    measures = compute_metrics(episode(trajectory))
     assert measures["carriageway_time_s"] == pytest.approx(1.5)
     assert measures["vehicles_braked"] == 3.0
 
 
 def test_spl_charges_detours() -> None:
     """A clean drive of 125 m for a route of 100 m has an SPL of 0.8."""
-    there = [0.5 * (i + 1) for i in range(225)]
+    forward = [0.5 * (i + 1) for i in range(225)]
     back = [112.5 - 0.5 * (i + 1) for i in range(25)]
-    assert compute_metrics(episode(log(there + back), ended="goal"))["spl"] == pytest.approx(0.8)
+    assert compute_metrics(episode(log(forward + back), ended="goal"))["spl"] == pytest.approx(0.8)
 
 
 def test_every_metric_is_defined_for_every_episode() -> None:
     """No metric raises or gives NaN, whatever the episode."""
-    for one in (
+    for expected in (
         episode(log([0.05])),
         episode(log([0.0, 120.0]), ended="goal"),
         episode(log([1.0] * 3, person_m=0.1)),
     ):
-        values = compute_metrics(one)
+        values = compute_metrics(expected)
         assert set(values) == set(METRICS)
         assert all(value is None or np.isfinite(value) for value in values.values())
 
 
 def test_resets_neither_hide_nor_invent_a_failure_to_progress() -> None:
-    """A jump forward does not make a standing robot progress, and a jump back does not make a
-    driving one stall."""
+    """A forward jump is no progress of a standing robot, and a jump back does not stall a driving
+    one."""
     stands = log([0.0] * 200 + [10.0] * 200, resets={199: 10.0})
     assert compute_metrics(episode(stands))["failure_to_progress"] == 4.0
     drives = [0.05 * (i + 1) for i in range(150)] + [0.05 * (i + 1) for i in range(150)]
     assert compute_metrics(episode(log(drives, resets={149: 0.0})))["failure_to_progress"] == 0.0
 
 
-def test_who_walks_into_a_robot_that_stands_is_counted_and_costs_it_nothing() -> None:
-    """At the goal after two such contacts: a success, no collision, and two contacts."""
+def test_people_who_walk_into_a_standing_robot_cost_it_nothing() -> None:
+    """Two such contacts before the goal are a success with no collision and two contacts."""
     facts = episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal")
     measures = compute_metrics(
         replace(facts, walked_into=(failure("collision", "pedestrian"),) * 2)
@@ -227,27 +224,26 @@ def test_who_walks_into_a_robot_that_stands_is_counted_and_costs_it_nothing() ->
 
 
 def test_accelerations_and_jerks_are_of_the_policys_periods() -> None:
-    """A command a quarter of a second: 0, 0.5, 1.5, 1.5 m/s at their ends are 2, 4, 0 m/s2, so 8
-    and -16 m/s3."""
-    one = log([0.05] * 15)
-    one.speed[:, 0] = np.repeat([0.5, 1.5, 1.5], 5)
-    measures = compute_metrics(episode(one))
+    """At 4 Hz speeds of 0, 0.5, 1.5, 1.5 m/s give 2, 4, 0 m/s2, and so 8 and -16 m/s3."""
+    trajectory = log([0.05] * 15)
+    trajectory.speed[:, 0] = np.repeat([0.5, 1.5, 1.5], 5)
+    measures = compute_metrics(episode(trajectory))
     assert measures["acceleration_mean_mps2"] == pytest.approx((2.0 + 4.0 + 0.0) / 3)
     assert measures["jerk_mean_mps3"] == pytest.approx((8.0 + 16.0) / 2)
 
 
 def test_a_reset_is_no_deceleration() -> None:
-    """Put at rest at 1 m/s and driven on at 1 m/s: the jump is left out, the new start counts."""
-    one = log([0.05 * (i + 1) for i in range(20)], resets={9: 0.5})
-    one.speed[:, 0] = 1.0
-    assert compute_metrics(episode(one))["acceleration_mean_mps2"] == pytest.approx(
+    """A reset to rest at 1 m/s is left out, and the new start counts."""
+    trajectory = log([0.05 * (i + 1) for i in range(20)], resets={9: 0.5})
+    trajectory.speed[:, 0] = 1.0
+    assert compute_metrics(episode(trajectory))["acceleration_mean_mps2"] == pytest.approx(
         (4.0 + 0.0 + 4.0 + 0.0) / 4
     )
 
 
 def test_shares_of_episodes_count_an_episode_once() -> None:
-    """Two collisions with people and one with a wall: one episode that hit a person, one that hit
-    something else."""
+    """Two collisions with people and one with a wall are one episode that hit a person, and one
+    that hit something else."""
     hits = (
         failure("collision", "pedestrian"),
         failure("collision", "pedestrian"),
@@ -263,7 +259,7 @@ def test_shares_of_episodes_count_an_episode_once() -> None:
 
 
 def test_the_nearest_of_a_success_is_absent_from_a_failure() -> None:
-    """The paper averages it over successful episodes."""
+    """The paper averages the least distance over successful episodes only."""
     drive = log([50.0, 100.0], person_m=0.9)
     good, bad = (compute_metrics(episode(drive, ended=ended)) for ended in ("goal", "timeout"))
     assert (

@@ -1,4 +1,4 @@
-"""Distances to people and times to collision, and places on a route."""
+"""Distances to people, times to collision, and places on a route."""
 
 from __future__ import annotations
 
@@ -17,31 +17,29 @@ FOOTPRINT = (0.7, 0.55)
 
 
 def people(*rows: tuple[float, float, float, float]) -> People:
-    """x, y, heading, speed of each."""
+    """People given as x, y, heading and speed."""
     x, y, heading, speed = np.array(rows, dtype=float).reshape(-1, 4).T
     names = tuple(f"p{i}" for i in range(len(rows)))
     return People.of(names, np.column_stack([x, y]), heading, speed, ("walk",) * len(rows))
 
 
-def test_nobody_is_infinitely_far() -> None:
+def test_without_people_distances_and_times_are_infinite() -> None:
     """Without people there is neither distance nor time."""
     assert nearness(RobotState(Pose(0.0, 0.0, 0.0)), people(), FOOTPRINT) == Nearness(
         math.inf, math.inf, math.inf
     )
 
 
-def test_two_who_drive_at_each_other_meet_halfway() -> None:
-    """5 m apart at 1 m/s each, radii 0.35 and 0.3 m: 4.35 m at 2 m/s. The gap before the robot is
-    4.35 m as well."""
+def test_a_head_on_approach_meets_halfway() -> None:
+    """5 m apart at 1 m/s each with radii 0.35 and 0.3 m, the gap is 4.35 m, closed at 2 m/s."""
     near = nearness(
         RobotState(Pose(0.0, 0.0, 0.0), v_mps=1.0), people((5.0, 0.0, math.pi, 1.0)), FOOTPRINT
     )
     assert near == pytest.approx((5.0, 4.35, 2.175))
 
 
-def test_who_passes_aside_or_walks_away_is_never_met() -> None:
-    """A person who passes aside, walks ahead at the same pace or is behind has no time to
-    collision."""
+def test_passing_and_leaving_people_have_no_time_to_collision() -> None:
+    """So do people ahead at the same pace, and those behind."""
     passing = people((5.0, 0.7, math.pi, 1.0), (3.0, 0.0, 0.0, 1.0), (-2.0, 0.0, 0.0, 0.0))
     near = nearness(RobotState(Pose(0.0, 0.0, 0.0), v_mps=1.0), passing, FOOTPRINT)
     assert (
@@ -52,7 +50,7 @@ def test_who_passes_aside_or_walks_away_is_never_met() -> None:
 
 
 def test_the_gap_is_to_the_outline_not_to_the_nearest_centre() -> None:
-    """One 0.75 m ahead is nearer to the bumper than one 0.7 m aside is to the flank."""
+    """A person 0.75 m ahead is nearer to the bumper than one 0.7 m aside is to the flank."""
     near = nearness(
         RobotState(Pose(0.0, 0.0, 0.0)),
         people((0.75, 0.0, 0.0, 0.0), (0.0, 0.7, 0.0, 0.0)),
@@ -62,7 +60,7 @@ def test_the_gap_is_to_the_outline_not_to_the_nearest_centre() -> None:
 
 
 def test_the_gap_is_the_least_of_all_gaps() -> None:
-    """On random crowds, against every gap taken by itself; one that overlaps has none."""
+    """In random crowds it equals the least of the single gaps, and an overlap has none."""
     rng = np.random.default_rng(0)
     for _ in range(200):
         pose = Pose(*rng.uniform(-1.0, 1.0, 2), rng.uniform(-math.pi, math.pi))
@@ -73,8 +71,8 @@ def test_the_gap_is_the_least_of_all_gaps() -> None:
         )
 
 
-def test_at_the_time_that_is_told_they_touch() -> None:
-    """On random ways: at that time the distance is the radius, and before it larger."""
+def test_bodies_touch_at_the_time_to_collision() -> None:
+    """For random motions the distance at that time is the radius, and before it is larger."""
     rng = np.random.default_rng(1)
     offset, velocity = rng.uniform(-5.0, 5.0, (500, 2)), rng.uniform(-2.0, 2.0, (500, 2))
     in_s = time_to_collision_s(offset, velocity, 0.65)
@@ -89,9 +87,9 @@ def test_at_the_time_that_is_told_they_touch() -> None:
 
 
 @pytest.mark.parametrize("spacing_m", [0.3, 1.0, 25.0])
-def test_all_places_on_a_route_are_those_that_are_found_one_by_one(spacing_m: float) -> None:
-    """To the bit: on a way that winds, comes back near itself and ends, from poses on it, off it
-    and beyond it."""
+def test_places_on_a_route_as_an_array_equal_single_ones(spacing_m: float) -> None:
+    """On a winding way that returns near itself they are equal to the bit for poses on, off and
+    beyond it."""
     rng = np.random.default_rng(2)
     turns = np.cumsum(rng.normal(0.0, 0.4, 300))
     route = Polyline(np.cumsum(spacing_m * np.column_stack([np.cos(turns), np.sin(turns)]), axis=0))

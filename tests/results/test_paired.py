@@ -1,4 +1,4 @@
-"""Paired differences: cases worked out by hand, what intervals cover, and what they find."""
+"""Paired differences: cases worked out by hand, the coverage of intervals, and their power."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ NAN = float("nan")
 
 
 def flips(n: int, won: int, lost: int, solved: int = 0) -> PairedDifference:
-    """Of n scenarios so many are solved by the second run alone, by the first alone, by both."""
+    """Outcomes of n scenarios: solved by the second run alone (won), the first alone (lost), or
+    both."""
     first, second = np.zeros(n), np.zeros(n)
     second[:won] = 1.0
     first[won : won + lost] = 1.0
@@ -46,17 +47,17 @@ def test_a_difference_of_rates_by_hand() -> None:
     assert found.verdict(False) == "within noise"
 
 
-def test_pairs_are_drawn_as_pairs() -> None:
-    """Scenarios that differ far more than the runs do: a small change in the same direction
-    everywhere is found, which two runs that are drawn apart would hide."""
+def test_pairs_are_resampled_as_pairs() -> None:
+    """A small equal change among very different scenarios is found, which independent resampling
+    would hide."""
     hard = np.random.default_rng(3).uniform(0.0, 100.0, 50)
     found = difference_of_means(hard, hard + np.linspace(0.01, 0.03, 50))
     assert 0.01 < found.low < found.difference < found.high < 0.03
 
 
-def test_what_is_alike_is_within_noise() -> None:
-    """No change: an interval of nothing, around 0. Below five pairs there is neither interval nor
-    verdict; of none nothing."""
+def test_equal_runs_are_within_noise() -> None:
+    """Without a change the interval is 0 to 0; below five pairs there is neither interval nor
+    verdict; no pairs give nothing."""
     values = np.array([0.3, NAN, 0.7, 1.0, 0.2, 0.1])
     alike = difference_of_means(values, values)
     assert (alike.low, alike.high, alike.n, alike.changed, alike.verdict(True)) == (
@@ -85,17 +86,16 @@ def test_what_is_alike_is_within_noise() -> None:
 
 
 def test_fewer_than_six_scenarios_that_changed_are_too_few() -> None:
-    """Five of a thousand, all won: the interval does not hold 0, and yet of two runs that are alike
-    one pair in sixteen shows as much. Six are one in 32."""
+    """Five of a thousand, all won, are no verdict, since equal runs give this once in sixteen; six
+    are one in 32."""
     assert flips(1000, 5, 0).low > 0.0 and flips(1000, 5, 0).verdict(True) == "too few"
     assert (
         flips(1000, 6, 0).verdict(True) == "better" and flips(1000, 0, 6).verdict(True) == "worse"
     )
 
 
-def test_of_a_rate_the_scenarios_with_a_failure_are_counted() -> None:
-    """Five of a hundred ways had a failure, and each is some millimetres longer in the other run:
-    too few, as of the failures themselves. Six are enough."""
+def test_a_rate_needs_six_scenarios_with_a_failure() -> None:
+    """Five of a hundred, with other lengths in the other run, are too few, and six are enough."""
     metres = np.full(100, 15.0), np.linspace(15.001, 15.1, 100)
     for failures, verdict in ((5, "too few"), (6, "better")):
         counted = (np.arange(100) < failures).astype(float)
@@ -119,8 +119,8 @@ def test_of_a_rate_the_scenarios_with_a_failure_are_counted() -> None:
 def test_three_in_a_hundred_of_800_is_found_where_flips_are_few(
     won: int, lost: int, verdict: str
 ) -> None:
-    """24 of 800 fewer solved: found where 24 or 80 scenarios flipped (4.9 and 2.7 standard errors;
-    one is the root of how many flipped), not where 160 did (1.9)."""
+    """24 of 800 fewer solved are found with 24 or 80 flips (4.9 and 2.7 standard errors), not with
+    160 (1.9)."""
     found = flips(800, won, lost, 400)
     assert abs(found.difference) == pytest.approx(0.03) and found.verdict(True) == verdict
 
@@ -128,17 +128,17 @@ def test_three_in_a_hundred_of_800_is_found_where_flips_are_few(
 def drawn_pairs(
     rng: np.random.Generator, n: int, flipped: float, gained: float
 ) -> tuple[Floats, Floats]:
-    """Two runs of n scenarios of which this share flips, so that the second gains so much on the
-    mean."""
+    """Draw two runs of n scenarios with this share of flips, so that the second gains this much on
+    average."""
     way = rng.choice(
         [1.0, -1.0, 0.0], size=n, p=[(flipped + gained) / 2, (flipped - gained) / 2, 1.0 - flipped]
     )
     return (way < 0.0).astype(float), (way > 0.0).astype(float)
 
 
-def test_the_power_at_three_in_a_hundred_is_what_is_said() -> None:
-    """800 scenarios of which a tenth flips: the normal law gives 0.77, drawn runs as much within
-    what 200 can tell; where nothing was gained, one in twenty is called a difference."""
+def test_the_power_at_three_in_a_hundred_is_as_documented() -> None:
+    """800 scenarios with a tenth flipped have a power of 0.77, and without a gain one in twenty
+    gets a verdict."""
     rng = np.random.default_rng(11)
     found = [
         difference_of_means(*drawn_pairs(rng, 800, 0.1, 0.03)).verdict(True) == "better"
@@ -153,9 +153,9 @@ def test_the_power_at_three_in_a_hundred_is_what_is_said() -> None:
 
 
 @pytest.mark.parametrize("n", [10, 40])
-def test_intervals_cover_what_is_true(n: int) -> None:
-    """In 95 of 100 runs, within what 500 can tell: of a mean of pairs that vary together, and of a
-    pooled rate of scenarios that are not equally hard."""
+def test_intervals_cover_the_true_difference(n: int) -> None:
+    """They do in 95 of 100 runs, for a mean of correlated pairs and a pooled rate of unequal
+    scenarios."""
     rng = np.random.default_rng(n)
     means = []
     rates = []
@@ -171,7 +171,7 @@ def test_intervals_cover_what_is_true(n: int) -> None:
 
 
 def test_the_same_runs_give_the_same_intervals() -> None:
-    """To the bit, whatever was drawn in between."""
+    """They are equal to the bit, whatever was drawn in between."""
     rng = np.random.default_rng(0)
     pair = drawn_pairs(rng, 90, 0.3, 0.1)
     first = difference_of_means(*pair)

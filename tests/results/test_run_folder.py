@@ -64,19 +64,19 @@ def record(name: str, *, success: float = 1.0, status: str = "done", wall_s: flo
 
 
 LOG = driven(SUITE.scenarios[0], [1.0] * 3).encoded()
-"""Of three ticks, as `record` has."""
+"""A log of three ticks, as in `record`."""
 
 
-def on_disk(folder: RunFolder, kept: Record, under: str = "") -> None:
-    """Write the files of an episode, and no row. under: in the folder of another one."""
-    place = folder.episode_folder(under or kept.scenario.id)
+def write_files_of(folder: RunFolder, episode_record: Record, under: str = "") -> None:
+    """Write the files of an episode without a row; `under` is the folder of another scenario."""
+    place = folder.episode_folder(under or episode_record.scenario.id)
     place.mkdir(parents=True, exist_ok=True)
     (place / "trajectory.npz").write_bytes(LOG)
-    kept.save(place / "record.json")
+    episode_record.save(place / "record.json")
 
 
 def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: Path) -> None:
-    """Rows are sorted by scenario and hold no wall times, so two runs give the same bytes."""
+    """Rows are sorted by scenario without wall times, so that two runs give the same bytes."""
     for name, order in (("a", (0, 1, 2)), ("b", (2, 0, 1))):
         with RunFolder.create(tmp_path / name, SPEC, SUITE) as folder:
             for i in order:
@@ -86,8 +86,8 @@ def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: 
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
-    """A second run into a folder is refused, and so is a folder of other things; a run killed at
-    once begins anew."""
+    """A second run and a folder of other files are refused, and a run that was killed at once
+    starts again."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE):
         pass
     with pytest.raises(RunError, match=r"already holds a run\. Add --resume"):
@@ -103,7 +103,7 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
-    """While one run holds the folder a second one is told which process does."""
+    """The refusal names the process of the run that holds the folder."""
     with (
         RunFolder.create(tmp_path / "run", SPEC, SUITE),
         pytest.raises(RunError, match=r"in use by process \d+"),
@@ -112,8 +112,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_locked_before_it_is_written(tmp_path: Path) -> None:
-    """Of two runs that find the same folder empty at the same moment the second one writes
-    nothing."""
+    """Of two runs that find the same folder empty at once, the second writes nothing."""
     mine, other = (
         msgspec.structs.replace(SPEC, policy="p"),
         msgspec.structs.replace(SPEC, policy="q"),
@@ -158,8 +157,8 @@ def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.Monk
         ("odometry", "gps"),
     ],
 )
-def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
-    """Another policy, suite or version would mix two runs: the difference is named."""
+def test_resuming_with_other_settings_is_refused(tmp_path: Path, field: str, value: object) -> None:
+    """Another policy, suite or version would mix two runs, so the difference is named."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE):
         pass
     other = changed(SPEC, **{field: value})
@@ -167,8 +166,8 @@ def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, val
         RunFolder.resume(tmp_path / "run", other)
 
 
-def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
-    """Mount, size, field of view and crop of both."""
+def test_a_changed_camera_is_described(tmp_path: Path) -> None:
+    """The description has mount, size, field of view and crop of both."""
     spec = changed(SPEC, camera=CameraSpec(512, 288, 60.0))
     with RunFolder.create(tmp_path / "run", spec, SUITE):
         pass
@@ -183,17 +182,17 @@ def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
         assert again.spec.manifest.camera == spec.manifest.camera
 
 
-def test_every_row_tells_how_waypoints_were_followed(tmp_path: Path) -> None:
-    """From the record, which holds the rule itself."""
+def test_every_row_has_the_waypoint_rule(tmp_path: Path) -> None:
+    """The rule comes from the record."""
     scaled = changed(record("s-0"), waypoints=WaypointRule(index=4, unit_m=0.25))
     scaled.save(tmp_path / "record.json")
-    kept = Record.load(tmp_path / "record.json")
-    assert kept.manifest.waypoints == WaypointRule(index=4, unit_m=0.25)
-    assert table_row(kept)["waypoints"] == "waypoint 4, units of 0.25 m, in 0.25 s, shipped"
+    saved = Record.load(tmp_path / "record.json")
+    assert saved.manifest.waypoints == WaypointRule(index=4, unit_m=0.25)
+    assert table_row(saved)["waypoints"] == "waypoint 4, units of 0.25 m, in 0.25 s, shipped"
 
 
 def test_resuming_with_an_edited_policy_is_refused(tmp_path: Path) -> None:
-    """Also when its version was left as it was: the policy is named."""
+    """The policy is named, also when its version is unchanged."""
     spec = changed(SPEC, policy_source="1111")
     with RunFolder.create(tmp_path / "run", spec, SUITE):
         pass
@@ -248,9 +247,9 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: str) -> None:
-    """Whatever happened to results.sqlite: showing it says the remedy, and resuming finds every
-    record on disk."""
+def test_a_damaged_database_is_rebuilt_from_the_records(tmp_path: Path, name: str) -> None:
+    """After any damage to results.sqlite, showing it gives the remedy, and resuming finds every
+    record."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         for i in (2, 0):
             folder.write_episode(record(f"s-{i}"), LOG)
@@ -267,7 +266,7 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
 
 
 def test_a_database_of_an_earlier_version_is_read_and_added_to(tmp_path: Path) -> None:
-    """It has a column `row` with the table's row of each record, which is not read any more."""
+    """Its column `row`, which held the table's row of each record, is no longer read."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         folder.write_episode(record("s-0"), LOG)
     with closing(sqlite3.connect(tmp_path / "run/results.sqlite")) as database, database:
@@ -280,11 +279,10 @@ def test_a_database_of_an_earlier_version_is_read_and_added_to(tmp_path: Path) -
         assert again.notes == [] and [*again.finish()["scenario"]] == ["s-0", "s-1"]
 
 
-def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write(
+def test_run_json_and_record_json_are_flat_and_tolerate_missing_keys(
     tmp_path: Path,
 ) -> None:
-    """Every fact of scenario, set-up and manifest is a key of the file; both are read back as they
-    were, and from a file of an earlier version without the later keys."""
+    """Facts are top-level keys and read back unchanged, also from an earlier version's file."""
     spec = changed(
         SPEC,
         camera=CameraSpec(64, 48),
@@ -297,16 +295,16 @@ def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write
             msgspec.structs.replace(record("s-0"), setup=spec.setup, manifest=spec.manifest), LOG
         )
     path = tmp_path / "run/episodes/s-0/record.json"
-    told = [json.loads((tmp_path / "run/run.json").read_text()), json.loads(path.read_text())]
+    files = [json.loads((tmp_path / "run/run.json").read_text()), json.loads(path.read_text())]
     assert read_spec(tmp_path / "run") == spec and Record.load(path).setup == spec.setup
-    for file in told:
+    for file in files:
         assert (
             not file.keys() & {"setup", "manifest"}
             and file["camera"]["width"] == 64
             and file["latency_ms"] == 50.0
         )
-    assert set(RunSetup.__struct_fields__) <= told[0].keys()
-    assert (told[0]["seed"], told[0]["policy"], told[0]["policy_name"], told[1]["policy"]) == (
+    assert set(RunSetup.__struct_fields__) <= files[0].keys()
+    assert (files[0]["seed"], files[0]["policy"], files[0]["policy_name"], files[1]["policy"]) == (
         0,
         "p",
         "p",
@@ -323,9 +321,9 @@ def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write
         "metric_schema",
     }
     (tmp_path / "run/run.json").write_text(
-        json.dumps({key: told[0][key] for key in told[0].keys() - later})
+        json.dumps({key: files[0][key] for key in files[0].keys() - later})
     )
-    path.write_text(json.dumps({key: told[1][key] for key in told[1].keys() - later}))
+    path.write_text(json.dumps({key: files[1][key] for key in files[1].keys() - later}))
     old = Record.load(path)
     assert read_spec(tmp_path / "run").manifest.camera is old.manifest.camera is None
     assert (old.setup.latency_ms, old.setup.metric_schema, old.scenario) == (
@@ -333,7 +331,7 @@ def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write
         0,
         record("s-0").scenario,
     )
-    path.write_text(json.dumps(told[1] | {"suite_hash": 5}))
+    path.write_text(json.dumps(files[1] | {"suite_hash": 5}))
     with pytest.raises(
         RunError,
         match=r"record\.json: not an episode record: Expected `str`, got `int` - at `\$\.suite_h",
@@ -341,9 +339,8 @@ def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write
         Record.load(path)
 
 
-def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
-    """A run that was killed leaves a write-ahead log; when it is deleted, or everything is, the
-    records count."""
+def test_a_database_without_its_write_ahead_log_is_rebuilt(tmp_path: Path) -> None:
+    """When a killed run's write-ahead log, or everything, is deleted, the records count."""
     for lost in ("results.sqlite-wal", "results.sqlite"):
         path = tmp_path / lost
         code = (
@@ -398,7 +395,7 @@ HARM = {
 def test_a_run_folder_that_is_damaged_during_a_run_loses_no_row(
     tmp_path: Path, damage: str
 ) -> None:
-    """Its rows, records and spec are written again, and it can be resumed."""
+    """Rows, records and spec are written again, and the run can be resumed."""
     run = tmp_path / "run"
     with RunFolder.create(run, SPEC, SUITE) as folder:
         folder.write_episode(record("s-0"), LOG)
@@ -415,8 +412,8 @@ def test_a_run_folder_that_is_damaged_during_a_run_loses_no_row(
         assert again.finished_ids() >= ({"s-0", "s-1"} if damage != "deleted" else set())
 
 
-def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> None:
-    """`show` says the remedy."""
+def test_records_without_a_database_are_reported_with_the_remedy(tmp_path: Path) -> None:
+    """`show` does not print an empty table."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         folder.episode_folder("s-0").mkdir()
         record("s-0").save(folder.episode_folder("s-0") / "record.json")
@@ -426,14 +423,13 @@ def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> 
 
 
 def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
-    """Neither a broken record nor one of another scenario counts as finished; which it was is
-    said."""
+    """A broken record and one of another scenario do not count as finished, and are named."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         for i in range(3):
             folder.episode_folder(f"s-{i}").mkdir()
         (folder.episode_folder("s-0") / "record.json").write_text("{")
-        on_disk(folder, record("s-2"), "s-1")
-        on_disk(folder, record("s-2"))
+        write_files_of(folder, record("s-2"), "s-1")
+        write_files_of(folder, record("s-2"))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert again.finished_ids() == {"s-2"}
         assert len(again.notes) == 2 and all(
@@ -441,9 +437,8 @@ def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
         )
 
 
-def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> None:
-    """A run killed after it wrote a trajectory and before the record: the next attempt begins with
-    an empty folder."""
+def test_a_new_attempt_starts_with_an_empty_folder(tmp_path: Path) -> None:
+    """The trajectory of a run killed before its record is removed."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         folder.write_frame("s-0", 4, b"png")
         for name in ("trajectory.npz", "trajectory.npz.part", "record.json.part"):
@@ -454,14 +449,13 @@ def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> N
         assert [path.name for path in again.episode_folder("s-0").iterdir()] == ["record.json"]
 
 
-def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> None:
-    """A record on disk without a row counts as finished when the run is resumed; one that is not
-    its row's does not."""
+def test_an_episode_whose_row_was_lost_is_recovered_on_resume(tmp_path: Path) -> None:
+    """A record without a row counts as finished, and a record that contradicts its row does not."""
     folder = RunFolder.create(tmp_path / "run", SPEC, SUITE)
     with folder:
         folder.add_row(record("s-0", success=1.0))
         for name in ("s-0", "s-1"):
-            on_disk(folder, record(name, success=0.0))
+            write_files_of(folder, record(name, success=0.0))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert (
             again.finished_ids() == {"s-1"}
@@ -473,8 +467,7 @@ def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> 
 
 
 def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
-    """Crashed episodes stay in SR, RC, SPL and V as 0; whom they would have hit is unknown, and so
-    is every other mean with a direction."""
+    """Crashes count as 0 in SR, RC, SPL and V, and make every other mean with a direction unknown."""
     crashed = msgspec.structs.replace(record("s-1", status="crashed"), measures={}, reason="boom")
     table = table_of([record("s-0"), crashed])
     summary = summary_of(table)
@@ -486,13 +479,13 @@ def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
-    """What is no run folder is answered with what it lacks and the runs that lie in it and beside
-    it; a file with what a run is."""
+    """The message lists what it lacks and the runs in and beside it; for a file it says what a run
+    is."""
     for name in ("mine", "runs/theirs"):
         with RunFolder.create(tmp_path / name, SPEC, SUITE):
             pass
     (tmp_path / "file").touch()
-    for name, told in (
+    for name, expected in (
         ("other", "unknown run '{run}'. Valid choices: {beside}/mine. Did you mean"),
         (
             "runs",
@@ -502,21 +495,23 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
         ("file", "{run} is no run folder: a file is there, and a run is a folder with run.json"),
     ):
         with pytest.raises(
-            UsageError, match=re.escape(told.format(run=tmp_path / name, beside=tmp_path))
+            UsageError, match=re.escape(expected.format(run=tmp_path / name, beside=tmp_path))
         ):
             read_records(tmp_path / name)
 
 
 @pytest.mark.parametrize("below", ["run", "runs/run"])
-def test_a_run_below_a_file_is_told_which_file_and_where_else(tmp_path: Path, below: str) -> None:
-    """The path leads through a file: that file is named, and a place beside it."""
+def test_a_run_path_through_a_file_is_refused_with_an_alternative(
+    tmp_path: Path, below: str
+) -> None:
+    """That file is named, and a place beside it."""
     (tmp_path / "file").touch()
     path = tmp_path / "file" / below
-    told = (
+    expected = (
         f"{path}: cannot be written: {tmp_path / 'file'} is a file, no folder: choose a path "
         f"next to it, like "
     )
-    with pytest.raises(MachineError, match=re.escape(f"{told}{tmp_path / below}")):
+    with pytest.raises(MachineError, match=re.escape(f"{expected}{tmp_path / below}")):
         RunFolder.create(path, SPEC, SUITE).__enter__()
 
 
@@ -533,8 +528,8 @@ def test_a_damaged_record_is_named(tmp_path: Path, content: bytes) -> None:
         Record.load(path)
 
 
-def test_a_log_survives_the_disk(tmp_path: Path) -> None:
-    """A saved trajectory reads back the same; a broken file is named."""
+def test_a_saved_trajectory_reads_back_the_same(tmp_path: Path) -> None:
+    """A broken file is named."""
     log = log_with(2, pose=np.ones((2, 3)), event_tracks=np.ones((1, 5)))
     (tmp_path / "t.npz").write_bytes(log.encoded())
     again = Log.load(tmp_path / "t.npz")
@@ -547,20 +542,21 @@ def test_a_log_survives_the_disk(tmp_path: Path) -> None:
 
 
 def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
-    """Asked for one, `cosim show` refuses in words; without, it tells what became of the
-    episode."""
+    """`cosim show` refuses the picture with the reason, and without one prints the episode's
+    outcome."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as held:
         held.write_episode(record("s-0", status="crashed"))
-    said = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
+    result = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "episode 's-0' is crashed: it has no track to draw" in said.stderr
+        result.returncode == 2
+        and "episode 's-0' is crashed: it has no track to draw" in result.stderr
     )
     assert not (tmp_path / "above.png").exists()
     assert cosim("show", "run", "--episode", "s-0", cwd=tmp_path).returncode == 0
 
 
 def test_records_differ_if_only_one_has_a_scan() -> None:
-    """The difference is described in both orders, also if the first record has the scan."""
+    """The difference is described in both orders."""
     plain = record("s-0")
     scanned = msgspec.structs.replace(plain, scan=ScanLook(appearance="splats"))
     assert record_difference(plain, scanned).startswith("scan is None, there {'appearance'")

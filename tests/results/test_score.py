@@ -1,5 +1,5 @@
-"""Scores: what follows from a trajectory, what a run recorded, and what is said where these are
-apart."""
+"""Scores: recomputed from trajectories, compared with the recorded ones, and reported where they
+differ."""
 
 from __future__ import annotations
 
@@ -32,15 +32,14 @@ Edit = Callable[[dict[str, Any]], object]
 
 
 def rewrite(run: Path, scenario: str, edit: Edit) -> None:
-    """Edit the record of an episode wherever it stands: its file, its text and its row in the
-    database."""
+    """Edit the record of an episode in its file and its row in the database."""
     file = run / "episodes" / scenario / "record.json"
-    told = json.loads(file.read_bytes())
-    edit(told)
-    file.write_text(json.dumps(told))
+    fields = json.loads(file.read_bytes())
+    edit(fields)
+    file.write_text(json.dumps(fields))
     with closing(sqlite3.connect(run / "results.sqlite")) as database, database:
         database.execute(
-            "update episodes set record = ? where scenario = ?", (json.dumps(told), scenario)
+            "update episodes set record = ? where scenario = ?", (json.dumps(fields), scenario)
         )
 
 
@@ -64,15 +63,16 @@ def put(index: Any, value: float) -> Callable[[Any], Any]:
 
 
 def test_a_run_scores_as_it_was_recorded(tmp_path: Path, cosim: Cosim) -> None:
-    """Two driven to the goal, one that hit a wall, one that crashed: equal to the bit, in every
-    file; schema told."""
-    said = cosim("score", str(run_of(tmp_path / "run", ["goal", HIT, "crashed", "goal"])))
-    assert said.returncode == 0, said.stderr
+    """Two driven to the goal, one that hit a wall and one crash score equal to the bit in every
+    file."""
+    result = cosim("score", str(run_of(tmp_path / "run", ["goal", HIT, "crashed", "goal"])))
+    assert result.returncode == 0, result.stderr
     assert (
-        f"3 episodes, {len(METRICS)} metrics each, by metric schema {METRIC_SCHEMA}" in said.stdout
+        f"3 episodes, {len(METRICS)} metrics each, by metric schema {METRIC_SCHEMA}"
+        in result.stdout
     )
-    assert "1 have no trajectory" in said.stdout
-    assert "equal to the bit to record.json, results.sqlite, results.csv" in said.stdout
+    assert "1 have no trajectory" in result.stdout
+    assert "equal to the bit to record.json, results.sqlite, results.csv" in result.stdout
 
 
 LOG_EDITS = {
@@ -97,13 +97,15 @@ LOG_EDITS = {
 
 @pytest.mark.parametrize("name", LOG_EDITS)
 def test_an_edited_trajectory_is_found(tmp_path: Path, cosim: Cosim, name: str) -> None:
-    """The first difference is named: episode, metric, what was recorded, what follows; exit code
+    """The first difference has episode, metric, recorded and recomputed value, and the exit code is
     1."""
     run = run_of(tmp_path / "run", ["goal", HIT])
-    edits, told = LOG_EDITS[name]
+    edits, expected = LOG_EDITS[name]
     rewrite_log(run, "s-001", **edits)
-    said = cosim("score", str(run))
-    assert said.returncode == 1 and f"different: episode s-001, {told}" in said.stdout, said
+    result = cosim("score", str(run))
+    assert result.returncode == 1 and f"different: episode s-001, {expected}" in result.stdout, (
+        result
+    )
 
 
 RECORD_EDITS: dict[str, tuple[Edit, str]] = {
@@ -148,41 +150,42 @@ RECORD_EDITS: dict[str, tuple[Edit, str]] = {
 
 @pytest.mark.parametrize("name", RECORD_EDITS)
 def test_an_edited_record_is_found(tmp_path: Path, cosim: Cosim, name: str) -> None:
-    """Also where file and database were edited alike: it is not what the trajectory shows."""
+    """A record is compared with the trajectory, even where file and database were edited alike."""
     run = run_of(tmp_path / "run", ["goal", HIT])
-    edit, told = RECORD_EDITS[name]
+    edit, expected = RECORD_EDITS[name]
     rewrite(run, "s-001", edit)
-    said = cosim("score", str(run))
-    assert said.returncode == 1 and f"different: episode s-001, {told}" in said.stdout, said
+    result = cosim("score", str(run))
+    assert result.returncode == 1 and f"different: episode s-001, {expected}" in result.stdout, (
+        result
+    )
 
 
 def test_an_edited_table_is_found(tmp_path: Path, cosim: Cosim) -> None:
-    """One digit of results.csv, or a metric that is gone from it, beside sound records; a column
-    that came with a later version may be lacking."""
+    """A changed digit or a missing metric of results.csv is found, and a column of a later version
+    may be missing."""
     run = run_of(tmp_path / "run", ["goal", HIT])
     table = (run / "results.csv").read_text()
     speed = repr(read_records(run)[1].measures["velocity_mean_mps"])
     (run / "results.csv").write_text(table.replace(f",{speed},", f",{speed[:-1]}8,"))
-    said = cosim("score", str(run))
-    assert said.returncode == 1
+    result = cosim("score", str(run))
+    assert result.returncode == 1
     assert (
         f"episode s-001, velocity_mean_mps in results.csv: recorded {speed[:-1]}8, computed "
-        f"{speed} (" in said.stdout
+        f"{speed} (" in result.stdout
     )
-    for column, told in (
+    for column, expected in (
         ("spl", "spl in results.csv: recorded nothing, computed 1.0"),
         ("latency_ms", "equal to the bit"),
     ):
         pd.read_csv(io.StringIO(table), dtype=str).drop(columns=column).to_csv(
             run / "results.csv", index=False
         )
-        assert told in cosim("score", str(run)).stdout, column
+        assert expected in cosim("score", str(run)).stdout, column
     (run / "results.csv").write_text(table)
 
 
-def test_what_follows_from_a_long_way_is_judged_again() -> None:
-    """Put back after a collision and after standing for ten seconds; each freezing that is told or
-    left out, each failure without a reset, and an end that came before its time, contradict the
+def test_the_failures_of_a_long_way_are_recomputed() -> None:
+    """Added or omitted freezings, failures without a reset, and an early end contradict the
     trajectory."""
     way = short_way("s", ends_on_failure=False, time_limit_s=21.5)
     speeds = [1.0] * 60 + [0.0] * 260 + [1.0] * 110
@@ -193,27 +196,30 @@ def test_what_follows_from_a_long_way_is_judged_again() -> None:
     )
     assert [*contradictions(record, way, log)] == []
 
-    def told(**fields: object) -> list[str]:
+    def differences(**fields: object) -> list[str]:
         changed = msgspec.structs.replace(record, **fields)  # type: ignore[arg-type]
         return [one.what for one in contradictions(changed, way, log)]
 
-    assert told(failures=both[:1]) == ["failures at tick 250", "freezings at tick 250"]
-    assert told(failures=both[1:]) == ["failures at tick 20"]
-    assert told(failures=(*both, failure_at(log, 300, "freezing")))[-1] == "freezings at tick 300"
-    assert told(ended="goal") == ["ended"]
+    assert differences(failures=both[:1]) == ["failures at tick 250", "freezings at tick 250"]
+    assert differences(failures=both[1:]) == ["failures at tick 20"]
+    assert (
+        differences(failures=(*both, failure_at(log, 300, "freezing")))[-1]
+        == "freezings at tick 300"
+    )
+    assert differences(ended="goal") == ["ended"]
     longer = short_way("s", ends_on_failure=False, time_limit_s=22.5)
     assert [one.what for one in contradictions(record, longer, log)] == ["ended"]
 
 
 def refusal(cosim: Cosim, run: Path) -> str:
-    """What `cosim score` says of a run that it refuses: one line."""
-    said = cosim("score", str(run))
-    assert said.returncode == 2 and not said.stdout, said
-    return said.stderr.splitlines()[-1]
+    """Return the refusal of `cosim score`, which is one line."""
+    result = cosim("score", str(run))
+    assert result.returncode == 2 and not result.stdout, result
+    return result.stderr.splitlines()[-1]
 
 
-def test_a_run_that_goes_on_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """While a process holds the folder it is named; nothing is read half-way."""
+def test_a_run_in_progress_is_refused(tmp_path: Path, cosim: Cosim) -> None:
+    """The process that holds the folder is named, and nothing is read half-written."""
     run = run_of(tmp_path / "run", ["goal"])
     with RunFolder.resume(run, read_spec(run)):
         assert (
@@ -223,7 +229,7 @@ def test_a_run_that_goes_on_is_refused(tmp_path: Path, cosim: Cosim) -> None:
 
 
 def test_a_run_without_an_episode_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """Nothing has ended: there is nothing to score, and it is told how to go on."""
+    """Without a finished episode the message says how to continue."""
     run = run_of(tmp_path / "run", ["goal"])
     with closing(sqlite3.connect(run / "results.sqlite")) as database, database:
         database.execute("delete from episodes")
@@ -234,7 +240,7 @@ def test_a_run_without_an_episode_is_refused(tmp_path: Path, cosim: Cosim) -> No
 
 
 def test_an_edited_suite_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """A goal that was made larger after the run: file and scenario are named."""
+    """File and scenario are named when a goal was enlarged after the run."""
     run = run_of(tmp_path / "run", ["goal", HIT])
     file = run / "scenarios.json"
     lines = file.read_text().splitlines()
@@ -250,7 +256,7 @@ def test_an_edited_suite_is_refused(tmp_path: Path, cosim: Cosim) -> None:
 def test_a_damaged_episode_is_refused_and_run_again(
     tmp_path: Path, cosim: Cosim, name: str, damage: str
 ) -> None:
-    """File and remedy are named; `--resume` names it, too, and has this episode alone to be run."""
+    """File and remedy are named, and `--resume` names it and runs only this episode."""
     run = run_of(tmp_path / "run", ["goal", HIT, "goal", "crashed"])
     file = run / "episodes/s-001" / name
     data = file.read_bytes()
@@ -261,10 +267,10 @@ def test_a_damaged_episode_is_refused_and_run_again(
         file.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
     else:
         file.unlink()
-    told = refusal(cosim, run)
+    message = refusal(cosim, run)
     assert (
-        f"error: {file}: not " in told
-        and "give the command of the run again with --resume, which" in told
+        f"error: {file}: not " in message
+        and "give the command of the run again with --resume, which" in message
     )
     with RunFolder.resume(run, read_spec(run)) as folder:
         assert folder.finished_ids() == {"s-000", "s-002", "s-003"}
@@ -274,50 +280,46 @@ def test_a_damaged_episode_is_refused_and_run_again(
         assert again.finished_ids() == {"s-000", "s-002", "s-003"}
 
 
-def test_what_is_no_run_is_told_with_a_remedy(tmp_path: Path, cosim: Cosim) -> None:
-    """A run.json that cannot be read: one line, without the words of the system."""
+def test_an_unreadable_run_is_refused_with_a_remedy(tmp_path: Path, cosim: Cosim) -> None:
+    """A bad run.json gives one line without the system's error text."""
     run = tmp_path / "run"
     run.mkdir()
     (run / "run.json").write_text("no JSON")
-    told = refusal(cosim, run)
+    message = refusal(cosim, run)
     assert (
-        f"error: {run / 'run.json'}: cannot be read: " in told
-        and "name another run" in told
-        and "Errno" not in told
+        f"error: {run / 'run.json'}: cannot be read: " in message
+        and "name another run" in message
+        and "Errno" not in message
     )
 
 
-def test_a_record_that_is_not_what_the_database_has_is_refused(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """The file alone was edited: the first thing that is apart is named, by `score` and by
-    `show`."""
+def test_a_record_that_contradicts_the_database_is_refused(tmp_path: Path, cosim: Cosim) -> None:
+    """`score` and `show` name the first difference when only the file was edited."""
     run = run_of(tmp_path / "run", ["goal"])
     file = run / "episodes/s-000/record.json"
     file.write_text(file.read_text().replace('"success": 1.0', '"success": 0.5'))
-    told = refusal(cosim, run)
+    message = refusal(cosim, run)
     shown = cosim("show", str(run))
     assert (
         shown.returncode == 2
         and not shown.stdout
-        and shown.stderr.splitlines()[-1] == told.splitlines()[-1]
+        and shown.stderr.splitlines()[-1] == message.splitlines()[-1]
     )
     assert (
         f"{file}: not what results.sqlite has of this episode: measures.success is 0.5, "
-        f"there 1.0: give the comm" in told
+        f"there 1.0: give the comm" in message
     )
 
 
 def test_another_metric_schema_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """Measures by other definitions, or by a version that did not say by which; every row says by
-    which it was made."""
+    """Measures of other or unrecorded definitions are refused, and every row has its schema."""
     run = run_of(tmp_path / "run", ["goal"])
     assert f",{METRIC_SCHEMA}," in (run / "results.csv").read_text()
     rewrite(run, "s-000", lambda record: record.update(metric_schema=METRIC_SCHEMA - 1))
-    told = refusal(cosim, run)
+    message = refusal(cosim, run)
     assert (
         f"{run}: the measures of 's-000' are of metric schema {METRIC_SCHEMA - 1}; this version has"
-        in told
+        in message
     )
     shown = cosim("show", str(run))
     assert shown.returncode == 0 and "its values are shown as recorded" in shown.stdout
@@ -336,11 +338,9 @@ def test_another_metric_schema_is_refused(tmp_path: Path, cosim: Cosim) -> None:
     ],
     ids=["straight", "orca"],
 )
-def test_what_engines_ran_scores_to_the_bit(
-    tmp_path: Path, policy: str, ends: dict[str, str]
-) -> None:
-    """Shipped scenarios of a group to pass round, of nobody, and of a stopping hand, run for real:
-    each of the ends."""
+def test_engine_runs_score_to_the_bit(tmp_path: Path, policy: str, ends: dict[str, str]) -> None:
+    """Shipped scenarios of a group, of no pedestrian, and of a stopping hand are run with real
+    engines to each end."""
     from scenarios.runs.run import run
     from scenarios.suites.catalog import load_suite
 

@@ -1,4 +1,4 @@
-"""What a run says of a policy as a whole: pooled rates, crashes, episodes that do not count."""
+"""The summary of a run: pooled rates, crashes, and invalid episodes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from cosim.results.table import summary_of, why_inconclusive
 
 
 def table(*rows: tuple[float, float, float], crashed: int = 0, invalid: int = 0) -> pd.DataFrame:
-    """metres travelled, failures, metres of route of each episode that is done; and so many
-    others."""
+    """The table of finished episodes with metres travelled, failures and route metres, and of
+    others by status."""
     done = [
         dict.fromkeys(METRICS, None)
         | {
@@ -34,8 +34,7 @@ def table(*rows: tuple[float, float, float], crashed: int = 0, invalid: int = 0)
 
 
 def test_a_rate_of_a_run_is_all_failures_on_all_metres() -> None:
-    """2 m with 10 failures, 400 m with none, 0 m with 19: 29 on 402 m, not the mean of 500 and 0;
-    and the one that stands counts on the way that it should have driven."""
+    """10, 0 and 19 failures on 2, 400 and 0 m are 29 on 402 m travelled and on 800 m of route."""
     three = table((2.0, 10, 100.0), (400.0, 0, 400.0), (0.0, 19, 300.0))
     summary = summary_of(three, ["failures_per_100m", "failures_per_100m_route"])
     assert summary["mean"].tolist() == pytest.approx([100 * 29 / 402, 100 * 29 / 800])
@@ -44,7 +43,7 @@ def test_a_rate_of_a_run_is_all_failures_on_all_metres() -> None:
 
 
 def test_a_robot_that_never_moved_has_no_rate_but_failures_on_its_route() -> None:
-    """Nothing travelled: no rate per 100 m travelled, and not 0."""
+    """Without travel there is no rate per 100 m travelled, rather than 0."""
     stands = summary_of(table((0.0, 30, 300.0)), ["failures_per_100m", "failures_per_100m_route"])
     assert (
         np.isnan(stands.loc["failures_per_100m", "mean"])
@@ -55,23 +54,24 @@ def test_a_robot_that_never_moved_has_no_rate_but_failures_on_its_route() -> Non
 @pytest.mark.parametrize(
     "name", ["failures_per_100m", "failures_per_100m_route", "collisions_per_100m"]
 )
-def test_who_crashes_before_it_fails_has_no_rate(name: str) -> None:
-    """An episode given up cannot make a rate better: there is none."""
+def test_a_crash_before_a_failure_leaves_no_rate(name: str) -> None:
+    """An aborted episode cannot improve a rate."""
     rows: Sequence[tuple[float, float, float]] = [(300.0, 1, 300.0)] * 4
     assert np.isnan(summary_of(table(*rows, crashed=1), [name]).loc[name, "mean"])
 
 
-def test_crashing_improves_no_metric_that_is_ranked() -> None:
-    """Beside an episode that went badly, and alone: a crash makes each such mean worse, or there is
-    none."""
+def test_a_crash_improves_no_ranked_metric() -> None:
+    """Beside a bad episode, and alone, a crash makes each such mean worse or absent."""
     for name, metric in METRICS.items():
         if metric.higher_is_better is None:
             continue
         worst = WORST.get(name)
         assert (worst is None) == (name in UNKNOWN_WITH_CRASH), name
-        one = table((300.0, 0, 300.0), crashed=1)
-        one.loc[0, name] = 0.4
-        both, crash = (summary_of(part, [name]).loc[name] for part in (one, one[1:]))
+        crashed_once = table((300.0, 0, 300.0), crashed=1)
+        crashed_once.loc[0, name] = 0.4
+        both, crash = (
+            summary_of(part, [name]).loc[name] for part in (crashed_once, crashed_once[1:])
+        )
         if worst is None:
             assert both["n"] == crash["n"] == 0 and np.isnan([both["mean"], crash["mean"]]).all()
         else:
@@ -79,9 +79,8 @@ def test_crashing_improves_no_metric_that_is_ranked() -> None:
             assert both["mean"] == 0.2, name
 
 
-def test_a_crash_touches_and_leaves_nothing() -> None:
-    """No person, thing, edge or rule of a crashed episode is counted, and its row has no count of
-    them."""
+def test_a_crash_adds_to_no_count() -> None:
+    """No person, obstacle, edge or rule of a crashed episode is counted, and its row has no counts."""
     assert {*WORST} == {"success", "goal_reached", "route_completion", "spl", "velocity_mean_mps"}
     shares = {name for name, metric in METRICS.items() if metric.share}
     assert shares == {
@@ -94,9 +93,9 @@ def test_a_crash_touches_and_leaves_nothing() -> None:
     }
 
 
-def test_an_invalid_episode_is_in_no_mean_and_two_in_a_hundred_spoil_a_table() -> None:
-    """The denominator is what was scheduled less what is invalid; more than 2 % of that, and nobody
-    is to quote it."""
+def test_invalid_episodes_are_in_no_mean_and_over_2_percent_make_it_inconclusive() -> None:
+    """The denominator excludes them, and above 2 %, or with unfinished episodes, the table is
+    inconclusive."""
     few = table(*[(10.0, 0, 10.0)] * 98, invalid=2)
     assert (
         summary_of(few, ["success"]).loc["success", "n"] == 98 and why_inconclusive(few, 100) == ""

@@ -38,8 +38,8 @@ MAP = StreetMap("m", (-50.0, -9.0, 50.0, 9.0), {":j_c0": CROSSING}, {}, {"r_0": 
 
 
 def street(speed_mps: float, walk: bool | None = None, people: People | None = None) -> Street:
-    """A car whose bumper is at x = 2, heading east; the crossing's signal, None for an unsignalised
-    one."""
+    """A street with a car whose bumper is at x = 2, heading east, and a crossing signal, None for
+    unsignalised."""
     car = Vehicles.of(("v0",), [[0.0, 0.0]], [0.0], [speed_mps], [[4.0, 2.0]])
     signals = {} if walk is None else {":j_c0": Signal(walk)}
     return Street(
@@ -77,7 +77,7 @@ def test_the_carriageway_is_the_road_and_the_red_crossing(
 
 
 def test_a_vehicle_that_brakes_for_the_robot_counts_once() -> None:
-    """A car that loses 3 m/s2 before a robot on the road is counted at the first tick, and anew
+    """A car that brakes at 3 m/s2 before a robot on the road counts at the first tick, and again
     after two seconds."""
     roadway = TrafficMonitor(MAP, 0.05)
     ticks = (0, 1, 2, 60)
@@ -85,8 +85,8 @@ def test_a_vehicle_that_brakes_for_the_robot_counts_once() -> None:
     assert seen == [RoadState(True, 1), RoadState(True, 0), RoadState(True, 0), RoadState(True, 1)]
 
 
-def test_only_hard_braking_for_the_next_in_the_way_counts() -> None:
-    """Not 1 m/s2, not for a robot beside the way or behind, not when a person is nearer."""
+def test_only_hard_braking_for_a_robot_next_in_the_way_counts() -> None:
+    """1 m/s2, a robot aside or behind, and a nearer person do not count."""
     robot = Pose(12.0, 0.5, 0.0)
     person = People.of(("c0",), [[8.0, 0.0]], [0.0], [1.0], ("walk",))
     assert vehicles_braking_for(robot, street(8.0), street(7.85), 0.05) == ["v0"]
@@ -96,9 +96,9 @@ def test_only_hard_braking_for_the_next_in_the_way_counts() -> None:
     assert vehicles_braking_for(robot, street(8.0), street(7.85, people=person), 0.05) == []
 
 
-def test_a_green_crossing_makes_nobody_brake() -> None:
-    """Cars that stop while the robot crosses at green stop for their own light; at red they stop
-    for the robot."""
+def test_braking_counts_at_a_red_crossing_only() -> None:
+    """Cars that stop while the robot crosses at green stop for their own light, and at red for the
+    robot."""
     for walk, braked in ((True, 0), (False, 1)):
         seen = TrafficMonitor(MAP, 0.05).update(
             step(0, 20.0, 0.5, street(8.0, walk), street(7.8, walk))
@@ -106,9 +106,9 @@ def test_a_green_crossing_makes_nobody_brake() -> None:
         assert seen.braked == braked
 
 
-def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
-    """On a walk over sidewalk, corner and crossing in a fixed order, red and green, it says what a
-    fresh one says."""
+def test_cached_lookups_on_the_sidewalk_equal_fresh_ones() -> None:
+    """A walk over sidewalk, corner and crossing, at red and green, gives the answers of a new
+    instance."""
     side = Strip(
         "s",
         "sidewalk",
@@ -127,7 +127,7 @@ def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
             return super().locate(x_m, y_m, slack_m)
 
     counted = Counted(**{f.name: getattr(street_map, f.name) for f in fields(street_map) if f.init})
-    kept = TrafficMonitor(counted, 0.05)
+    cached = TrafficMonitor(counted, 0.05)
     rng = np.random.default_rng(4)
     walk = np.concatenate(
         [
@@ -138,14 +138,13 @@ def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
     for tick, (x_m, y_m) in enumerate(walk.tolist()):
         after = street(7.7, tick % 2 == 0)
         this = step(100 * tick, x_m, y_m, street(8.0, tick % 2 == 0), after)
-        assert kept.update(this) == TrafficMonitor(street_map, 0.05).update(this)
+        assert cached.update(this) == TrafficMonitor(street_map, 0.05).update(this)
         if tick == 99:
             assert len(looks) == 1
 
 
-def test_who_waits_on_the_seam_before_a_red_crossing_is_not_on_the_road() -> None:
-    """The crossing's ground reaches half a metre beyond its line, to the kerb: only between the
-    ends is it road."""
+def test_a_robot_on_the_kerb_before_a_red_crossing_is_not_on_the_road() -> None:
+    """The crossing's ground extends half a metre beyond its line, but only its line is road."""
     seamed = replace(CROSSING, polygon=shapely.box(18.0, -4.5, 22.0, 4.5))
     street_map = StreetMap("m", MAP.bounds, {":j_c0": seamed}, {}, {}, {})
     after = street(0.0, walk=False)

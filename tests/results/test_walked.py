@@ -28,8 +28,8 @@ LEGGED = [robot for robot in ROBOTS.values() if isinstance(robot.drive, Legs)]
 
 
 @pytest.mark.parametrize("cycle_ticks", [4.2, 16.0])
-def test_sway_is_no_way_and_the_ends_of_the_path_count(cycle_ticks: float) -> None:
-    """A robot that sways by 2 cm to either side covers the straight; a reset adds nothing."""
+def test_sway_adds_no_distance_and_the_path_counts_to_its_ends(cycle_ticks: float) -> None:
+    """A robot that sways by 2 cm has the length of the straight, and a reset adds nothing."""
     ticks = np.arange(400)
     sway_m = 0.02 * np.sin(2.0 * np.pi * ticks / cycle_ticks)
     xy = np.column_stack([0.05 * ticks, sway_m])
@@ -45,15 +45,15 @@ def test_sway_is_no_way_and_the_ends_of_the_path_count(cycle_ticks: float) -> No
 
 
 def test_a_curve_has_its_length() -> None:
-    """A quarter of a circle of 2 m at 1 m/s loses less than 1 % by the means."""
+    """A quarter circle of 2 m at 1 m/s loses less than 1 % by the averaging."""
     turn = np.arange(0.0, np.pi / 2.0, 0.025)
     xy = 2.0 * np.column_stack([np.sin(turn), 1.0 - np.cos(turn)])
     way_m = walked_m(xy, np.full(len(xy), np.nan), 16.0).sum()
     assert way_m == pytest.approx(2.0 * turn[-1], rel=0.01)
 
 
-def test_another_way_than_that_of_the_poses_contradicts_the_trajectory() -> None:
-    """With legs the way follows from the poses: neither a longer nor a shorter one passes."""
+def test_a_distance_that_differs_from_the_poses_is_refused() -> None:
+    """With legs neither a longer nor a shorter distance passes."""
     way = short_way("s", robot="dog")
     record, log = episode_of(way, "h")
     assert log is not None
@@ -68,8 +68,8 @@ def test_another_way_than_that_of_the_poses_contradicts_the_trajectory() -> None
 
 
 @pytest.mark.parametrize("columns", [tuple(COLUMNS), BRIEF_COLUMNS])
-def test_the_recorder_records_the_way_of_the_poses(columns: tuple[str, ...]) -> None:
-    """Also where only the columns of a search are recorded; without a gait it is as driven."""
+def test_the_recorder_records_the_distance_of_the_poses(columns: tuple[str, ...]) -> None:
+    """So it does with the columns of a search alone, and without a gait the distance is as driven."""
 
     def travelled_m(cycle_s: float) -> Floats:
         recorder = Recorder(TICK_S, (0.7, 0.3), columns, cycle_s)

@@ -1,4 +1,4 @@
-"""Which ends of a session may be opened, and in which words the others are refused."""
+"""Allowed endpoints of a session, and the refusals of others."""
 
 from __future__ import annotations
 
@@ -25,16 +25,15 @@ BEYOND = (
 
 
 @pytest.mark.parametrize("endpoint", LOOPBACK)
-def test_this_machine_alone_needs_nothing_more(endpoint: str) -> None:
-    """Loopback and Unix sockets are opened as they are, and nothing is said of danger."""
+def test_local_endpoints_need_no_security(endpoint: str) -> None:
+    """Loopback and Unix sockets are opened without a warning."""
     assert Connection(role="coordinator", listen=endpoint).warning == ""
     assert Connection(role="viewer", connect=endpoint, insecure=True).warning == ""
 
 
 @pytest.mark.parametrize("endpoint", BEYOND)
-def test_beyond_this_machine_needs_tls_or_a_word(endpoint: str) -> None:
-    """Without either it is refused with both remedies; --insecure says in one line what it
-    means."""
+def test_remote_endpoints_need_tls_or_insecure(endpoint: str) -> None:
+    """Without either the refusal has both remedies, and --insecure explains itself in one line."""
     with pytest.raises(UsageError, match="may watch, inject") as refused:
         Connection(role="coordinator", listen=endpoint)
     assert f"Use tls/{endpoint[4:]} with --tls FOLDER" in str(
@@ -52,9 +51,9 @@ def test_beyond_this_machine_needs_tls_or_a_word(endpoint: str) -> None:
     )
 
 
-def test_contradictions_are_refused() -> None:
-    """TLS without files, files without TLS, both and insecure, two endpoints or none, one who never
-    listens, others."""
+def test_contradictory_options_are_refused() -> None:
+    """They include TLS without files, files without TLS, both TLS and insecure, two endpoints, and
+    none."""
     cases: list[tuple[str, dict[str, object]]] = [
         ("needs --tls FOLDER, which holds ca.pem", {"listen": "tls/0.0.0.0:7447"}),
         ("--tls goes with tls/ADDRESS:PORT", {"listen": "tcp/127.0.0.1:7447", "tls": "certs"}),
@@ -78,13 +77,13 @@ def test_contradictions_are_refused() -> None:
             Connection(**{"role": "coordinator", **given})  # type: ignore[arg-type]
 
 
-def test_it_travels_to_other_processes_as_it_is() -> None:
-    """A connection is the same after MessagePack, and is checked again there."""
+def test_a_connection_survives_encoding() -> None:
+    """A connection is equal after MessagePack, and is checked again when decoded."""
     role: Role = "worker"
-    one = Connection(role=role, connect="tls/hub.lan:7447", tls="certs/worker")
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(one), type=Connection) == one
+    connection = Connection(role=role, connect="tls/hub.lan:7447", tls="certs/worker")
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(connection), type=Connection) == connection
     there = Connection(role="coordinator", connect="tls/gpu.lan:7449", tls="certs/coordinator")
-    assert there.seen_by(one) == Connection(
+    assert there.seen_by(connection) == Connection(
         role="worker", connect="tls/gpu.lan:7449", tls="certs/worker"
     )
     with pytest.raises(UsageError, match="needs --tls FOLDER"):

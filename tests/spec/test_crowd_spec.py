@@ -1,4 +1,4 @@
-"""What a scenario may ask of its crowd."""
+"""The settings of a scenario's crowd."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from cosim.core.errors import SpecError
 from cosim.spec.scenario import City, CrowdSpec, Scenario, content_hash
 
 
-def test_a_density_comes_back_from_its_file() -> None:
-    """With and without one."""
+def test_a_crowd_survives_its_file() -> None:
+    """A scenario reads back equal with and without a density."""
     for spec in (CrowdSpec(persons=12), CrowdSpec(density=32.5)):
         assert msgspec.json.decode(msgspec.json.encode(spec), type=CrowdSpec) == spec
 
 
-def test_a_density_that_makes_no_sense_is_refused() -> None:
-    """Too many, less than nobody, and a density beside a number of persons."""
+def test_an_invalid_density_is_refused() -> None:
+    """Too high, negative, and a density in addition to a number of persons are refused."""
     for density in (-1.0, 400.0):
         with pytest.raises(SpecError, match=r"crowd density must be in \[0, 150\] per 1000 m2"):
             CrowdSpec(density=density)
@@ -24,9 +24,9 @@ def test_a_density_that_makes_no_sense_is_refused() -> None:
         CrowdSpec(persons=20, density=30.0)
 
 
-def test_shares_that_cannot_be_are_refused() -> None:
-    """Shares beyond 0 to 1, more children than groups can take, more elderly than there are
-    others."""
+def test_impossible_shares_are_refused() -> None:
+    """They are outside 0 to 1, more children than groups can have, or more elderly people than
+    remain."""
     for field in ("groups", "elderly", "children"):
         with pytest.raises(SpecError, match=rf"crowd {field} must be a share in \[0, 1\], not 1.2"):
             CrowdSpec(**{field: 1.2})
@@ -42,7 +42,8 @@ def test_shares_that_cannot_be_are_refused() -> None:
 
 
 def test_every_field_of_a_scenario_is_in_its_hash() -> None:
-    """Defaults too: a default that changes, changes every hash. Clear weather alone is left out."""
+    """Defaults are included, so that a changed default changes every hash; only clear weather is
+    left out."""
     scenario = Scenario(
         id="a",
         suite="s",

@@ -1,4 +1,4 @@
-"""Whether scenarios fit their places: on a crossroads drawn by hand."""
+"""The check that scenarios fit their places, on a crossroads drawn by hand."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def a_bin(**at: float) -> Obstacle:
 
 
 def from_west_to_east(**changes: Any) -> Scenario:
-    """60 m along the sidewalk and over the crossing, the north closed, somebody standing on the
-    way."""
+    """A route of 60 m along the sidewalk and over the crossing, the north closed, with a person on
+    the way."""
     fields: dict[str, Any] = {
         "route": ((-30.0, 0.0), (0.0, 0.0), (30.0, 0.0)),
         "crossings": (RouteCrossing(id="east", enter_s_m=32.0, leave_s_m=60.0, signalised=True),),
@@ -88,14 +88,14 @@ def from_west_to_east(**changes: Any) -> Scenario:
     )
 
 
-def test_what_fits_is_not_spoken_of() -> None:
-    """A way on the sidewalk and over the crossing, its barrier where it closes a branch, its event
-    on the way."""
+def test_a_fitting_scenario_has_no_faults() -> None:
+    """Its way is on sidewalk and crossing, its barrier closes a branch, and its event is on the
+    way."""
     assert list(misfits([from_west_to_east()], crossroads())) == []
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         (
             {"route": ((-30.0, 1.8), (0.0, 0.0), (30.0, 0.0))},
@@ -167,15 +167,17 @@ def test_what_fits_is_not_spoken_of() -> None:
         "obstacle-on-goal",
     ],
 )
-def test_what_does_not_fit_is_named_with_its_place(changes: dict[str, Any], told: str) -> None:
-    """Field, number or id, and where it is."""
-    assert list(misfits([from_west_to_east(**changes)], crossroads())) == [f"scenario 's': {told}"]
+def test_a_fault_is_named_with_its_place(changes: dict[str, Any], expected: str) -> None:
+    """The message has field, number or id, and position."""
+    assert list(misfits([from_west_to_east(**changes)], crossroads())) == [
+        f"scenario 's': {expected}"
+    ]
 
 
-def test_a_density_makes_no_more_people_than_may_be_asked_for(
+def test_a_density_respects_the_limit_of_people(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """How many it makes is known where the map is: 400 m2 hold 60 people at 150 per 1000 m2."""
+    """The number depends on the map: 400 m2 hold 60 people at 150 per 1000 m2."""
     monkeypatch.setattr(fits, "MAX_PERSONS", 59)
     dense = from_west_to_east(crowd=CrowdSpec(density=150.0))
     assert list(misfits([dense], crossroads())) == [
@@ -185,7 +187,7 @@ def test_a_density_makes_no_more_people_than_may_be_asked_for(
 
 
 def test_a_scenario_far_from_everything_is_not_on_the_map() -> None:
-    """One message, however much of it is off."""
+    """One message says so, however many parts are off."""
     far = from_west_to_east(
         route=((5000.0, 0.0), (5060.0, 0.0)), crossings=(), barriers=(), events=()
     )
@@ -194,11 +196,10 @@ def test_a_scenario_far_from_everything_is_not_on_the_map() -> None:
     ]
 
 
-def test_every_place_is_looked_at_once_and_all_is_told_together(
+def test_every_place_is_read_once_and_all_faults_are_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """However many scenarios a place has, in whatever order; a robot or a sky that is not there is
-    told once."""
+    """Scenarios of a place may be in any order; an unknown robot or sky is reported once."""
     made = []
 
     def place(where: City) -> tuple[None, StreetMap]:
@@ -213,33 +214,33 @@ def test_every_place_is_looked_at_once_and_all_is_told_together(
         for i in range(3)
         for name, one, seed in (("fine", fine, 1), ("odd", odd, 2))
     )
-    whole = Suite(name="w", version="1", scenarios=scenarios)
-    with pytest.raises(SpecError) as told:
-        check_places(whole, scenarios)
+    suite = Suite(name="w", version="1", scenarios=scenarios)
+    with pytest.raises(SpecError) as caught:
+        check_places(suite, scenarios)
     assert made == [1, 2]
-    head, *faults = str(told.value).splitlines()
+    head, *faults = str(caught.value).splitlines()
     assert head == "suite 'w': 5 faults:"
     assert f"unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}" in faults[0]
     assert "hdri 'nowhere.hdr' does not exist" in faults[1]
     assert all(f"scenario 'odd-{i}': event 'e0' is off" in faults[2 + i] for i in range(3))
-    check_places(whole, [s for s in scenarios if s.id.startswith("fine")])
+    check_places(suite, [s for s in scenarios if s.id.startswith("fine")])
 
 
-def test_many_places_are_looked_at_by_several_processes() -> None:
-    """The same is told in the same order as by one."""
+def test_several_processes_report_the_same_faults() -> None:
+    """Many places give the same faults in the same order as with one process."""
     where = [CityMap(map=f"nowhere-{i}") for i in range(16)]
     lost = tuple(
         msgspec.structs.replace(from_west_to_east(), id=f"s{i}", place=at)
         for i, at in enumerate(where)
     )
-    whole = Suite(name="w", version="1", scenarios=lost)
-    told = []
+    suite = Suite(name="w", version="1", scenarios=lost)
+    messages = []
     for jobs in (1, 2):
         with pytest.raises(SpecError) as refusal:
-            check_places(whole, lost, jobs=jobs)
-        told.append(str(refusal.value))
+            check_places(suite, lost, jobs=jobs)
+        messages.append(str(refusal.value))
     assert (
-        told[0] == told[1]
-        and "16 faults" in told[0]
-        and "scenario 's4': unknown map 'nowhere-4'" in told[0]
+        messages[0] == messages[1]
+        and "16 faults" in messages[0]
+        and "scenario 's4': unknown map 'nowhere-4'" in messages[0]
     )

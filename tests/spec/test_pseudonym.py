@@ -1,5 +1,4 @@
-"""What a policy is told in place of a scenario's name: it tells nothing to who does not know the
-run's seed."""
+"""Pseudonyms of scenarios, which reveal nothing to a policy without the run's seed."""
 
 from __future__ import annotations
 
@@ -18,20 +17,20 @@ from tests.support.shipped import all_shipped
 
 @settings(max_examples=12)
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))
-def test_no_two_runs_tell_the_same(one: int, other: int) -> None:
+def test_pseudonyms_of_two_runs_are_distinct(expected: int, other: int) -> None:
     """Names and seeds of all shipped scenarios are distinct within a run, and between runs of
     different seeds."""
-    called = [episode_id_of(one, scenario) for scenario in all_shipped()]
+    called = [episode_id_of(expected, scenario) for scenario in all_shipped()]
     assert len({name for name, _ in called}) == len(all_shipped()) == len(set(called))
-    if one != other:
+    if expected != other:
         assert not {name for name, _ in called} & {
             episode_id_of(other, scenario).episode for scenario in all_shipped()
         }
 
 
-def test_a_name_tells_neither_event_nor_order() -> None:
-    """Twelve characters of a hash; the order of the names is another one for every seed, and none
-    is the suite's."""
+def test_a_pseudonym_reveals_neither_event_nor_order() -> None:
+    """It is twelve characters of a hash, and their order changes with the seed and is never the
+    suite's."""
     orders = []
     for seed in range(6):
         names = [episode_id_of(seed, scenario).episode for scenario in all_shipped()]
@@ -44,8 +43,9 @@ def test_a_name_tells_neither_event_nor_order() -> None:
     assert len(set(orders)) == 6 and tuple(range(len(all_shipped()))) not in orders
 
 
-def test_it_is_the_same_everywhere_and_hangs_on_the_scenario_alone() -> None:
-    """Fixed by hand here, so that a run that is finished by another version keeps its names."""
+def test_a_pseudonym_is_stable_across_versions() -> None:
+    """It depends on seed and scenario alone and is fixed here, so that another version can finish a
+    run."""
     scenario = all_shipped()[0]
     assert episode_id_of(5, scenario) == episode_id_of(
         5, msgspec.structs.replace(scenario, robot="scout")
@@ -60,8 +60,8 @@ def test_it_is_the_same_everywhere_and_hangs_on_the_scenario_alone() -> None:
     )
 
 
-def test_a_run_draws_a_seed_that_cannot_be_tried_through() -> None:
-    """Each time another one, of 53 bits."""
+def test_a_run_draws_a_seed_that_cannot_be_guessed() -> None:
+    """Each draw gives another seed, of 53 bits."""
     drawn = [random_run_seed() for _ in range(200)]
     assert (
         len(set(drawn)) == 200 and max(drawn) > 2**48 and all(0 <= seed < 2**53 for seed in drawn)
@@ -69,8 +69,8 @@ def test_a_run_draws_a_seed_that_cannot_be_tried_through() -> None:
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63], ids=["negative", "too-large"])
-def test_what_is_no_seed_is_refused(seed: int) -> None:
-    """In words, before anything is run."""
+def test_an_invalid_seed_is_refused(seed: int) -> None:
+    """It is refused with a reason before anything runs."""
     with pytest.raises(
         UsageError,
         match=f"a seed of {seed}: it must be a whole number from 0 to 9223372036854775807",

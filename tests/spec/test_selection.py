@@ -1,4 +1,4 @@
-"""Which scenarios of a suite are chosen, and by which options they were."""
+"""Selection of a suite's scenarios, and the options that describe a selection."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def reactive() -> Suite:
 
 
 def test_static_is_chosen_like_an_event(reactive: Suite) -> None:
-    """The hundred scenarios without an event are found by name, alone and with an event."""
+    """The hundred scenarios without an event are selected by name, alone and with an event."""
     assert {s.structure for s in select_scenarios(reactive, kinds=["static"])} == {"static"}
     assert len(select_scenarios(reactive, kinds=["static"])) == 100
     assert len(select_scenarios(reactive, kinds=["frontal", "static"])) == 300
@@ -54,7 +54,7 @@ CHOICES: dict[str, dict[str, object]] = {
 
 @pytest.mark.parametrize("words", CHOICES)
 def test_the_options_that_chose_scenarios_are_found(reactive: Suite, words: str) -> None:
-    """From the ids alone: the fewest options that choose these and no others."""
+    """The fewest options that select exactly these scenarios are found from the ids."""
     chosen = select_scenarios(reactive, **CHOICES[words])  # type: ignore[arg-type]
     assert selection_in_words(reactive, [scenario.id for scenario in chosen]) == words
 
@@ -62,8 +62,7 @@ def test_the_options_that_chose_scenarios_are_found(reactive: Suite, words: str)
 def test_a_run_resumed_with_another_selection_names_the_options(
     reactive: Suite, tmp_path: Path
 ) -> None:
-    """How many scenarios the run has and how many are asked for, with the options of both, in place
-    of two lists."""
+    """The message has both numbers of scenarios and both sets of options, rather than two lists."""
 
     def spec(ids: list[str]) -> RunSpec:
         return msgspec.structs.replace(spec_of(reactive), scenarios=tuple(ids))
@@ -87,7 +86,7 @@ def test_a_run_resumed_with_another_selection_names_the_options(
 
 
 def with_decoys_of(reactive: Suite) -> Suite:
-    """Ten scenarios of four kinds; all but `static` have a decoy, and all decoys are at the end."""
+    """Ten scenarios of four kinds, and decoys of all but `static` at the end."""
     few = [
         one
         for one in reactive.scenarios
@@ -119,26 +118,27 @@ PAIRED_CHOICES: dict[str, dict[str, object]] = {
 
 @pytest.mark.parametrize("words", PAIRED_CHOICES)
 def test_decoys_are_chosen_with_their_scenarios(reactive: Suite, words: str) -> None:
-    """By kind, number and split, unless they are left out; an id chooses one alone. The options
-    are found from the ids."""
-    whole = with_decoys_of(reactive)
-    chosen = select_scenarios(whole, **PAIRED_CHOICES[words])  # type: ignore[arg-type]
-    assert selection_in_words(whole, [scenario.id for scenario in chosen]) == words
+    """Kind, number and split include them unless excluded, an id selects one, and the options are
+    found from the ids."""
+    suite = with_decoys_of(reactive)
+    chosen = select_scenarios(suite, **PAIRED_CHOICES[words])  # type: ignore[arg-type]
+    assert selection_in_words(suite, [scenario.id for scenario in chosen]) == words
 
 
 def test_episodes_counts_pairs_wherever_their_decoys_are(reactive: Suite) -> None:
-    """Three scenarios and their decoys, in the order of the suite; `static` has none."""
-    whole = with_decoys_of(reactive)
-    chosen = select_scenarios(whole, episodes=3)
-    first = [one.id for one in whole.scenarios[:3]]
-    decoys = [one.id for one in whole.scenarios if one.decoy_of in first]
+    """--episodes 3 selects three scenarios and their decoys in suite order, of which `static` has
+    none."""
+    suite = with_decoys_of(reactive)
+    chosen = select_scenarios(suite, episodes=3)
+    first = [one.id for one in suite.scenarios[:3]]
+    decoys = [one.id for one in suite.scenarios if one.decoy_of in first]
     assert [one.id for one in chosen] == [*first, *decoys] and decoys
     with pytest.raises(UsageError, match="--no-decoys: only decoys of suite 'reactive' are chosen"):
-        select_scenarios(whole, ["frontal-001-decoy"], decoys=False)
+        select_scenarios(suite, ["frontal-001-decoy"], decoys=False)
 
 
 def test_shards_keep_pairs_together(reactive: Suite) -> None:
-    """However many they are, each scenario is in one shard, its decoy in the same."""
+    """For any number of shards each scenario is in one, with its decoy."""
     pairs = scenario_pairs(with_decoys_of(reactive).scenarios)
     assert sorted(map(len, pairs)) == [1] * 2 + [2] * 8
     for of in (2, 3, 7):
@@ -156,17 +156,19 @@ def test_shards_keep_pairs_together(reactive: Suite) -> None:
         )
 
 
-def test_nothing_that_a_policy_gets_tells_a_decoy(reactive: Suite) -> None:
-    """Ids, seeds and order of a pair are drawn independently of each other: over many seeds of a
-    run, each of them puts the decoy first in about half of all pairs."""
+def test_nothing_that_a_policy_gets_reveals_a_decoy(reactive: Suite) -> None:
+    """Ids, seeds and order of a pair are independent: over many run seeds each puts the decoy first
+    half the time."""
     pairs = [pair for pair in scenario_pairs(with_decoys_of(reactive).scenarios) if len(pair) == 2]
-    told = [[episode_id_of(seed, one) for one in pair] for seed in range(250) for pair in pairs]
+    pseudonyms = [
+        [episode_id_of(seed, one) for one in pair] for seed in range(250) for pair in pairs
+    ]
     drawn = [
         [[seed_for(purpose, seed, one) for one in pair] for seed in range(250) for pair in pairs]
         for purpose in ("policy", "goal", "odometry")
     ]
-    assert drawn[0] == [[one.seed for one in pair] for pair in told]
-    for values in (told, *drawn):
+    assert drawn[0] == [[one.seed for one in pair] for pair in pseudonyms]
+    for values in (pseudonyms, *drawn):
         decoy_first = sum(decoy < event for event, decoy in values)
         assert 900 < decoy_first < 1100
-    assert all(len(one.episode) == 12 for pair in told for one in pair)
+    assert all(len(one.episode) == 12 for pair in pseudonyms for one in pair)

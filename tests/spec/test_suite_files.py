@@ -1,5 +1,4 @@
-"""What a suite file may hold: everything else is refused in words, every fault at once, before
-anything runs."""
+"""Valid content of a suite file: everything else is refused with every fault before anything runs."""
 
 from __future__ import annotations
 
@@ -21,10 +20,10 @@ from scenarios.suites.catalog import SUITES, load_suite
 from tests.support.mutate_suites import fates, mutated, small_suite
 
 PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|nested too deep")
-"""How a refusal says where in the file something is wrong."""
+"""Pattern of the place in the file that a refusal names."""
 
 
-def sound() -> dict[str, Any]:
+def valid_suite() -> dict[str, Any]:
     """The file of a suite of three: a long way with barriers, crossings and events, and two short
     ones with groups."""
     chosen = [s for s in load_suite("long-horizon").scenarios if s.id == "lh-037-00"]
@@ -39,41 +38,40 @@ def sound() -> dict[str, Any]:
 
 
 def refusal(path: Path, data: bytes | str) -> str:
-    """What is said of a file with this content, the file's name taken away."""
+    """Return the refusal of a file with this content, without the file's name."""
     path.write_bytes(data if isinstance(data, bytes) else data.encode())
-    with pytest.raises(SpecError) as told:
+    with pytest.raises(SpecError) as caught:
         read_suite(path, EVENT_KINDS)
-    message = str(told.value)
+    message = str(caught.value)
     assert message.startswith(f"{path}: ")
     return message.removeprefix(f"{path}: ")
 
 
-def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) -> None:
-    """Whatever a file holds: a suite, or a short refusal of printable lines, each of which names
-    its place."""
-    whole = sound()
+def test_a_thousand_mutated_suites_are_read_or_refused_with_reasons(tmp_path: Path) -> None:
+    """Any file is a suite, or has a short refusal of printable lines that each name their place."""
+    suite = valid_suite()
     path = tmp_path / "mutated.json"
     accepted = 0
     for seed in range(1000):
-        path.write_bytes(mutated(whole, seed))
+        path.write_bytes(mutated(suite, seed))
         try:
             read_suite(path, EVENT_KINDS)
             accepted += 1
         except SpecError as error:
-            told = str(error).removeprefix(f"{path}: ")
-            lines = told.splitlines()
+            message = str(error).removeprefix(f"{path}: ")
+            lines = message.splitlines()
             assert len(lines) <= 6 and all(
                 line.isprintable() and len(line) <= 500 for line in lines
-            ), (seed, told)
+            ), (seed, message)
             faults = lines[1:] if len(lines) > 1 else lines
-            assert all(PLACE.search(line) for line in faults), (seed, told)
+            assert all(PLACE.search(line) for line in faults), (seed, message)
     assert 100 < accepted < 600
 
 
 @pytest.mark.engine
 def test_mutated_suites_that_are_accepted_can_be_driven(tmp_path: Path) -> None:
-    """Of those that the reader and the map let through eight are driven for two seconds: none
-    crashes. (`python -m tests.support.mutate_suites` drives 200.)"""
+    """Eight that reader and map accept are driven for 2 s without a crash (`python -m
+    tests.support.mutate_suites`: 200)."""
     driven = []
     for fate in fates(small_suite(City(seed=1, size_m=500.0)), tmp_path, count(0)):
         if fate.what == "does not fit its place":
@@ -173,36 +171,34 @@ OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
     ),
     (("first", "ends_at"), "stop", "ends_at 'stop' needs an event 'gesturing'"),
 )
-"""Where in the file (`first`: in its first scenario), what stands there, and what is said of it."""
+"""Where in the file (`first`: in its first scenario), its value, and the expected message."""
 
 
 @pytest.mark.parametrize(
-    ("where", "value", "told"),
+    ("where", "value", "expected"),
     OUT_OF_RANGE,
     ids=[".".join(map(str, where)) for where, _, _ in OUT_OF_RANGE],
 )
 def test_a_value_out_of_its_range_is_named(
-    tmp_path: Path, where: tuple[str | int, ...], value: object, told: str
+    tmp_path: Path, where: tuple[str | int, ...], value: object, expected: str
 ) -> None:
-    """The field, its range and what was found; numbers that JSON does not know, such as NaN, are
-    told as any other."""
-    whole: Any = sound()
+    """The message has field, range and value, also for numbers that JSON lacks, such as NaN."""
+    suite: Any = valid_suite()
     *holders, key = where
-    holder = whole
+    holder = suite
     for step in holders:
         holder = holder["scenarios"][0] if step == "first" else holder[step]
     holder[key] = value
-    assert told in refusal(tmp_path / "s.json", json.dumps(whole))
+    assert expected in refusal(tmp_path / "s.json", json.dumps(suite))
 
 
-def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
-    """One on a line, the first five of many; wrong types, unknown fields and contradictions
-    alike."""
-    whole = sound()
-    first, second, third = whole["scenarios"]
+def test_several_faults_are_reported_at_once(tmp_path: Path) -> None:
+    """Wrong types, unknown fields and contradictions have one line each, at most five."""
+    suite = valid_suite()
+    first, second, third = suite["scenarios"]
     first |= {"seed": "x", "gaol": 1, "crowd": {"persons": -1, "groups": 2.0}, "goal_radius_m": 1e9}
     second["goal"] = [0.0, 0.0]
-    assert refusal(tmp_path / "s.json", json.dumps(whole)).splitlines() == [
+    assert refusal(tmp_path / "s.json", json.dumps(suite)).splitlines() == [
         "5 faults:",
         "  Object contains unknown field `gaol` - at `$.scenarios[0]`. Valid choices: "
         + ", ".join(Scenario.__struct_fields__)
@@ -215,15 +211,15 @@ def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
         f"{tuple(second['route'][-1])} - at `$.scenarios[1]`",
     ]
     third["route"] = [["x", "y"]] * 2000
-    lines = refusal(tmp_path / "s.json", json.dumps(whole)).splitlines()
+    lines = refusal(tmp_path / "s.json", json.dumps(suite)).splitlines()
     assert lines[0] == "1000 faults or more; the first 5:" and len(lines) == 6
 
 
 def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> None:
-    """Cut off, not UTF-8, nested without end: the line and the byte, or what is wrong with the
-    whole."""
-    text = json.dumps(sound(), indent=1).encode()
-    told = {
+    """A file that is cut off, not UTF-8, or nested endlessly is refused with line and byte, or the
+    general fault."""
+    text = json.dumps(valid_suite(), indent=1).encode()
+    expected = {
         text[: text.index(b'"version"')]: "JSON ends too early, line 3, byte 1 of it",
         text.replace(
             b'"version"', b",", 1
@@ -233,15 +229,14 @@ def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> Non
         b"": "JSON ends too early, line 1, byte 0 of it",
         b"[]": "Expected `object`, got `array`",
     }
-    for data, words in told.items():
+    for data, words in expected.items():
         assert refusal(tmp_path / "s.json", data).startswith(words)
     (tmp_path / "s.json").write_bytes(b"\xef\xbb\xbf" + text)
     assert read_suite(tmp_path / "s.json").name == "sound"
 
 
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
-    """A folder, a pipe that nobody writes to, and a file that is not there: no waiting, no reading
-    without end."""
+def test_a_path_that_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    """A folder, a pipe without a writer and a missing file cause no wait and no endless read."""
     os.mkfifo(tmp_path / "pipe.json")
     (tmp_path / "folder.json").mkdir()
     for name, words in (
@@ -253,11 +248,10 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
             read_suite(tmp_path / name)
 
 
-def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_each(
+def test_a_repeated_scenario_is_found_in_linear_time(
     tmp_path: Path,
 ) -> None:
-    """The ids are counted: of 300 hardly any two are compared, and so 48,000 take no longer than
-    their reading."""
+    """Of 300 ids hardly any two are compared, so that 48,000 take no longer than their reading."""
 
     class Counting(str):
         compared = 0
@@ -279,5 +273,5 @@ def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_ea
 
 @pytest.mark.parametrize("name", SUITES)
 def test_the_shipped_suites_keep_their_ranges(name: str) -> None:
-    """They are read without a word."""
+    """They are read without a fault."""
     assert load_suite(name).scenarios

@@ -35,7 +35,7 @@ FOREIGN = (
     "cosim/r/jobs/claim",
 )
 GIVEN_UP_S = 0.5
-"""What is refused is waited for so long: nothing comes, on any machine."""
+"""Time in seconds after which a refused message counts as not delivered."""
 TOKEN = rmw_token(Endpoint("NN", 3, "ab", "driver"))
 
 
@@ -49,7 +49,8 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Hub:
-    """A run's hub and its own process. heard: keys that reached them from outside."""
+    """A run's hub and its own process; `received` are the keys of messages from outside that reached
+    them."""
 
     def __init__(self, certs: Path, stack: ExitStack) -> None:
         self.at = f"tls/localhost:{free_port()}"
@@ -58,12 +59,14 @@ class Hub:
         )
         self.session = stack.enter_context(open_session(end))
         self.run: Session = stack.enter_context(open_session(self.session.inside))
-        self.heard: list[tuple[str, int]] = []
+        self.received: list[tuple[str, int]] = []
         self.tokens: list[str] = []
         for topic, name in OUT.items():
             self.run.advertise(name, latched=int(topic == "/tf_static"))
         self.run.declare_token(rmw_token(Endpoint("NN", 3, "cd", "cosim")))
-        self.run.subscribe("**", lambda name, payload, _: self.heard.append((name, len(payload))))
+        self.run.subscribe(
+            "**", lambda name, payload, _: self.received.append((name, len(payload)))
+        )
         for tokens in ("@ros2_lv/**", "cosim/**"):
             self.run.watch_tokens(tokens, lambda name, alive: self.tokens.append(name))
 
@@ -74,18 +77,17 @@ def hub(certs: Path) -> Iterator[Hub]:
         yield Hub(certs, stack)
 
 
-def test_a_node_hears_sensors_and_tells_commands_alone(certs: Path, hub: Hub) -> None:
-    """It gets every published topic, latched ones later too, and sees the run's token; its commands,
-    plans and tokens arrive, long ones too; what it publishes elsewhere, deletes or answers does
-    not."""
+def test_a_node_receives_topics_and_sends_only_commands_and_plans(certs: Path, hub: Hub) -> None:
+    """A node gets every published topic and sees the run's token; of its messages only commands,
+    plans and tokens arrive."""
     with plain_zenoh(hub.at, certs, "ros2") as guest:
-        got: list[str] = []
-        guest.declare_subscriber("3/**", lambda sample: got.append(str(sample.key_expr)))
+        received: list[str] = []
+        guest.declare_subscriber("3/**", lambda sample: received.append(str(sample.key_expr)))
         for name in OUT.values():
-            guest.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
-        asked: list[str] = []
+            guest.declare_subscriber(name, lambda sample: received.append(str(sample.key_expr)))
+        queried: list[str] = []
         for name in (*IN.values(), *FOREIGN):
-            guest.declare_queryable(name, lambda query: asked.append(str(query.key_expr)))
+            guest.declare_queryable(name, lambda query: queried.append(str(query.key_expr)))
         token = guest.liveliness().declare_token(TOKEN)
         foreign = guest.liveliness().declare_token("cosim/r/workers/one")
         wait_until(lambda: TOKEN in hub.tokens)
@@ -97,19 +99,19 @@ def test_a_node_hears_sensors_and_tells_commands_alone(certs: Path, hub: Hub) ->
             for name in OUT.values():
                 hub.run.publish(name, b"x")
             time.sleep(0.05)
-            return set(OUT.values()) <= set(got)
+            return set(OUT.values()) <= set(received)
 
         wait_until(all_arrived)
         hub.run.publish_lossy("cosim/r/env/e/robot", b"x")
-        hub.heard.clear()
+        hub.received.clear()
         for name in (*FOREIGN, *OUT.values(), IN["/plan"], IN["/cmd_vel"]):
             guest.put(name, b"x")
             guest.delete(name)
         guest.put(IN["/plan"], bytes(MAX_MESSAGE_B))
         guest.put(IN["/cmd_vel"], b"last")
-        wait_until(lambda: (IN["/cmd_vel"], 4) in hub.heard)
+        wait_until(lambda: (IN["/cmd_vel"], 4) in hub.received)
         own = {(name, 1) for name in OUT.values()} | {("cosim/r/env/e/robot", 1)}
-        assert set(hub.heard) - own == {
+        assert set(hub.received) - own == {
             (IN["/plan"], 1),
             (IN["/plan"], MAX_MESSAGE_B),
             (IN["/cmd_vel"], 1),
@@ -117,45 +119,46 @@ def test_a_node_hears_sensors_and_tells_commands_alone(certs: Path, hub: Hub) ->
         }
         for name in (*IN.values(), *FOREIGN):
             assert hub.run.query_all(name, timeout_s=GIVEN_UP_S) == {}
-        assert asked == []
+        assert queried == []
         del token, foreign
 
 
 def test_nodes_do_not_reach_each_other_through_the_run(certs: Path, hub: Hub) -> None:
-    """One node's commands and topics of its own are not passed to another."""
+    """Commands and private topics of one node are not passed to another."""
     with plain_zenoh(hub.at, certs, "ros2") as one, plain_zenoh(hub.at, certs, "ros2") as other:
-        got: list[str] = []
+        received: list[str] = []
         for name in (IN["/cmd_vel"], FOREIGN[0]):
-            other.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
-        hub.heard.clear()
+            other.declare_subscriber(name, lambda sample: received.append(str(sample.key_expr)))
+        hub.received.clear()
         one.put(FOREIGN[0], b"x")
         one.put(IN["/cmd_vel"], b"x")
-        wait_until(lambda: (IN["/cmd_vel"], 1) in hub.heard)
+        wait_until(lambda: (IN["/cmd_vel"], 1) in hub.received)
         time.sleep(GIVEN_UP_S)
-        assert got == []
+        assert received == []
 
 
-def test_without_the_certificate_of_a_node_nothing_is_heard(certs: Path, hub: Hub) -> None:
-    """No certificate: no link. Another role: a link that carries nothing."""
+def test_without_a_node_certificate_nothing_is_received(certs: Path, hub: Hub) -> None:
+    """Without a certificate there is no link; a certificate of another role gives a link that
+    carries nothing."""
     with plain_zenoh(hub.at, certs, "viewer") as viewer:
-        got: list[str] = []
+        received: list[str] = []
         for name in (*OUT.values(), "**"):
-            viewer.declare_subscriber(name, lambda sample: got.append(str(sample.key_expr)))
-        hub.heard.clear()
+            viewer.declare_subscriber(name, lambda sample: received.append(str(sample.key_expr)))
+        hub.received.clear()
         viewer.put(IN["/cmd_vel"], b"forged")
         for name in OUT.values():
             hub.run.publish(name, b"x")
         time.sleep(GIVEN_UP_S)
-        assert (IN["/cmd_vel"], 6) not in hub.heard
-        assert [name for name in got if not name.endswith(IN["/cmd_vel"])] == []
+        assert (IN["/cmd_vel"], 6) not in hub.received
+        assert [name for name in received if not name.endswith(IN["/cmd_vel"])] == []
         assert list(viewer.liveliness().get("@ros2_lv/**", timeout=GIVEN_UP_S)) == []
     with pytest.raises((AccessError, EngineError)):
         open_session(Connection(role="worker", connect=hub.at.replace("tls/", "tcp/")))
 
 
-def test_the_configuration_for_nodes_is_one_that_zenoh_reads(certs: Path, hub: Hub) -> None:
-    """`session.json5` of the role opens a session to the run's machine, once its port is set. It
-    has timestamps, which publishers with a history need."""
+def test_zenoh_opens_a_session_with_the_configuration_for_nodes(certs: Path, hub: Hub) -> None:
+    """`session.json5` of the role connects to the run's machine once its port is set, with the
+    timestamps that history needs."""
     path = certs / "ros2" / "session.json5"
     path.write_text(path.read_text().replace(":7447", f":{hub.at.rpartition(':')[2]}"))
     config = zenoh.Config.from_file(path)
@@ -165,8 +168,8 @@ def test_the_configuration_for_nodes_is_one_that_zenoh_reads(certs: Path, hub: H
 
 
 @pytest.mark.parametrize("host", ["fd00::7", ""])
-def test_the_configuration_for_nodes_names_a_host_in_every_case(tmp_path: Path, host: str) -> None:
-    """An IPv6 address has brackets, and without a coordinator's certificate there is a word to
+def test_the_configuration_for_nodes_always_names_a_host(tmp_path: Path, host: str) -> None:
+    """An IPv6 address has brackets; without a coordinator's certificate there is a placeholder to
     replace."""
     make_authority(tmp_path / "certs", [host or "localhost"], 365)
     if not host:

@@ -58,7 +58,7 @@ DEPTH = np.linspace(0.5, 30.0, 40 * 64, dtype=np.float32).reshape(40, 64)
 NOW_NS = messages.stamp_ns(20)
 
 
-def seen(**more: Any) -> Observation:
+def observation_with(**more: Any) -> Observation:
     """An observation with every sensor that ROS 2 is sent."""
     lidar = ScanSpec(rays=8)
     values: dict[str, Any] = {
@@ -75,8 +75,8 @@ def seen(**more: Any) -> Observation:
 
 @pytest.mark.parametrize("store", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
 def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
-    """Each stored hash equals the one that rosbags computes from the distribution's definition, and
-    every topic has one."""
+    """Each stored hash equals that of rosbags for the distribution's definition, and every topic
+    has one."""
     definitions = get_typestore(store)
     assert {name: definitions.hash_rihs01(name) for name in types.HASHES} == dict(types.HASHES)
     used = {
@@ -87,8 +87,8 @@ def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
 
 
 def test_keys_tokens_and_gids_are_those_of_the_design_document() -> None:
-    """Its examples are read and written again to the letter; qos texts, key, gid and attachment
-    have the documented form."""
+    """Its examples are read and written back to the letter; QoS texts, key, gid and attachment have
+    the documented form."""
     for token in (TALKER, LISTENER):
         end = read_rmw_token(token)
         assert end is not None and rmw_token(end) == token and end.domain == 2
@@ -105,7 +105,7 @@ def test_keys_tokens_and_gids_are_those_of_the_design_document() -> None:
 
 
 def test_a_namespace_is_mangled_in_tokens() -> None:
-    """Slashes of namespaces and topics become %, and are read back; both dialects."""
+    """In both dialects, slashes of namespaces and topics become % and are read back."""
     end = Endpoint(
         "MS", 3, "ab12", "driver", (1, 4), "/env/a", "/env/a/scan",
         "sensor_msgs/msg/LaserScan", types.HASHES["sensor_msgs/msg/LaserScan"],
@@ -120,14 +120,18 @@ def test_a_namespace_is_mangled_in_tokens() -> None:
 
 
 def test_each_message_is_decoded_to_what_was_observed() -> None:
-    """All topics of an observation, as CDR and back: values, frames and stamps; the same bytes each
-    time."""
-    one = seen()
-    sent = {row.name: row.message(one, NOW_NS) for row in messages.TOPICS.values() if row.message}
+    """All topics of an observation survive CDR with values, frames and stamps, as the same bytes
+    each time."""
+    observation = observation_with()
+    sent = {
+        row.name: row.message(observation, NOW_NS)
+        for row in messages.TOPICS.values()
+        if row.message
+    }
     assert sent.pop("/points") is None
-    sent["/goal_pose"] = messages.goal_pose(one, NOW_NS)
-    sent["/tf_static"] = messages.static_tf(one, NOW_NS)
-    sent["/initialpose"] = messages.initial_pose(one, NOW_NS)
+    sent["/goal_pose"] = messages.goal_pose(observation, NOW_NS)
+    sent["/tf_static"] = messages.static_tf(observation, NOW_NS)
+    sent["/initialpose"] = messages.initial_pose(observation, NOW_NS)
     back = {}
     for name, message in sent.items():
         data = types.to_cdr(message)
@@ -141,12 +145,12 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
     assert (image.data.reshape(40, 64, 3) == RGB).all()
     assert (back["/camera/depth"].data.view("<f4").reshape(40, 64) == DEPTH).all()
     info = back["/camera/camera_info"]
-    assert one.camera is not None
-    assert (info.k.reshape(3, 3) == one.camera.matrix).all() and info.p[3] == 0.0
+    assert observation.camera is not None
+    assert (info.k.reshape(3, 3) == observation.camera.matrix).all() and info.p[3] == 0.0
     pose = back["/odom"].pose.pose
     assert (pose.position.x, pose.position.y) == (3.0, -1.0)
     scan = back["/scan"]
-    assert (scan.ranges == one.scan.ranges_m[0]).all()  # type: ignore[union-attr]
+    assert (scan.ranges == observation.scan.ranges_m[0]).all()  # type: ignore[union-attr]
     assert math.isclose(scan.angle_max, math.pi - scan.angle_increment, rel_tol=1e-6)
     assert back["/imu"].linear_acceleration.z == 9.81
     goal = back["/goal_pose"].pose.position
@@ -157,34 +161,36 @@ def test_each_message_is_decoded_to_what_was_observed() -> None:
 
 
 def test_optical_frames_look_ahead() -> None:
-    """The chain base_link -> camera_link -> optical frame of /tf_static is the calibration of the
-    picture, and camera_link has x ahead."""
-    one = seen()
-    frames = {frame.child_frame_id: frame for frame in messages.static_tf(one, NOW_NS).transforms}
+    """The chain base_link -> camera_link -> optical frame equals the calibration of the picture,
+    and camera_link has x ahead."""
+    observation = observation_with()
+    frames = {
+        frame.child_frame_id: frame for frame in messages.static_tf(observation, NOW_NS).transforms
+    }
     assert list(frames) == ["odom", messages.CAMERA, messages.OPTICAL, messages.LIDAR, messages.IMU]
     camera, optical = (
         _matrix(frames[name].transform) for name in (messages.CAMERA, messages.OPTICAL)
     )
-    assert one.camera is not None
-    assert np.allclose(camera @ optical, one.camera.on_robot)
+    assert observation.camera is not None
+    assert np.allclose(camera @ optical, observation.camera.on_robot)
     assert camera[0, 0] > 0.9 and abs(camera[1, 0]) < 1e-9
 
 
 def _matrix(transform: Any) -> np.ndarray[Any, Any]:
     at, turn = transform.translation, transform.rotation
     x, y, z, w = turn.x, turn.y, turn.z, turn.w
-    whole = np.eye(4)
-    whole[:3, :3] = [
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    whole[:3, 3] = at.x, at.y, at.z
-    return whole
+    matrix[:3, 3] = at.x, at.y, at.z
+    return matrix
 
 
 def test_a_cloud_of_rings_has_the_points_of_the_scan() -> None:
-    """Points are the distances along the rays; without a return they are infinite."""
+    """Points are the distances along the rays; rays without a return are infinite."""
     spec = ScanSpec(rays=16, rings=3, elevation_deg=(-10.0, 10.0))
     ranges = np.full((3, 16), 5.0, np.float32)
     ranges[1, 4] = np.inf
@@ -197,13 +203,21 @@ def test_a_cloud_of_rings_has_the_points_of_the_scan() -> None:
 
 def test_a_goal_is_sent_when_it_changes() -> None:
     """A point is sent again after it has moved in odom, and an instruction when its text differs."""
-    sent, topic, _ = messages.new_goal(seen(), messages.SentGoal(), NOW_NS)
+    sent, topic, _ = messages.new_goal(observation_with(), messages.SentGoal(), NOW_NS)
     assert topic == "/goal_pose"
-    assert messages.new_goal(seen(goal=PointGoal(10.1, 2.0)), sent, NOW_NS)[1] == ""
-    assert messages.new_goal(seen(goal=PointGoal(12.0, 2.0)), sent, NOW_NS)[1] == "/goal_pose"
-    told, topic, message = messages.new_goal(seen(goal=Instruction("Go.")), sent, NOW_NS)
+    assert messages.new_goal(observation_with(goal=PointGoal(10.1, 2.0)), sent, NOW_NS)[1] == ""
+    assert (
+        messages.new_goal(observation_with(goal=PointGoal(12.0, 2.0)), sent, NOW_NS)[1]
+        == "/goal_pose"
+    )
+    sent_instruction, topic, message = messages.new_goal(
+        observation_with(goal=Instruction("Go.")), sent, NOW_NS
+    )
     assert (topic, message.data) == ("/cosim/instruction", "Go.")
-    assert messages.new_goal(seen(goal=Instruction("Go.")), told, NOW_NS)[1] == ""
+    assert (
+        messages.new_goal(observation_with(goal=Instruction("Go.")), sent_instruction, NOW_NS)[1]
+        == ""
+    )
 
 
 def twist(v_mps: float, w_radps: float, stamp_ns: int | None = None) -> Received:
@@ -220,12 +234,12 @@ def twist(v_mps: float, w_radps: float, stamp_ns: int | None = None) -> Received
     return Received(data, name, types.HASHES[name], bytes(16), "/a", len(data))
 
 
-def verdict(got: Received, wait: Ros2Wait = "next", distro: str = "jazzy") -> Any:
+def verdict(message: Received, wait: Ros2Wait = "next", distro: str = "jazzy") -> Any:
     return judged(
-        got,
+        message,
         wait,
         NOW_NS,
-        type_hash(got.type, distro) if got.type in types.HASHES else "",
+        type_hash(message.type, distro) if message.type in types.HASHES else "",
         attached=True,
     )
 
@@ -241,9 +255,9 @@ def test_a_command_is_taken_by_the_rule_of_its_stamp() -> None:
     assert early.command is None and early.fault is None
 
 
-def test_what_is_no_command_is_named_and_never_driven() -> None:
-    """NaN, too long, another type, another hash, a wall clock, no attachment, malformed bytes: each
-    with its node and a remedy."""
+def test_an_invalid_command_is_described_and_never_driven() -> None:
+    """NaN, excess length, another type or hash, a wall clock, no attachment and malformed bytes are
+    reported with node and remedy."""
     good = twist(1.0, 0.5)
     faults = {
         "both must be finite": verdict(twist(math.nan, 0.0)),
@@ -264,8 +278,8 @@ def test_what_is_no_command_is_named_and_never_driven() -> None:
 
 
 def test_a_plan_is_turned_into_the_robots_frame() -> None:
-    """Points of a path in odom become metres ahead and to the left, 32 at most; another frame,
-    no points and malformed bytes are refused."""
+    """Points of a path in odom become metres ahead and left, 32 at most; other frames, empty and
+    malformed paths are refused."""
     turn = types.message("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
 
     def path(frame: str, points: list[tuple[float, float]]) -> bytes:
@@ -318,7 +332,7 @@ def test_an_inbox_is_bounded_in_messages_and_bytes() -> None:
 
 
 def test_remarks_are_counted_by_topic_and_kind() -> None:
-    """A kind of fault is new once in an episode, whatever its words say; repeats are counted."""
+    """A kind of fault is new once in an episode, whatever its words; repeats are counted."""
     remarks = Remarks()
     first = [remarks.add(Fault(CMD_VEL, "number", f"linear.x {x}")) for x in range(3)]
     assert first == [True, False, False]
@@ -329,7 +343,7 @@ def test_remarks_are_counted_by_topic_and_kind() -> None:
 
 
 def test_the_page_names_each_topic_and_its_type() -> None:
-    """The table of topics in docs/ros2.md has those that are sent and read, with their types."""
+    """The table of topics in docs/ros2.md lists those that are sent and read, with their types."""
     page = (ROOT / "docs" / "ros2.md").read_text()
     rows = [
         line.split("|")[1:3] for line in page.splitlines() if line.startswith(("| `/", "| in: `/"))

@@ -1,5 +1,5 @@
-"""Certificates: made once, kept to oneself, shown with their end, and refused in words when they do
-not fit."""
+"""Certificates: created once, readable by their owner alone, shown with their end, and refused with
+a reason."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NOW = datetime.now(UTC)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An authority with a coordinator of localhost and a worker."""
     folder = tmp_path_factory.mktemp("authority") / "certs"
     make_authority(folder, ["localhost"], 365)
@@ -32,14 +32,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def end_of(folder: Path, role: Role) -> Connection:
-    """An end of a session with what is in a folder, that nobody need be at."""
+def open_end(folder: Path, role: Role) -> Connection:
+    """Open an end of a session with the files of a folder; no peer is needed."""
     end = "listen" if role == "coordinator" else "connect"
     return Connection(role=role, tls=str(folder / role), **{end: "tls/localhost:7447"})  # type: ignore[arg-type]
 
 
-def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cosim) -> None:
-    """Keys are their owner's alone; what is there stays until --renew, which keeps the hosts; the
+def test_the_command_creates_shows_and_never_overwrites(tmp_path: Path, cosim: Cosim) -> None:
+    """Keys are readable by their owner alone; files stay until --renew, which keeps the hosts; the
     end is shown."""
     folder = tmp_path / "certs"
     first = cosim(
@@ -54,7 +54,7 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
     ):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = (folder / "coordinator" / "cert.pem").read_bytes()
-    for words, said in {
+    for words, expected in {
         ("init", str(folder)): "is not empty",
         ("role", str(folder), "coordinator"): "--renew replaces it",
         ("role", str(folder), "guest"): "Valid choices: coordinator, director",
@@ -65,7 +65,7 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
         ("show", str(tmp_path)): "holds no certificate",
     }.items():
         refused = cosim("certs", *words)
-        assert refused.returncode == 2 and said in refused.stderr, refused.stderr
+        assert refused.returncode == 2 and expected in refused.stderr, refused.stderr
     assert (folder / "coordinator" / "cert.pem").read_bytes() == before
     assert cosim("certs", "role", str(folder), "coordinator", "--renew").returncode == 0
     assert (folder / "coordinator" / "cert.pem").read_bytes() != before
@@ -83,16 +83,16 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
     ]
 
 
-def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> None:
-    """A missing file, damage, another's key, another authority, everybody's key, another role: each
-    by its name."""
+def test_each_kind_of_unusable_file_is_named(certificates: Path, tmp_path: Path) -> None:
+    """A missing or damaged file, another's key, another authority, a readable key and another role
+    are each named."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     copies = iter(range(100))
 
     def refused(change: str, role: Role = "worker") -> str:
         folder = tmp_path / str(next(copies))
-        shutil.copytree(made, folder)
+        shutil.copytree(certificates, folder)
         place = folder / "worker"
         match change:
             case "missing":
@@ -123,44 +123,44 @@ def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> Non
     assert "is of the role worker, and this needs viewer" in refused("", "viewer")
 
 
-def test_the_end_of_a_certificate_is_said_before_it_comes(made: Path) -> None:
-    """Nothing is said long before; within 30 days the day and the remedy; afterwards, and too
-    early, it is refused."""
+def test_the_end_of_a_certificate_is_announced_30_days_before(certificates: Path) -> None:
+    """Within 30 days the day and the remedy are shown; an expired or not yet valid certificate is
+    refused."""
     for role in ("coordinator", "worker"):
-        end = end_of(made, role)  # type: ignore[arg-type]
+        end = open_end(certificates, role)  # type: ignore[arg-type]
         assert checked_identity(end, NOW) == ""
         assert (
-            "expires on" in (said := checked_identity(end, NOW + timedelta(days=350)))
-            and "--renew" in said
+            "expires on" in (warning := checked_identity(end, NOW + timedelta(days=350)))
+            and "--renew" in warning
         )
         with pytest.raises(AccessError, match=r"has expired on .*--renew"):
             checked_identity(end, NOW + timedelta(days=366))
         with pytest.raises(AccessError, match="is this machine's clock right"):
             checked_identity(end, NOW - timedelta(days=3))
-    assert checked_identity(end_of(made, "worker"), NOW - timedelta(hours=20)) == "", (
+    assert checked_identity(open_end(certificates, "worker"), NOW - timedelta(hours=20)) == "", (
         "a clock that is behind"
     )
 
 
 @pytest.mark.engine
-def test_a_hub_that_does_not_fit_is_refused_in_words(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_hub_that_does_not_fit_is_refused_with_a_reason(
+    certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another authority there or here, another name, an expired hub, no TLS, nobody there; and one
-    that fits."""
+    """Another authority on either end, another name, an expired hub, no TLS and no hub are refused;
+    a valid hub connects."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
-    trusting = tmp_path / "trusting"  # takes the hub for what it is, and is not taken itself
+    trusting = tmp_path / "trusting"  # trusts the hub, but is not trusted by it
     shutil.copytree(other / "worker", trusting)
     (trusting / "ca.pem").write_bytes(
-        (other / "ca.pem").read_bytes() + (made / "ca.pem").read_bytes()
+        (other / "ca.pem").read_bytes() + (certificates / "ca.pem").read_bytes()
     )
     old = tmp_path / "old"
     make_authority(old, ["localhost"], 5, NOW - timedelta(days=10))
     issue(old, "worker", [], 365)
 
-    def tried(at: str, folder: Path) -> str:
+    def refusal_of(at: str, folder: Path) -> str:
         with (
             pytest.raises(AccessError) as error,
             open_session(Connection(role="worker", connect=at, tls=str(folder))),
@@ -169,23 +169,26 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         return str(error.value)
 
     at = f"tls/localhost:{free_port()}"
-    listening = Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))
+    listening = Connection(role="coordinator", listen=at, tls=str(certificates / "coordinator"))
     with open_session(listening) as session:
         session.serve("cosim/r/jobs/claim", bytes.upper)
         with open_session(
-            Connection(role="worker", connect=at, tls=str(made / "worker"))
+            Connection(role="worker", connect=at, tls=str(certificates / "worker"))
         ) as worker:
             assert worker.query("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
         monkeypatch.setattr(
             settings, "CONNECTS_WITHIN_S", 0.1
-        )  # what is refused is so however long it is tried
+        )  # a refused client stays refused for the whole wait
         assert (
-            "the certificate of tls/localhost" in (said := tried(at, other / "worker"))
-            and "another authority" in said
+            "the certificate of tls/localhost" in (reason := refusal_of(at, other / "worker"))
+            and "another authority" in reason
         )
-        assert "refused us" in (said := tried(at, trusting)) and "than the one there trusts" in said
-        assert "is not for the address 127.0.0.1" in tried(
-            at.replace("localhost", "127.0.0.1"), made / "worker"
+        assert (
+            "refused us" in (reason := refusal_of(at, trusting))
+            and "than the one there trusts" in reason
+        )
+        assert "is not for the address 127.0.0.1" in refusal_of(
+            at.replace("localhost", "127.0.0.1"), certificates / "worker"
         )
     plain = f"tls/localhost:{free_port()}".replace("tls", "tcp")
     with (
@@ -193,9 +196,11 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         monkeypatch.context() as patch,
         pytest.raises(EngineError, match="by the same protocol"),
     ):
-        patch.setattr(identity, "_PATIENCE_S", 0.2)  # who speaks no TLS never answers
+        patch.setattr(identity, "_PATIENCE_S", 0.2)  # a peer without TLS never answers
         open_session(
-            Connection(role="worker", connect=plain.replace("tcp", "tls"), tls=str(made / "worker"))
+            Connection(
+                role="worker", connect=plain.replace("tcp", "tls"), tls=str(certificates / "worker")
+            )
         )
     expired = Connection(
         role="coordinator", listen=f"tls/localhost:{free_port()}", tls=str(old / "coordinator")
@@ -204,34 +209,37 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         open_session(expired)
     monkeypatch.setattr(
         "bridge.session.connection_warnings", lambda _: []
-    )  # one that listened before its certificate's end
+    )  # a hub that listened before its certificate expired
     (trusting / "ca.pem").write_bytes(
         (other / "ca.pem").read_bytes() + (old / "ca.pem").read_bytes()
     )
     with open_session(expired):
-        assert "has expired" in tried(expired.listen, trusting)
+        assert "has expired" in refusal_of(expired.listen, trusting)
     with pytest.raises(EngineError, match="no hub answers at"):
         open_session(
             Connection(
-                role="worker", connect=f"tls/localhost:{free_port()}", tls=str(made / "worker")
+                role="worker",
+                connect=f"tls/localhost:{free_port()}",
+                tls=str(certificates / "worker"),
             )
         )
 
 
 @pytest.mark.engine
-def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(
-    made: Path, tmp_path: Path
+def test_plain_zenoh_without_our_certificate_cannot_connect(
+    certificates: Path, tmp_path: Path
 ) -> None:
-    """None, one of another authority, one that signed itself a worker: no link; the same client
-    with ours: a link."""
+    """No, foreign and self-signed certificates give no link; the same client with ours gets one."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
-    shutil.copy(made / "ca.pem", other / "ca.pem")
+    shutil.copy(certificates / "ca.pem", other / "ca.pem")
     (tmp_path / "none").mkdir()
-    shutil.copy(made / "ca.pem", tmp_path / "none" / "ca.pem")
+    shutil.copy(certificates / "ca.pem", tmp_path / "none" / "ca.pem")
     at = f"tls/localhost:{free_port()}"
-    with open_session(Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))):
+    with open_session(
+        Connection(role="coordinator", listen=at, tls=str(certificates / "coordinator"))
+    ):
         for folder in (other, tmp_path / "none"):
             with pytest.raises(zenoh.ZError), plain_zenoh(at, folder, "worker", wait_ms=400):
                 pass
@@ -240,12 +248,12 @@ def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(
             plain_zenoh(at.replace("tls", "tcp"), None, "", wait_ms=400),
         ):
             pass
-        with plain_zenoh(at, made, "worker"):
+        with plain_zenoh(at, certificates, "worker"):
             pass
 
 
-def test_a_host_that_is_none_is_refused(tmp_path: Path) -> None:
-    """Before anything is written."""
+def test_an_invalid_host_is_refused(tmp_path: Path) -> None:
+    """An invalid host is refused before any file is written."""
     with pytest.raises(UsageError, match="a name or address of a machine"):
         make_authority(tmp_path / "certs", ["hub lan"], 1)
     assert not (tmp_path / "certs").exists()

@@ -1,5 +1,5 @@
-"""What each role may do on a hub: plain Zenoh tries it over TLS on loopback; what is refused is
-seen to do nothing."""
+"""What each role may do on a hub: plain Zenoh tries it over TLS on loopback; a refused act has no
+effect."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ pytestmark = pytest.mark.engine
 
 ENV = "cosim/r/env/e"
 POLICY = "cosim/r/policy/ours/act"
-TOLD = tuple(f"{ENV}/{topic}" for topic in ("clock", "robot", "crowd", "signals", "events"))
+PUBLISHED = tuple(f"{ENV}/{topic}" for topic in ("clock", "robot", "crowd", "signals", "events"))
 JOBS = tuple(f"cosim/r/jobs/{act}" for act in ("claim", "report"))
 SEEN = (f"{ENV}/status", f"{ENV}/log", f"{ENV}/camera", "cosim/r/status")
-ASKED = (*JOBS, *SEEN, "cosim/r/nets/0", f"{ENV}/inject", f"{ENV}/director", POLICY)
-OWN = b"asked by the one who tries"
+QUERIED = (*JOBS, *SEEN, "cosim/r/nets/0", f"{ENV}/inject", f"{ENV}/director", POLICY)
+OWN = b"query of the guest"
 GIVEN_UP_S = 2.0
-"""What is refused is waited for so long: nothing comes, on any machine."""
+"""Time in seconds after which a refused message counts as not delivered."""
 MAY_ASK: dict[str, tuple[str, ...]] = {
     "worker": (*JOBS, "cosim/r/status", "cosim/r/nets/0", f"{ENV}/director", POLICY),
     "viewer": SEEN,
@@ -43,12 +43,12 @@ MAY_ASK: dict[str, tuple[str, ...]] = {
     "director": (),
     "ros2": (),
 }
-"""At a coordinator's hub. A director has no business there: others connect to it."""
+"""Keys that each role may query at a coordinator's hub. Directors have their own hub."""
 
 
 @pytest.fixture(scope="module")
 def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Certificates of all roles; of those who listen for localhost."""
+    """Certificates of all roles; those of roles that listen are for localhost."""
     folder = tmp_path_factory.mktemp("tls") / "certs"
     make_authority(folder, ["localhost"], 365)
     for role in get_args(Role):
@@ -58,16 +58,18 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def replies(session: zenoh.Session, key: str) -> list[str]:
-    """What a query is answered, errors included."""
-    got = session.get(
+    """Return all replies to a query, errors included."""
+    answers = session.get(
         key, payload=OWN, timeout=PATIENCE_S, consolidation=zenoh.ConsolidationMode.NONE
     )
-    return [said.payload.to_string() for one in got if (said := one.ok or one.err) is not None]
+    return [
+        answer.payload.to_string() for one in answers if (answer := one.ok or one.err) is not None
+    ]
 
 
-class Air:
-    """A hub, its run's own process, and a policy server. seen: the keys of what was asked of them
-    and told to them; alive: of the tokens that were shown."""
+class Peers:
+    """A hub, its run's own process, and a policy server; `seen` are keys of queries and messages,
+    `alive` those of tokens."""
 
     def __init__(self, certs: Path | None, stack: ExitStack) -> None:
         protocol, tls = ("tcp", "") if certs is None else ("tls", str(certs / "coordinator"))
@@ -80,7 +82,7 @@ class Air:
         self.inside = stack.enter_context(plain_zenoh(self.hub.inside.connect, None, ""))
         self.policy = stack.enter_context(plain_zenoh(self.at, certs, "policy"))
         self.seen: list[str] = []
-        for key in ASKED:
+        for key in QUERIED:
             if key != POLICY:
                 end = self.run if key.startswith(ENV) else self.hub
                 end.serve(key, lambda _, key=key: self._saw(key), found=key == f"{ENV}/status")  # type: ignore[misc]
@@ -98,8 +100,8 @@ class Air:
             query.reply(query.key_expr, self._saw(str(query.key_expr)))
 
     def settle(self) -> None:
-        """Until what was routed before has arrived: what the run tells and what the hub tells goes
-        after it."""
+        """Wait until everything routed before has arrived, by sending messages of the run and of
+        the hub after it."""
         for end in (self.run, self.hub):
             mark = f"{ENV}/mark{time.monotonic_ns()}"
             end.publish_lossy(mark, b"")
@@ -107,35 +109,34 @@ class Air:
 
 
 class Guest:
-    """A client that tries everything. heard: the keys of what was told or asked that was none of
-    its own doing."""
+    """A client that tries everything; `received` are keys of queries and messages that it did not send
+    itself."""
 
-    def __init__(self, air: Air, role: str, stack: ExitStack) -> None:
-        self.air = air
-        self.session = stack.enter_context(plain_zenoh(air.at, air.certs, role))
-        self.heard: list[str] = []
+    def __init__(self, peers: Peers, role: str, stack: ExitStack) -> None:
+        self.air = peers
+        self.session = stack.enter_context(plain_zenoh(peers.at, peers.certs, role))
+        self.received: list[str] = []
         self.session.declare_queryable("cosim/r/policy/theirs/info", self._answer)
         everything = [] if role in ("policy", "") else [POLICY, "cosim/*/policy/**", "cosim/**"]
-        for key in (*JOBS, *SEEN, *TOLD, f"{ENV}/inject", f"{ENV}/director", *everything):
+        for key in (*JOBS, *SEEN, *PUBLISHED, f"{ENV}/inject", f"{ENV}/director", *everything):
             self.session.declare_queryable(key, self._answer)
-        for key in (*TOLD, *JOBS, POLICY, "cosim/r/policy/**", "cosim/**", "**"):
+        for key in (*PUBLISHED, *JOBS, POLICY, "cosim/r/policy/**", "cosim/**", "**"):
             self.session.declare_subscriber(key, self._hear)
         self.token = self.session.liveliness().declare_token("cosim/r/workers/one")
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             if query.payload is None or query.payload.to_bytes() != OWN:
-                self.heard.append(str(query.key_expr))
+                self.received.append(str(query.key_expr))
             query.reply(query.key_expr, b"FORGED")
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        # Nobody else deletes: it hears its own when a thread of its own comes to it.
+        # No other client deletes; its own deletion arrives when its thread runs.
         if sample.kind == zenoh.SampleKind.PUT and sample.payload.to_string() != "FORGED":
-            self.heard.append(str(sample.key_expr))
+            self.received.append(str(sample.key_expr))
 
     def passed(self, may_ask: tuple[str, ...]) -> None:
-        """Until all that it sent before is with the hub: what it asks, or is asked, goes after
-        that."""
+        """Wait until all that it sent before is at the hub, by sending a query after it."""
         if may_ask:
             wait_until(lambda: may_ask[0] in replies(self.session, may_ask[0]))
         else:
@@ -143,7 +144,7 @@ class Guest:
         self.air.settle()
 
     def answers(self) -> bool:
-        """Whether what it answers as a policy is heard."""
+        """Whether its replies as a policy are received."""
         try:
             return self.air.hub.query("cosim/r/policy/theirs/info", b"", timeout_s=0.5) == b"FORGED"
         except (TimeoutError, EngineError):
@@ -151,19 +152,25 @@ class Guest:
 
 
 @pytest.fixture(scope="module")
-def air(certs: Path) -> Iterator[Air]:
+def peers(certs: Path) -> Iterator[Peers]:
     with ExitStack() as stack:
-        yield Air(certs, stack)
+        yield Peers(certs, stack)
 
 
 def try_all(
-    air: Air, guest: Guest, may_ask: tuple[str, ...], *, watches: bool, answers: bool, shows: bool
+    peers: Peers,
+    guest: Guest,
+    may_ask: tuple[str, ...],
+    *,
+    watches: bool,
+    answers: bool,
+    shows: bool,
 ) -> None:
-    """Try all acts; what is allowed works, and nothing else has any effect."""
+    """Try all acts; permitted ones work, and no other has any effect."""
     guest.passed(may_ask)
-    # to ask
-    air.seen.clear()
-    for key in ASKED:
+    # queries
+    peers.seen.clear()
+    for key in QUERIED:
         if key in may_ask:
             wait_until(lambda key=key: key in replies(guest.session, key))  # type: ignore[misc]
         else:
@@ -174,45 +181,53 @@ def try_all(
         for one in replies(guest.session, key)
     ]
     assert [one for one in wide if one != "FORGED" and "ask for exactly" not in one] == []
-    assert {key for key in air.seen if "/mark" not in key} == set(may_ask)
-    # to tell, and to take back
-    air.seen.clear()
-    for key in (*TOLD, *JOBS, f"{ENV}/inject", POLICY, "cosim/r/status", f"{ENV}/*", "cosim/**"):
+    assert {key for key in peers.seen if "/mark" not in key} == set(may_ask)
+    # publications and deletions
+    peers.seen.clear()
+    for key in (
+        *PUBLISHED,
+        *JOBS,
+        f"{ENV}/inject",
+        POLICY,
+        "cosim/r/status",
+        f"{ENV}/*",
+        "cosim/**",
+    ):
         guest.session.put(key, b"FORGED")
         guest.session.delete(key)
     guest.passed(may_ask)
-    assert {key for key in air.seen if "/mark" not in key} <= set(may_ask[:1])
-    # to hear what is told, and what is asked of a policy
-    guest.heard.clear()
-    for key in TOLD:
-        air.run.publish_lossy(key, b"true")
-    air.hub.query(POLICY, b"secret", timeout_s=PATIENCE_S)
+    assert {key for key in peers.seen if "/mark" not in key} <= set(may_ask[:1])
+    # subscriptions to the run's messages and to queries of a policy
+    guest.received.clear()
+    for key in PUBLISHED:
+        peers.run.publish_lossy(key, b"true")
+    peers.hub.query(POLICY, b"secret", timeout_s=PATIENCE_S)
     if watches:
-        wait_until(lambda: set(TOLD) <= set(guest.heard))
+        wait_until(lambda: set(PUBLISHED) <= set(guest.received))
     guest.passed(may_ask)
     foreign = {"cosim/r/policy/theirs/info"} if answers else set()
-    assert {key for key in guest.heard if key not in TOLD} - foreign == set()
-    assert watches == bool(set(TOLD) & set(guest.heard))
-    # to answer in the place of others, and as a policy
+    assert {key for key in guest.received if key not in PUBLISHED} - foreign == set()
+    assert watches == bool(set(PUBLISHED) & set(guest.received))
+    # replies in place of others, and as a policy
     for key in (*JOBS, *SEEN, f"{ENV}/inject"):
-        assert air.hub.query(key, b"", timeout_s=PATIENCE_S) == key.encode()
+        assert peers.hub.query(key, b"", timeout_s=PATIENCE_S) == key.encode()
     assert guest.answers() is answers
-    # to be seen as a worker
+    # a token as a worker
     alive = [
         str(one.ok.key_expr)
-        for one in air.inside.liveliness().get("cosim/*/workers/*", timeout=PATIENCE_S)
+        for one in peers.inside.liveliness().get("cosim/*/workers/*", timeout=PATIENCE_S)
     ]
     assert (alive == ["cosim/r/workers/one"]) is shows
 
 
 @pytest.mark.parametrize("role", MAY_ASK)
-def test_a_role_may_do_its_own_and_nothing_else(air: Air, role: str) -> None:
-    """Asking, telling, listening, answering, being alive, wildcards: each tried by each role, with
-    its certificate."""
+def test_a_role_has_its_own_rights_and_no_others(peers: Peers, role: str) -> None:
+    """Each role, with its certificate, tries to query, publish, subscribe, reply, declare tokens
+    and use wildcards."""
     with ExitStack() as stack:
-        guest = Guest(air, role, stack)
+        guest = Guest(peers, role, stack)
         try_all(
-            air,
+            peers,
             guest,
             MAY_ASK[role],
             watches=role == "viewer",
@@ -221,40 +236,38 @@ def test_a_role_may_do_its_own_and_nothing_else(air: Air, role: str) -> None:
         )
 
 
-def test_without_certificates_nobody_tells_where_the_robot_is() -> None:
-    """On loopback everybody may do what the roles may together, but not speak for the run or its
+def test_without_certificates_no_client_speaks_for_the_run() -> None:
+    """On loopback a client has the rights of all roles together, but not those of the run or its
     hub."""
     with ExitStack() as stack:
-        air = Air(None, stack)
-        may = tuple(key for key in ASKED if any(key in theirs for theirs in MAY_ASK.values()))
-        try_all(air, Guest(air, "", stack), may, watches=True, answers=True, shows=True)
+        peers = Peers(None, stack)
+        may = tuple(key for key in QUERIED if any(key in theirs for theirs in MAY_ASK.values()))
+        try_all(peers, Guest(peers, "", stack), may, watches=True, answers=True, shows=True)
 
 
 @pytest.mark.parametrize(("hub", "key"), [("director", f"{ENV}/director"), ("policy", POLICY)])
-def test_who_is_asked_is_asked_by_runs_alone(certs: Path, hub: Role, key: str) -> None:
-    """At the hub of a director or a policy server, workers and coordinators ask; others do not, and
-    nobody answers."""
+def test_only_runs_may_query_directors_and_policy_servers(certs: Path, hub: Role, key: str) -> None:
+    """At the hub of a director or a policy server only workers and coordinators may query, and no
+    client may reply."""
     at = f"tls/localhost:{free_port()}"
-    asked: list[bytes] = []
+    queries: list[bytes] = []
     with ExitStack() as stack:
         session = stack.enter_context(
             open_session(Connection(role=hub, listen=at, tls=str(certs / hub)))
         )
-        session.serve(key, lambda payload: asked.append(payload) or b"honest")  # type: ignore[func-returns-value]
+        session.serve(key, lambda payload: queries.append(payload) or b"honest")  # type: ignore[func-returns-value]
         guests = {
             role: stack.enter_context(plain_zenoh(at, certs, role)) for role in get_args(Role)
         }
         for role, guest in guests.items():
-            if role != "policy" or hub != "policy":  # one policy server may answer beside another
+            if role != "policy" or hub != "policy":  # several policy servers may answer
                 guest.declare_queryable(key, lambda query: query.reply(query.key_expr, b"FORGED"))
         for role in ("worker", "coordinator"):
             wait_until(lambda role=role: "honest" in replies(guests[role], key))  # type: ignore[misc]
-        asked.clear()
+        queries.clear()
         for role in ("director", "policy", "viewer", "injector"):
-            assert set(replies(guests[role], key)) <= {"FORGED"}, (
-                "its own answer, and nobody else's"
-            )
-        assert asked == []
+            assert set(replies(guests[role], key)) <= {"FORGED"}, "only its own answer"
+        assert queries == []
         assert session.query(key, b"x", timeout_s=PATIENCE_S) == b"honest"
 
 
@@ -270,9 +283,9 @@ serve(Mine, listen=sys.argv[1], tls=sys.argv[2])
 """
 
 
-def test_the_file_that_is_copied_is_asked_by_runs_alone(certs: Path) -> None:
-    """`serve` of policy_server.py by itself: workers and coordinators ask, one server at a time;
-    else nobody."""
+def test_only_runs_may_query_the_copied_policy_server(certs: Path) -> None:
+    """At `serve` of a copied policy_server.py only workers and coordinators may query, and wildcard
+    queries are refused."""
     at = f"tls/localhost:{free_port()}"
     words = [sys.executable, "-c", COPIED, at, str(certs / "policy")]
     with ExitStack() as stack:
@@ -293,9 +306,9 @@ def test_the_file_that_is_copied_is_asked_by_runs_alone(certs: Path) -> None:
         begin = b"\x85\xa4type\xa5reset\xa3run\xa1r\xa7episode\xa1e\xa7attempt\xa1a\xa4seed\x00"
         (wide,) = guests["worker"].get(info.replace("info", "reset"), payload=begin)
         assert b"not a question" in wide.err.payload.to_bytes()
-        (told,) = guests["worker"].get(info)
+        (reply,) = guests["worker"].get(info)
         (begun,) = guests["worker"].get(
-            str(told.ok.key_expr).replace("info", "reset"), payload=begin
+            str(reply.ok.key_expr).replace("info", "reset"), payload=begin
         )
         assert (
             b"begun" in begun.ok.payload.to_bytes() and server.stdout.readline() == "reset of e\n"
@@ -305,27 +318,28 @@ def test_the_file_that_is_copied_is_asked_by_runs_alone(certs: Path) -> None:
 @pytest.mark.parametrize(
     "written", ["application/python-serialized-object", "application/x-unheard-of"]
 )
-def test_what_would_have_to_be_unpickled_is_not_read(tmp_path: Path, written: str) -> None:
-    """A message that says it is a Python object, or something unheard of, is refused with what is
-    read here."""
-    asked: list[bytes] = []
+def test_pickled_and_unknown_messages_are_refused(tmp_path: Path, written: str) -> None:
+    """A message with a pickled Python object or an unknown type is refused with the types that are
+    read."""
+    claims: list[bytes] = []
     at = f"unixsock-stream/{tmp_path}/hub.sock"
     with listening_at(at) as hub, plain_zenoh(at, None, "") as guest:
-        hub.serve("cosim/r/jobs/claim", lambda payload: asked.append(payload) or b"taken")  # type: ignore[func-returns-value]
-        got = [
+        hub.serve("cosim/r/jobs/claim", lambda payload: claims.append(payload) or b"taken")  # type: ignore[func-returns-value]
+        refusals = [
             one.err.payload.to_string()
             for one in guest.get("cosim/r/jobs/claim", payload=b"x", encoding=written)
         ]
         assert (
-            got == [f"'{written}' is not read here: send application/msgpack or application/json"]
-            and not asked
+            refusals
+            == [f"'{written}' is not read here: send application/msgpack or application/json"]
+            and not claims
         )
         for fine in ("application/json", "application/msgpack", None):
             (one,) = guest.get("cosim/r/jobs/claim", payload=b"x", encoding=fine)
             assert one.ok.payload.to_bytes() == b"taken"
 
 
-def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
+def test_a_too_long_message_is_dropped(certs: Path) -> None:
     """A message longer than 64 KiB is dropped, and one of a role without rights ends no link."""
     at = f"tls/localhost:{free_port()}"
     lengths: list[int] = []

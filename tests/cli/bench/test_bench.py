@@ -1,4 +1,4 @@
-"""`cosim bench`: which measurement, and one checkout against another."""
+"""`cosim bench`: choice of measurements, and comparison of two checkouts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Path(path).write_text(json.dumps([figure]))
 
 
 def checkout(folder: Path, value: float) -> Path:
-    """A folder whose every measurement comes to a value, and is noted in a file beside it."""
+    """A folder whose measurements all give one value, each noted in a file beside the folder."""
     bench = folder / "scenarios" / "tools" / "bench"
     bench.mkdir(parents=True)
     for package in (bench, bench.parent, bench.parents[1]):
@@ -36,8 +36,7 @@ def checkout(folder: Path, value: float) -> Path:
 
 
 def test_checkouts_take_turns(tmp_path: Path) -> None:
-    """Each measurement is taken by one checkout and then by the other, and who begins changes from
-    round to round."""
+    """Both checkouts take each measurement in turn, and the first one changes from round to round."""
     both = [checkout(tmp_path / "one", 3.0), checkout(tmp_path / "two", 6.0)]
     one, two = take_rounds(["driving"], both, 2, lambda _: None)
     assert (tmp_path / "log").read_text().split("\n")[:-1] == [
@@ -48,35 +47,35 @@ def test_checkouts_take_turns(tmp_path: Path) -> None:
 
 
 @pytest.mark.engine
-def test_a_figure_stands_beside_that_of_another_checkout(tmp_path: Path, cosim: Cosim) -> None:
-    """--compare shows both medians and their ratio for what both take."""
+def test_compare_shows_the_figures_of_both_checkouts(tmp_path: Path, cosim: Cosim) -> None:
+    """--compare shows both medians and their ratio for common measurements."""
     other = checkout(tmp_path / "other", 1e6)
     (other / "scenarios" / "tools" / "bench" / "take.py").write_text(
         "import json, sys\nfrom pathlib import Path\nfigures = {'shortest walk, ms': 1e9, "
         "'elsewhere': 1.0}\nPath(sys.argv[3]).write_text(json.dumps([{'name': k, 'value': v} for "
         "k, v in figures.items()]))"
     )
-    said = cosim("bench", "--only", "places", "--rounds", "1", "--compare", str(other))
-    assert said.returncode == 0, said.stderr
-    (row,) = [line.split() for line in said.stdout.splitlines() if "shortest walk" in line]
+    result = cosim("bench", "--only", "places", "--rounds", "1", "--compare", str(other))
+    assert result.returncode == 0, result.stderr
+    (row,) = [line.split() for line in result.stdout.splitlines() if "shortest walk" in line]
     assert float(row[4]) == 1e9 and float(row[5]) == 0.0
-    assert "elsewhere" not in said.stdout and "point in the walkable area" not in said.stdout
+    assert "elsewhere" not in result.stdout and "point in the walkable area" not in result.stdout
 
 
-def test_what_cannot_be_measured_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """A measurement that is none, and a folder that is no checkout, are named before anything is
+def test_unknown_measurements_and_checkouts_are_refused(tmp_path: Path, cosim: Cosim) -> None:
+    """An unknown measurement and a folder that is no checkout are named before anything is
     measured."""
-    said = cosim("bench", "--only", "drivin")
+    result = cosim("bench", "--only", "drivin")
     assert (
-        said.returncode == 2
-        and "Did you mean driving?" in said.stderr
-        and "street 50" in said.stderr
+        result.returncode == 2
+        and "Did you mean driving?" in result.stderr
+        and "street 50" in result.stderr
     )
-    said = cosim("bench", "--compare", str(tmp_path))
+    result = cosim("bench", "--compare", str(tmp_path))
     assert (
-        said.returncode == 2
-        and str(tmp_path) in said.stderr
-        and "scenarios/tools/bench/take.py" in said.stderr
+        result.returncode == 2
+        and str(tmp_path) in result.stderr
+        and "scenarios/tools/bench/take.py" in result.stderr
     )
 
 

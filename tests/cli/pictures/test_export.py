@@ -41,9 +41,9 @@ def file(street: StreetSurface, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
-def test_a_street_is_read_back_as_it_is(street: StreetSurface, file: Path) -> None:
-    """y is up, every triangle of the ground is there in its place and colour, and nodes are named
-    by what they are."""
+def test_an_exported_street_equals_its_source(street: StreetSurface, file: Path) -> None:
+    """With y up, every triangle of the ground has its place and colour, and nodes are named by what
+    they are."""
     import trimesh
 
     scene = trimesh.load_scene(file)
@@ -74,8 +74,8 @@ def test_a_street_is_read_back_as_it_is(street: StreetSurface, file: Path) -> No
     assert red > 0.7 and green < 0.2
 
 
-def test_nodes_stand_below_the_group_of_their_kind(street: StreetSurface, file: Path) -> None:
-    """Six groups below the root; in them every kind of prop that stands there, walls, windows and
+def test_nodes_are_grouped_by_kind(street: StreetSurface, file: Path) -> None:
+    """The root has six groups, which hold every kind of prop in the street, walls, windows and
     fences."""
     import trimesh
 
@@ -93,7 +93,7 @@ def test_nodes_stand_below_the_group_of_their_kind(street: StreetSurface, file: 
 
 
 def ground_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
-    """(N, 3) middles of the level triangles of the ground in a file, with z up."""
+    """Return the (N, 3) centres of the level ground triangles in a file, with z up."""
     import trimesh
 
     scene = trimesh.load_scene(path)
@@ -109,8 +109,7 @@ def ground_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
 
 @pytest.mark.engine
 def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim) -> None:
-    """A scenario of a suite's file is exported: there is ground along its route from end to end,
-    and trees."""
+    """The export of a scenario of a suite file has trees, and ground along its whole route."""
     import trimesh
 
     from scenarios.places.nets import place
@@ -120,9 +119,9 @@ def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim
     street_map = place(city)[1]
     scenario: Scenario = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     write_suite(Suite(name="tiny", version="1", scenarios=(scenario,)), tmp_path / "tiny.json")
-    said = cosim("export", "t-0", "street.glb", "--suite", "tiny.json", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
-    assert "building tiles ..." in said.stderr and said.stdout.startswith(
+    result = cosim("export", "t-0", "street.glb", "--suite", "tiny.json", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "building tiles ..." in result.stderr and result.stdout.startswith(
         "Street: street.glb (t-0, "
     )
     ground = ground_of(tmp_path / "street.glb")
@@ -138,7 +137,7 @@ def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim
 
 
 def robot_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
-    """(N, 3) vertices of the robot in a file, with z up."""
+    """Return the (N, 3) vertices of the robot in a file, with z up."""
     import trimesh
 
     scene = trimesh.load_scene(path)
@@ -157,13 +156,13 @@ def robot_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
 def test_the_robot_of_a_run_is_exported_with_its_legs(
     street: StreetSurface, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """It is where it was, on its feet, which are not where they are at rest."""
+    """The robot is at its recorded place, on its feet, which are not in their rest position."""
     way = event_way("gesturing", "way", at_m=15.0, time_s=4.5)
     write_suite(Suite(name="one", version="1", scenarios=(way,)), tmp_path / "one.json")
     words = ("one.json", "--policy", "straight", "--robot", "dog")
     assert cosim("run", *words, "--out", "dog", cwd=tmp_path).returncode == 0
-    said = cosim("export", "way", "dog.glb", "--run", "dog", "--at", "4", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    result = cosim("export", "way", "dog.glb", "--run", "dog", "--at", "4", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
     body = robot_of(tmp_path / "dog.glb")
     log = Log.load(tmp_path / "dog" / "episodes" / "way" / "trajectory.npz")
     assert body.mean(axis=0)[:2] == pytest.approx(log.pose[79, :2], abs=0.1)
@@ -181,12 +180,10 @@ def test_the_robot_of_a_run_is_exported_with_its_legs(
     assert late.returncode == 2 and "'way' ended after" in late.stderr
 
 
-def test_what_cannot_be_exported_is_told_before_anything_is_built(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """An unknown scenario, a wrong ending and a folder that is not there: what was asked for, and
-    what is valid."""
-    asked = {
+def test_invalid_export_requests_are_refused_before_the_build(tmp_path: Path, cosim: Cosim) -> None:
+    """An unknown scenario, a wrong file ending and a missing folder are reported with the valid
+    choices."""
+    requests = {
         ("lh-011-0", "a.glb"): (2, "among them lh-011-00, "),
         ("lh-011-00", "a.obj"): (
             2,
@@ -194,11 +191,11 @@ def test_what_cannot_be_exported_is_told_before_anything_is_built(
         ),
         ("lh-011-00", "no/a.glb"): (3, "no/a.glb: cannot be written: no folder no"),
     }
-    asked |= {
+    requests |= {
         ("lh-011-00", "a.glb", "--at", "3"): (2, "--at needs --run RUN"),
         ("lh-011-00", "a.glb", "--run", "no"): (2, "no"),
     }
-    for words, (code, message) in asked.items():
-        said = cosim("export", *words, cwd=tmp_path)
-        assert (said.returncode, said.stdout) == (code, "") and message in said.stderr, said
+    for words, (code, message) in requests.items():
+        result = cosim("export", *words, cwd=tmp_path)
+        assert (result.returncode, result.stdout) == (code, "") and message in result.stderr, result
     assert not list(tmp_path.iterdir())

@@ -1,5 +1,4 @@
-"""The progress display of a run: what is left is judged by the way, and it fits a terminal of 80
-columns."""
+"""The progress display of a run: remaining time by distance, within 80 columns."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from tests.support.shipped import long_ways, shipped
 
 
 class Clock:
-    """Seconds, as the test says."""
+    """A clock whose seconds the test sets."""
 
     now_s = 0.0
 
@@ -24,9 +23,9 @@ class Clock:
         return self.now_s
 
 
-def test_what_is_left_is_judged_by_the_way_not_by_the_count() -> None:
-    """After 100 m of 100 + 300 m in 40 s about 100 s are left, not 40; before anything is done
-    nothing is said."""
+def test_remaining_time_is_estimated_by_distance_not_count() -> None:
+    """After 100 m of 100 + 300 m in 40 s, 100 s remain rather than 40; before that there is no
+    estimate."""
     left = RemainingWork({"a": 100.0, "b": 300.0})
     assert left.seconds(3.0) is None
     left.at("a", 1.0)
@@ -41,22 +40,22 @@ def board_of(
     scenarios: tuple, done: tuple[str, ...] = (), **options: object
 ) -> tuple[ProgressDisplay, Clock, io.StringIO]:
     clock = Clock()
-    said = io.StringIO()
-    console = Console(file=said, width=80)
+    output = io.StringIO()
+    console = Console(file=output, width=80)
     return (
         ProgressDisplay(scenarios, set(done), console=console, clock=clock, **options),
         clock,
-        said,
+        output,
     )  # type: ignore[arg-type]
 
 
-def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
-    """A line for each episode that ends: its status, how many of how many, about how long it still
-    takes."""
-    board, clock, said = board_of(long_ways()[:3], done=(long_ways()[0].id,))
+def test_a_log_has_the_number_done_and_the_remaining_time() -> None:
+    """Each finished episode logs one line with its status, the count of all, and the estimated
+    rest."""
+    board, clock, output = board_of(long_ways()[:3], done=(long_ways()[0].id,))
     clock.now_s = 40.0
     board.tell(Done(long_ways()[1].id, "done"))
-    (line,) = said.getvalue().splitlines()
+    (line,) = output.getvalue().splitlines()
     rest_m, gone_m = (
         long_ways()[2].route_line.length_m + SETUP_M,
         long_ways()[1].route_line.length_m + SETUP_M,
@@ -66,12 +65,12 @@ def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
     )
     clock.now_s = 160.0
     board.tell(Done(long_ways()[2].id, "crashed"))
-    assert said.getvalue().splitlines()[1] == f"{long_ways()[2].id}: crashed, 3 of 3"
+    assert output.getvalue().splitlines()[1] == f"{long_ways()[2].id}: crashed, 3 of 3"
 
 
-def test_an_episode_that_stands_still_comes_nearer_to_its_end() -> None:
-    """A robot that gets nowhere uses up its time limit: the share is that of the time, and what is
-    left is known."""
+def test_a_stuck_episode_progresses_by_its_time_limit() -> None:
+    """The progress of a robot that does not move is its share of the time limit, so the rest is
+    known."""
     one = msgspec.structs.replace(shipped("reactive").scenarios[0], id="stuck")
     board, clock, _ = board_of((one,))
     clock.now_s = 30.0
@@ -82,9 +81,9 @@ def test_an_episode_that_stands_still_comes_nearer_to_its_end() -> None:
     )
 
 
-def test_a_comparison_is_part_of_its_episode() -> None:
-    """With --counterfactual an episode at its goal is not over yet: the street without the robot is
-    still to come."""
+def test_a_counterfactual_is_part_of_its_episode() -> None:
+    """With --counterfactual an episode at its goal is not done until the street without the robot
+    has run."""
     board, clock, _ = board_of(long_ways()[:1], compared=True)
     clock.now_s = 70.0
     board.tell(EpisodeProgress(long_ways()[0].id, 100.0, long_ways()[0].route_line.length_m, 0))
@@ -94,23 +93,23 @@ def test_a_comparison_is_part_of_its_episode() -> None:
     assert (half_s := board.left.seconds(70.0)) is not None and half_s < at_goal_s / 1.5
 
 
-def test_a_run_with_nothing_left_to_do_is_all_done() -> None:
-    """Resumed after its last episode: the bar is full."""
+def test_a_resumed_complete_run_shows_a_full_bar() -> None:
+    """A run that is resumed after its last episode shows a full bar."""
     board, *_ = board_of(long_ways()[:1], done=(long_ways()[0].id,))
     assert board.left.share == 1.0 and "1/1" in str(board.bars.tasks[0].fields["count"])
 
 
 def test_the_bars_fit_80_columns() -> None:
-    """The longest name, thousands of seconds, dozens of failures: no line is broken and nothing is
-    cut."""
+    """With the longest name, thousands of seconds and dozens of failures no line is broken and
+    nothing is cut."""
     named = msgspec.structs.replace(long_ways()[7], id="ped_crossing-001")
-    board, clock, said = board_of((named, *long_ways()[:2]))
+    board, clock, output = board_of((named, *long_ways()[:2]))
     clock.now_s = 4000.0
     board.tell(EpisodeProgress(named.id, 3185.2, 630.4, 88))
     board.bars.refresh()
-    Console(file=said, width=80).print(board.bars.get_renderable())
-    lines = said.getvalue().splitlines()
-    assert max(map(len, lines)) <= 80 and "…" not in said.getvalue()
+    Console(file=output, width=80).print(board.bars.get_renderable())
+    lines = output.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80 and "…" not in output.getvalue()
     way = f"630/{long_ways()[7].route_line.length_m:.0f} m"
     assert any(
         "ped_crossing-001" in line and way in line and "88 failures" in line for line in lines

@@ -22,11 +22,11 @@ from cosim.results.throughput import (
 from tests.support.driven_runs import run_of
 
 
-def test_what_happens_is_a_line_of_json_and_a_line_of_words(
+def test_an_event_is_logged_as_json_and_as_text(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Both tell time, level, event and facts; what is below the level is left out; the file is
-    appended to; nothing is said outside of the block."""
+    """Both have time, level, event and facts; lower levels are left out, the file is appended to,
+    and logging ends with the block."""
     for _ in range(2):
         with logged("info", tmp_path / "log.jsonl") as counts:
             log_event("claimed", logging.DEBUG, scenario="s-0")
@@ -34,9 +34,9 @@ def test_what_happens_is_a_line_of_json_and_a_line_of_words(
                 "retried", logging.WARNING, scenario="s-0", why="its worker was lost", attempts=1
             )
     log_event("retried", scenario="later")
-    told = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert len(told) == 2 and told[0].pop("time")[10] == "T"
-    assert told[0] == {
+    entries = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert len(entries) == 2 and entries[0].pop("time")[10] == "T"
+    assert entries[0] == {
         "level": "warning",
         "event": "retried",
         "scenario": "s-0",
@@ -50,8 +50,8 @@ def test_what_happens_is_a_line_of_json_and_a_line_of_words(
     )
 
 
-def test_a_log_that_cannot_be_kept_is_refused(tmp_path: Path) -> None:
-    """A level that does not exist, with the nearest one; a file in no folder."""
+def test_an_unusable_log_is_refused(tmp_path: Path) -> None:
+    """An unknown level is refused with the nearest one, and so is a file in a missing folder."""
     with (
         pytest.raises(UsageError, match=r"unknown log level 'warn'.*Did you mean warning"),
         logged("warn", None),
@@ -61,8 +61,8 @@ def test_a_log_that_cannot_be_kept_is_refused(tmp_path: Path) -> None:
         pass
 
 
-def test_figures_of_a_run_are_kept_for_each_time_that_it_went_on(tmp_path: Path) -> None:
-    """Episodes of this go, simulated seconds, what its processes did, retries as they were
+def test_each_session_of_a_run_has_its_own_figures(tmp_path: Path) -> None:
+    """The figures have this session's episodes, simulated seconds, process counts, and retries as
     logged."""
     run = run_of(tmp_path / "run", ["goal", "hit", "goal"])
     simulated_s = 0.05 * sum(
@@ -84,8 +84,8 @@ def test_figures_of_a_run_are_kept_for_each_time_that_it_went_on(tmp_path: Path)
     assert first["answer_ms"] is None and "answer" not in go.figures.in_words
 
 
-def test_what_the_policy_took_for_an_answer_is_told(tmp_path: Path) -> None:
-    """The median of the episodes' medians, of those that tell."""
+def test_the_answer_time_of_a_policy_is_reported(tmp_path: Path) -> None:
+    """It is the median of the medians of the episodes that have one."""
     some = read_records(run_of(tmp_path / "run", ["goal", "hit", "goal", "hit"]))
     clocks = [{"answer_ms": ms} if ms else {} for ms in (2.0, 0.0, 30.0, 4.0)]
     took = [

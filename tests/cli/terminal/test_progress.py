@@ -1,4 +1,4 @@
-"""What is said while something takes its time."""
+"""Progress messages of long commands."""
 
 from __future__ import annotations
 
@@ -12,27 +12,25 @@ from cosim.core.units import duration
 
 
 def test_a_log_gets_one_line_for_each_stage() -> None:
-    """Where standard error is no terminal nothing moves and nothing is repeated: a line when a
-    stage begins."""
-    said = io.StringIO()
-    with doing("reading [the] city", Console(file=said, width=80)) as tell:
+    """Where standard error is no terminal, each stage prints one line when it begins."""
+    output = io.StringIO()
+    with doing("reading [the] city", Console(file=output, width=80)) as tell:
         for share in (0.0, 0.5, 1.0):
             tell("simulating to 20 s", share)
         tell("drawing")
-    assert said.getvalue() == "reading [the] city ...\nsimulating to 20 s ...\ndrawing ...\n"
+    assert output.getvalue() == "reading [the] city ...\nsimulating to 20 s ...\ndrawing ...\n"
 
 
-def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
-    """In a terminal the stage stands with its share and the time; at the end the line is taken
-    away."""
-    said = io.StringIO()
+def test_a_terminal_gets_a_progress_line_that_is_erased() -> None:
+    """The line shows the stage with its share and time, and is erased at the end."""
+    output = io.StringIO()
     console = Console(
-        file=said, width=80, force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"}
+        file=output, width=80, force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"}
     )
     with doing("reading [the] city", console) as tell:
         tell("simulating to 20 s", 0.5)
-    assert "simulating to 20 s: 50 %" in said.getvalue() and "0:00:00" in said.getvalue()
-    assert said.getvalue().endswith("\x1b[2K") or "\x1b[1A\x1b[2K" in said.getvalue()
+    assert "simulating to 20 s: 50 %" in output.getvalue() and "0:00:00" in output.getvalue()
+    assert output.getvalue().endswith("\x1b[2K") or "\x1b[1A\x1b[2K" in output.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -48,6 +46,7 @@ def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
     ],
     ids=lambda value: str(value).replace(" ", "-"),
 )
-def test_a_time_is_said_no_finer_than_it_is_known(seconds: float, words: str) -> None:
-    """Seconds, tens of seconds, minutes, tens of minutes: below one, two, 120 minutes and above."""
+def test_a_remaining_time_is_rounded_to_its_precision(seconds: float, words: str) -> None:
+    """It is rounded to seconds, tens of seconds, minutes, or tens of minutes: below one, two, 120
+    minutes, and above."""
     assert duration(seconds) == words

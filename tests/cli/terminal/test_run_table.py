@@ -32,12 +32,12 @@ from tests.support.driven_runs import episode_of, short_way
 
 
 def terminal(width: int = 80) -> tuple[Console, io.StringIO]:
-    said = io.StringIO()
-    return Console(file=said, width=width), said
+    output = io.StringIO()
+    return Console(file=output, width=width), output
 
 
 def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
-    """Two short episodes of two events; a collision each: 1 in the episode, 8.48 in 100 m."""
+    """Two short episodes of two events with a collision each: 1 in the episode, 8.48 in 100 m."""
     row = dict.fromkeys(METRICS, 1.0) | {"status": "done", "ended": "failure", "reason": ""}
     row |= {name: 0.25 for name, _ in (*SHOWN, *COUNTS, *WITH_PEOPLE)}  # type: ignore[dict-item]
     row |= {"collisions": 1.0, "collisions_per_100m": 8.48}  # type: ignore[dict-item]
@@ -48,8 +48,7 @@ def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
 
 
 def test_a_letter_means_one_thing_in_every_table() -> None:
-    """C, OL and F are per 100 m wherever they stand; what is counted in another way has a name in
-    words."""
+    """C, OL and F are per 100 m in every table; other counts have names in words."""
     table, kinds = pair_of_kinds()
     episodes, shares = terminal(), terminal()
     print_table(episodes[0], table, 2)
@@ -60,29 +59,29 @@ def test_a_letter_means_one_thing_in_every_table() -> None:
 
 
 def test_every_letter_and_heading_is_explained_under_its_table() -> None:
-    """Letters have their meaning in the line below, rates their unit in the heading, as the
-    documents do."""
+    """Letters are explained below the table, and rates have their unit in the heading, as in the
+    documents."""
     table, kinds = pair_of_kinds()
-    out, said = terminal()
+    out, output = terminal()
     print_table(out, table, 2)
-    text = " ".join(said.getvalue().split())
+    text = " ".join(output.getvalue().split())
     page = " ".join(text_of("docs/baselines.md").split())
     for _, letter in SHOWN:
         assert f"{letter} {LETTERS[letter]}" in text, letter
     for letter in ("C", "OL", "F"):
         assert f"{letter} {LETTERS[letter]}" in page.replace("`", ""), letter
     assert text.count("/100m") >= 4 and "m/s" in text
-    out, said = terminal()
+    out, output = terminal()
     print_by_kind(out, table, kinds)
-    assert "share of these" in " ".join(said.getvalue().split())
+    assert "share of these" in " ".join(output.getvalue().split())
 
 
-def test_success_names_the_events_that_end_otherwise() -> None:
-    """Under every table that gives SR stands which events ask for a stop, and which for passing
-    round, by name."""
-    out, said = terminal()
+def test_tables_of_success_name_events_with_their_own_ending() -> None:
+    """Below every table with SR the events that need a stop, and those that need passing round, are
+    named."""
+    out, output = terminal()
     print_table(out, pair_of_kinds()[0], 2)
-    assert SUCCESS_IN_WORDS in " ".join(said.getvalue().split())
+    assert SUCCESS_IN_WORDS in " ".join(output.getvalue().split())
     stop, rule = SUCCESS_IN_WORDS.split("(")[1:]
     assert all(kind.name in stop for kind in EVENT_KINDS.values() if kind.ends_at == "stop")
     assert all(kind.name in rule for kind in EVENT_KINDS.values() if kind.passed_as_group)
@@ -91,9 +90,8 @@ def test_success_names_the_events_that_end_otherwise() -> None:
     )
 
 
-def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
-    """Seventeen hundred scenarios are no answer to a slip of the pen: five are, and how many there
-    are."""
+def test_a_misspelt_name_gets_a_few_similar_ones() -> None:
+    """A misspelt scenario name gets five similar ones and the total count, not all 1,700."""
     names = [scenario.id for scenario in load_suite("reactive").scenarios]
     assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))
     assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 1700" in str(
@@ -101,9 +99,9 @@ def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
     )
 
 
-def test_val_and_test_stand_apart() -> None:
-    """A run with both has a row for each, with its crashes, and counts below five episodes; a run
-    of one has none."""
+def test_val_and_test_have_separate_rows() -> None:
+    """A run with both has a row for each, with its crashes, and counts below five episodes; other
+    runs have none."""
     rows = [
         dict.fromkeys(METRICS, 1.0)
         | {
@@ -116,19 +114,19 @@ def test_val_and_test_stand_apart() -> None:
         }
         for i, split in enumerate(("val",) * 6 + ("test",) * 3)
     ]
-    out, said = terminal()
+    out, output = terminal()
     print_table(out, pd.DataFrame(rows), 9)
-    assert re.search(r"^ +val +6 +1 +0\.83 0\.44\.\.0\.97 ", said.getvalue(), re.MULTILINE)
-    assert re.search(r"^ +test +3 +0 +0/3 +1\.00 +3 in 3 m ", said.getvalue(), re.MULTILINE)
-    assert "…" not in said.getvalue()
-    out, said = terminal()
+    assert re.search(r"^ +val +6 +1 +0\.83 0\.44\.\.0\.97 ", output.getvalue(), re.MULTILINE)
+    assert re.search(r"^ +test +3 +0 +0/3 +1\.00 +3 in 3 m ", output.getvalue(), re.MULTILINE)
+    assert "…" not in output.getvalue()
+    out, output = terminal()
     print_table(out, pd.DataFrame(rows[:2]), 2)
-    assert "split" not in said.getvalue()
+    assert "split" not in output.getvalue()
 
 
-def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() -> None:
-    """Camera, rate, goals, waypoint rule and seed below the rows; who has a camera of its own has a
-    star, and why."""
+def test_a_table_lists_the_setup_and_marks_nonstandard_policies() -> None:
+    """Camera, rate, goals, waypoint rule and seed are below the rows; a policy with its own camera
+    has a star and the reason."""
     row = {
         "scenario": "s-1",
         "status": "done",
@@ -148,9 +146,9 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
     }  # type: ignore[dict-item]
     row = dict.fromkeys(METRICS, 1.0) | {name: 1.0 for name, _ in (*SHOWN, *COUNTS)} | row  # type: ignore[assignment]
     for odd, star in (("a camera of its own", True), ("", False)):
-        out, said = terminal()
+        out, output = terminal()
         print_table(out, pd.DataFrame([row | {"nonstandard": odd}]), 1)
-        text = " ".join(said.getvalue().split())
+        text = " ".join(output.getvalue().split())
         assert (
             "policy orca (oracle, privileged); sensor track privileged; camera own mount, "
             "64 x 64 px, 75 deg, at 4 Hz; goal route_point; "
@@ -163,11 +161,11 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         )
 
 
-def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_have(
+def test_a_table_omits_cameras_and_waypoints_that_a_policy_lacks(
     tmp_path: Path,
 ) -> None:
-    """A blind policy has no camera in its line; waypoints stand there where an answer in the run's
-    folder was some."""
+    """A blind policy has no camera in its line; the waypoint rule appears only if an answer had
+    waypoints."""
     record, log = episode_of(short_way("s-0"), "h")
     assert log is not None
     plan = {
@@ -175,15 +173,15 @@ def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_
         "plan_points": np.ones((1, 2), np.float32),
         "plan_index": 0,
     }
-    for name, one in (
+    for name, expected in (
         ("commands", log),
         ("waypoints", dataclasses.replace(log, answers=np.ones((1, 4)), **plan)),
     ):
         (tmp_path / name / "episodes/s-0").mkdir(parents=True)
-        (tmp_path / name / "episodes/s-0/trajectory.npz").write_bytes(one.encoded())
-        out, said = terminal()
+        (tmp_path / name / "episodes/s-0/trajectory.npz").write_bytes(expected.encoded())
+        out, output = terminal()
         print_terms(out, table_of([record]), tmp_path / name)
-        text = " ".join(said.getvalue().split())
+        text = " ".join(output.getvalue().split())
         assert (
             text.startswith("policy p; sensor track blind; at 4 Hz; goal none; odometry none; ")
             and "camera" not in text
@@ -191,12 +189,12 @@ def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_
         assert ("waypoint 2, units of 1 m" in text) is (name == "waypoints")
 
 
-def test_the_list_says_which_policies_know_more_than_a_robot() -> None:
+def test_the_list_marks_privileged_policies() -> None:
     """`orca` is the oracle; it and two other baselines are privileged, those that see are not."""
-    out, said = terminal()
+    out, output = terminal()
     print_names(out)
     named = [
-        line.split("  ")[1] for line in said.getvalue().splitlines() if line.startswith("policy ")
+        line.split("  ")[1] for line in output.getvalue().splitlines() if line.startswith("policy ")
     ]
     privileged = ["route (privileged)", "orca (oracle, privileged)", "social_force (privileged)"]
     assert [name for name in named if "privileged" in name] == privileged
@@ -204,45 +202,45 @@ def test_the_list_says_which_policies_know_more_than_a_robot() -> None:
 
 
 def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
-    """A film of the failure, or of an episode where none failed, a report, one episode; without a
-    track a report."""
+    """Next are a film of the first failure, or of any episode, a report and one episode; without
+    trajectories a report."""
 
-    def told(*rows: tuple[str, str | None, float]) -> list[str]:
-        said = io.StringIO()
+    def printed_lines(*rows: tuple[str, str | None, float]) -> list[str]:
+        output = io.StringIO()
         table = pd.DataFrame(rows, columns=["scenario", "ended", "success"])
-        print_next_commands(Console(file=said, width=40), Path("runs/my run"), table)
-        assert said.getvalue().endswith("\n")
-        return [line.strip() for line in said.getvalue().splitlines()]
+        print_next_commands(Console(file=output, width=40), Path("runs/my run"), table)
+        assert output.getvalue().endswith("\n")
+        return [line.strip() for line in output.getvalue().splitlines()]
 
     report = "cosim report 'runs/my run' -o report.html"
-    assert told(("a", "goal", 1.0), ("b", "failure", 0.0)) == [
+    assert printed_lines(("a", "goal", 1.0), ("b", "failure", 0.0)) == [
         "Next:",
         "cosim film 'runs/my run' --failure -o film.mp4",
         report,
         "cosim show 'runs/my run' --episode b",
     ]
-    assert told(("a", "goal", 1.0))[1] == "cosim film 'runs/my run' a -o film.mp4"
-    assert told(("a", None, 0.0)) == ["Next:", report]
+    assert printed_lines(("a", "goal", 1.0))[1] == "cosim film 'runs/my run' a -o film.mp4"
+    assert printed_lines(("a", None, 0.0)) == ["Next:", report]
 
 
 def test_few_episodes_are_counted_and_crashes_have_a_column() -> None:
-    """Of one episode there is no interval, and no rate but failures in metres; a kind with a crash
-    has a count of it, and none of the people that were hit."""
+    """One episode gives no interval and failures in metres; a kind with a crash has its count, and
+    no count of people hit."""
     ways = [short_way(f"s-{k}", structure=("straight", "curve")[k % 2]) for k in range(4)]
 
-    def told(*hows: str) -> str:
+    def printed_table(*hows: str) -> str:
         records = [episode_of(way, "h", how)[0] for way, how in zip(ways, hows, strict=False)]
-        out, said = terminal()
+        out, output = terminal()
         print_table(out, table_of(records), len(records))
         print_by_kind(out, table_of(records), {way.id: way.structure for way in ways})
-        return said.getvalue()
+        return output.getvalue()
 
-    one = told("goal")
+    one = printed_table("goal")
     assert re.search(r"success \(SR\) +1/1 +- +1 ", one)
     assert re.search(r"collisions_per_100m \(C\) +0 in 8 m +- +1 ", one)
     assert re.search(r"velocity_mean_mps \(V\) +1\.00 +- +1 ", one)
     assert not re.search(r"\d to \d|\d\.\.\d", one) and "crash " not in one
-    several = told("goal", "goal", "goal", "crashed")
+    several = printed_table("goal", "goal", "goal", "crashed")
     assert re.search(r"success \(SR\) +3/4 +- +4 ", several)
     assert re.search(r"velocity_mean_mps \(V\) +0\.75 ", several)
     assert re.search(r"failures_per_100m \(FC\) +- +- +0 ", several)

@@ -1,4 +1,4 @@
-"""What the command line prints where it cannot be written: said in one line, or not at all; never a
+"""Output streams that cannot be written: reported in one line or not at all, never with a
 traceback."""
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ pytestmark = pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/
 @pytest.mark.parametrize(
     "words", [("list",), ("list", "reactive"), ("--help",), ("--version",)], ids="-".join
 )
-def test_a_full_disk_is_told_in_one_line(words: tuple[str, ...]) -> None:
-    """`cosim list > /dev/full`: what is wrong with standard output, exit code 3."""
+def test_a_full_disk_is_reported_in_one_line(words: tuple[str, ...]) -> None:
+    """`cosim list > /dev/full` reports the error of standard output and exits with code 3."""
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [*COMMAND, *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
@@ -29,9 +29,8 @@ def test_a_full_disk_is_told_in_one_line(words: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize("words", [("list", "reactive"), ("--help",)], ids="-".join)
-def test_who_stops_reading_is_told_nothing(words: tuple[str, ...]) -> None:
-    """`cosim list reactive | head -1`: no word, and the exit code of a program that a closed pipe
-    ended."""
+def test_a_closed_pipe_ends_the_command_silently(words: tuple[str, ...]) -> None:
+    """`cosim list reactive | head -1` prints no error and exits with the code of a closed pipe."""
     ours, theirs = os.pipe()
     os.close(ours)
     done = subprocess.run(
@@ -41,9 +40,9 @@ def test_who_stops_reading_is_told_nothing(words: tuple[str, ...]) -> None:
     assert done.returncode == 128 + 13 and done.stderr == ""
 
 
-def test_errors_that_cannot_be_written_leave_the_exit_code() -> None:
-    """With standard error on a full disk nothing can be said, and wrong use is 3, as the machine
-    is."""
+def test_a_full_standard_error_ends_with_exit_code_3() -> None:
+    """With standard error on a full disk, wrong use exits with 3, as other faults of the machine
+    do."""
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [*COMMAND, "list", "nowhere"], stdout=subprocess.PIPE, stderr=full, check=False
@@ -51,8 +50,8 @@ def test_errors_that_cannot_be_written_leave_the_exit_code() -> None:
     assert done.returncode == 3 and done.stdout == b""
 
 
-def test_what_the_terminal_cannot_show_is_written_as_an_escape(tmp_path: Path) -> None:
-    """A file's name that is no text, on a terminal that knows ASCII only."""
+def test_unprintable_characters_are_escaped(tmp_path: Path) -> None:
+    """A file name that is no text is escaped on a terminal that shows only ASCII."""
     name = os.fsdecode(b"ni\xff.json")
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(

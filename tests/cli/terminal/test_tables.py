@@ -30,12 +30,12 @@ from tests.conftest import ROOT
 
 WIDTHS = (60, 80, 120)
 LONG = "sumo-fokr-bs-demo-ped_crossing-003"
-"""As long as the name of an episode is on a map."""
+"""A name as long as those of episodes on maps."""
 
 
 def episodes() -> pd.DataFrame:
-    """Twelve episodes and their decoys with long names, two digits before every point, dozens of failures, and the
-    robot's cost; all succeed and touch everything."""
+    """Twelve successful episodes and their decoys with long names, large figures, dozens of
+    failures, and the robot's cost."""
     row = dict.fromkeys((*KEYS, *METRICS, *COUNTERFACTUAL), 34.56) | {
         name: 120.0 for name, _ in COUNTS
     }
@@ -71,29 +71,32 @@ def episodes() -> pd.DataFrame:
     )
 
 
-def of_run(out: Console) -> None:
+def example_run(out: Console) -> None:
     table = episodes()
     print_table(out, table, 24)
     kinds = [kind for kind in ("ped_crossing", "conversing") * 6 for _ in range(2)]
     print_by_kind(out, table, dict(zip(table["scenario"], kinds, strict=True)))
 
 
-def of_comparison(out: Console) -> None:
+def example_comparison(out: Console) -> None:
     figures = (200, -34.567, 34.567, "", "", 69.134, -12.345, 81.479, 100, "within noise")
     rows = [
         ("a", "b", by, LONG, name, "", *figures) for by in ("suite", "event") for name in METRICS
     ]
     before, after = (ComparedRun(label, Path(label), episodes()) for label in "ab")
-    told = pd.DataFrame(rows, columns=list(DIFFERENCES)), pd.DataFrame([], columns=list(FLIPPED))
-    print_comparison(out, RunComparison("reactive", before, (after,), *told, ()))
+    tables_of_differences = (
+        pd.DataFrame(rows, columns=list(DIFFERENCES)),
+        pd.DataFrame([], columns=list(FLIPPED)),
+    )
+    print_comparison(out, RunComparison("reactive", before, (after,), *tables_of_differences, ()))
 
 
-def of_sheet(out: Console) -> None:
+def example_sheet(out: Console) -> None:
     row = (LONG, "ped_crossing", -19.86, -19.98, 0.123, 0.060, 34.56, 34.56, -12.34, -180.0, 12.34)
     print_sheet(out, pd.DataFrame([row], columns=list(COLUMNS)))
 
 
-def of_sweep(out: Console) -> None:
+def example_sweep(out: Console) -> None:
     rows = [
         {
             "crowd.density": 12.5,
@@ -108,7 +111,7 @@ def of_sweep(out: Console) -> None:
     _print_sweep(pd.DataFrame(rows), ["crowd.density", "events.kind", "obstacles.per_100m"])
 
 
-def of_figures(out: Console) -> None:
+def example_figures(out: Console) -> None:
     print_figures(
         {
             f"a policy's answer to {LONG}, ms": [
@@ -119,37 +122,37 @@ def of_figures(out: Console) -> None:
     )
 
 
-def of_suite(out: Console) -> None:
+def example_suite(out: Console) -> None:
     print_scenarios(
         out, Suite(name="s", version="1", scenarios=load_suite("long-horizon").scenarios[-3:])
     )
 
 
 TABLES: dict[str, tuple[Callable[[Console], None], Sequence[str]]] = {
-    "run": (of_run, ("34.56", "120/120/120/120", "34.56 to 34.56", "0.61..1.00")),
+    "run": (example_run, ("34.56", "120/120/120/120", "34.56 to 34.56", "0.61..1.00")),
     "comparison": (
-        of_comparison,
+        example_comparison,
         ("-34.57", "34.57", "+69.13", "-12.35 to +81.48", "200", "within noise"),
     ),
-    "events": (of_sheet, ("-19.98", "0.123", "0.060", "-12.34", "-180", "12.34")),
-    "sweep": (of_sweep, ("34.56", "-34.56..34.56", "200")),
-    "bench": (of_figures, ("1235", "1035", "1235 to 1235", "<= 34.56")),
-    "suite": (of_suite, ("lh-braunschweig-2", "1750")),
+    "events": (example_sheet, ("-19.98", "0.123", "0.060", "-12.34", "-180", "12.34")),
+    "sweep": (example_sweep, ("34.56", "-34.56..34.56", "200")),
+    "bench": (example_figures, ("1235", "1035", "1235 to 1235", "<= 34.56")),
+    "suite": (example_suite, ("lh-braunschweig-2", "1750")),
 }
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", TABLES)
 def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a narrow, a usual and a wide terminal: no line is longer than it, nothing ends in dots,
-    figures are whole."""
-    said = io.StringIO()
-    out = Console(file=said, width=width)
+    """In a narrow, a usual and a wide terminal lines fit, no cell ends in dots, and figures are
+    complete."""
+    output = io.StringIO()
+    out = Console(file=output, width=width)
     for module in ("scenario", "bench"):
         monkeypatch.setattr(f"cosim.cli.{module}.out", out)
     prints, figures = TABLES[name]
     prints(out)
-    text = said.getvalue()
+    text = output.getvalue()
     in_tables = [line for line in text.splitlines() if not line.startswith("Paired by scenario")]
     assert "…" not in text and max(map(len, in_tables)) <= width, text
     for figure in figures:
@@ -157,24 +160,24 @@ def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_table_that_is_too_wide_is_divided() -> None:
-    """Each part has the names again and as many figures as fit; every figure is there once, in the
-    order of columns."""
+    """Each part repeats the names and holds as many figures as fit; every figure appears once, in
+    column order."""
     heads = [f"figure {k}" for k in range(9)]
-    said = io.StringIO()
+    output = io.StringIO()
     row = (LONG, *(f"{k}.000000" for k in range(9)))
     tables.show(
-        Console(file=said, width=50), [*tables.names("what"), *tables.figures(*heads)], [row]
+        Console(file=output, width=50), [*tables.names("what"), *tables.figures(*heads)], [row]
     )
-    parts = said.getvalue().split("what")[1:]
-    assert len(parts) > 1 and max(map(len, said.getvalue().splitlines())) <= 50
+    parts = output.getvalue().split("what")[1:]
+    assert len(parts) > 1 and max(map(len, output.getvalue().splitlines())) <= 50
     found = [[word for word in part.split() if word.endswith(".000000")] for part in parts]
     assert [word for words in found for word in words] == [f"{k}.000000" for k in range(9)] and all(
         found
     )
 
 
-def test_a_table_that_fits_is_left_as_it_is() -> None:
-    """Heads are broken only where there is no room for them."""
+def test_a_table_that_fits_is_unchanged() -> None:
+    """Headings are broken only where they do not fit."""
     columns = [*tables.names("what"), *tables.figures("a head of several words")]
     wide, narrow = io.StringIO(), io.StringIO()
     for file, width in ((wide, 40), (narrow, 20)):
@@ -183,18 +186,19 @@ def test_a_table_that_fits_is_left_as_it_is() -> None:
 
 
 def test_cells_are_plain_text() -> None:
-    """Brackets in a name are no markup; a section is set apart; title and note are around the
+    """Brackets in a name are no markup, a section is separated, and title and note surround the
     table."""
-    said = io.StringIO()
+    output = io.StringIO()
     columns = [*tables.names("what"), *tables.labels("how"), *tables.words("why")]
     rows = [("a [1]", "b", "c"), None, ("d", "e", "f")]
-    tables.show(Console(file=said, width=40), columns, rows, title="above", note="below")
-    lines = [line.split() for line in said.getvalue().splitlines()]
+    tables.show(Console(file=output, width=40), columns, rows, title="above", note="below")
+    lines = [line.split() for line in output.getvalue().splitlines()]
     assert lines[0] == ["above"] and lines[-1] == ["below"]
     assert ["a", "[1]", "b", "c"] in lines and ["d", "e", "f"] in lines
 
 
-def test_every_command_prints_its_tables_so() -> None:
-    """No other module of the command line makes a table of its own."""
-    for path in sorted((ROOT / "cosim/cli").rglob("*.py")):
-        assert path.name == "tables.py" or "rich.table" not in path.read_text(), path
+def test_every_command_prints_tables_through_one_module() -> None:
+    """No other module of the command line builds a table."""
+    modules = sorted((ROOT / "cosim/cli").rglob("*.py"))
+    builders = [path.name for path in modules if "rich.table" in path.read_text()]
+    assert builders == ["tables.py"]

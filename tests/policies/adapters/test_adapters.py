@@ -71,26 +71,25 @@ SHAPES: dict[str, Shapes] = {
         "hidden_state": (1, 512),
     },
 }
-"""As far as they are public; what is not is a guess, told in README.md beside the manifests."""
+"""Input and output shapes, guessed where they are not public: see README.md of the manifests."""
 SAMPLE = ("nomad", "s2e")
 
 
 def bundle_of(name: str, folder: Path, **changes: object) -> Path:
-    """A folder with an adapter's manifest, but for its files, and a small graph. changes: of the
-    output."""
-    told = json.loads((ADAPTERS / name / "manifest.json").read_text())
+    """A folder with an adapter's manifest, without its files, and a small graph; `changes` are of
+    the output."""
+    manifest = json.loads((ADAPTERS / name / "manifest.json").read_text())
     bundle: BundleManifest = read_bundle_manifest(ADAPTERS / name)
     (folder / bundle.model).write_bytes(likeness(bundle, SHAPES[name]))
-    told.pop("files", None)
-    told["output"] |= changes
-    (folder / "manifest.json").write_text(json.dumps(told))
+    manifest.pop("files", None)
+    manifest["output"] |= changes
+    (folder / "manifest.json").write_text(json.dumps(manifest))
     return folder
 
 
 @pytest.mark.parametrize("name", list(SHAPES))
-def test_an_adapter_takes_a_graph_of_the_networks_shapes(name: str, tmp_path: Path) -> None:
-    """Every input is made and every output read: it is asked twice in a grey street when it is
-    loaded."""
+def test_an_adapter_accepts_a_graph_of_the_networks_shapes(name: str, tmp_path: Path) -> None:
+    """All inputs are built and outputs read in two queries in a grey street when it is loaded."""
     policy = OnnxPolicy(bundle_of(name, tmp_path))
     assert policy.manifest.name == name and set(policy.graph.inputs) == set(policy.bundle.inputs)
 
@@ -100,8 +99,8 @@ def test_an_adapter_takes_a_graph_of_the_networks_shapes(name: str, tmp_path: Pa
 def test_an_adapter_passes_the_check(
     name: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """A graph that follows street and goal, with the inputs and outputs of the network, fails in
-    nothing."""
+    """A graph that follows street and goal, with the network's inputs and outputs, passes every
+    check."""
     if name not in SAMPLE and not request.config.getoption("--whole"):
         pytest.skip("a sample is tested without --whole")
     policy = OnnxPolicy(bundle_of(name, tmp_path))
@@ -113,8 +112,8 @@ def test_an_adapter_passes_the_check(
 
 
 @pytest.mark.engine
-def test_an_adapter_with_the_wrong_side_or_unit_fails_it(tmp_path: Path) -> None:
-    """The same graph under a manifest that a user may have got wrong does not pass."""
+def test_an_adapter_with_the_wrong_side_or_unit_fails_the_check(tmp_path: Path) -> None:
+    """The same graph under a manifest with a typical mistake does not pass."""
     for changes, check in (({"columns": ["y", "x"]}, "goal_mirrored"), ({"unit_m": 11.0}, "unit")):
         policy = OnnxPolicy(bundle_of("citywalker", tmp_path, **changes))
         drives = shown_drives(policy.manifest, 2, camera_of_choice("auto"))
@@ -127,8 +126,8 @@ def test_an_adapter_with_the_wrong_side_or_unit_fails_it(tmp_path: Path) -> None
 def test_every_adapter_says_where_its_weights_are(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is a policy by its name; without weights a run names file, source, size and hash where
-    these are known."""
+    """Each is a policy by name; without weights a run names file, source, size and hash where these
+    are known."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("HOME", str(tmp_path))
     assert sorted(SHAPES) == sorted(path.parent.name for path in ADAPTERS.glob("*/manifest.json"))
@@ -136,11 +135,13 @@ def test_every_adapter_says_where_its_weights_are(
         bundle = read_bundle_manifest(ADAPTERS / name)
         with pytest.raises(UsageError) as refused:
             load_policy(name)
-        said = str(refused.value)
-        assert f"{bundle.model} is missing" in said and bundle.source in said and bundle.licence
+        message = str(refused.value)
+        assert (
+            f"{bundle.model} is missing" in message and bundle.source in message and bundle.licence
+        )
         if bundle.model in bundle.files:
             facts = bundle.files[bundle.model]
-            assert f"{facts.bytes} bytes, SHA-256 {facts.sha256}" in said
+            assert f"{facts.bytes} bytes, SHA-256 {facts.sha256}" in message
         else:
             assert (
                 "unknown" in bundle.source
@@ -174,11 +175,11 @@ class InternVLAN1AsyncAgent:
 
 
 @pytest.mark.engine
-def test_internvla_is_asked_as_its_authors_ask_it(
+def test_internvla_is_queried_as_by_its_authors(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An agent of the same face, in its place on the path, passes the check as the served policy's
-    own code."""
+    """A substitute agent with the same interface, imported from the path, passes the check through
+    the served policy's code."""
     folder = tmp_path / "internnav" / "agent"
     folder.mkdir(parents=True)
     (folder / "internvla_n1_agent_realworld.py").write_text(AGENT)
@@ -189,9 +190,11 @@ def test_internvla_is_asked_as_its_authors_ask_it(
     assert without.returncode == 2 and "github.com/InternRobotics/InternNav" in without.stderr
     monkeypatch.setenv("COSIM_INTERNVLA", "checkpoint")
     done = cosim("policy", "check", name, "--frames", "3", "--json", cwd=tmp_path)
-    told = json.loads(done.stdout)
-    assert done.returncode == 0, told
+    report = json.loads(done.stdout)
+    assert done.returncode == 0, report
     assert (
-        told["checks"]["goal_mirrored"]["outcome"] == told["checks"]["side"]["outcome"] == "passed"
+        report["checks"]["goal_mirrored"]["outcome"]
+        == report["checks"]["side"]["outcome"]
+        == "passed"
     )
-    assert np.isfinite(told["answer_ms"])
+    assert np.isfinite(report["answer_ms"])

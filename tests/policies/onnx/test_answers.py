@@ -1,4 +1,4 @@
-"""From a graph's outputs to waypoints or a command."""
+"""Conversion of a graph's outputs to waypoints or a command."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ ROWS = np.array([[[1.0, 0.5], [2.0, 1.0], [3.0, 2.0]]])
 WAYPOINTS = {"what": "waypoints", "name": "plan", "index": 1}
 
 
-def answered(output: dict[str, Any], last: Command = STILL, **told: Any) -> Any:
-    """The answer of a graph that tells this."""
-    arrays = {name: np.asarray(array, np.float32) for name, array in told.items()}
+def answered(output: dict[str, Any], last: Command = STILL, **outputs: Any) -> Any:
+    """Return the answer of a graph with this output."""
+    arrays = {name: np.asarray(array, np.float32) for name, array in outputs.items()}
     return decode_answer(msgspec.convert(output, GraphOutput), arrays, COURIER, last)
 
 
@@ -46,13 +46,13 @@ PLANS: dict[str, tuple[dict[str, Any], Any, list[list[float]]]] = {
 
 @pytest.mark.parametrize("name", PLANS)
 def test_waypoints_are_read_by_their_columns(name: str) -> None:
-    """Summed up, turned, scaled and offset as the output says."""
-    fields, told, wanted = PLANS[name]
-    np.testing.assert_allclose(answered(WAYPOINTS | fields, plan=told), wanted, atol=1e-6)
+    """They are summed, turned, scaled and offset as the output declares."""
+    fields, expected, wanted = PLANS[name]
+    np.testing.assert_allclose(answered(WAYPOINTS | fields, plan=expected), wanted, atol=1e-6)
 
 
-def test_of_several_modes_the_one_with_the_highest_score_is_followed() -> None:
-    """Scores are another output, or stand behind each mode's numbers and their scales."""
+def test_the_mode_with_the_highest_score_is_followed() -> None:
+    """Scores are another output, or follow each mode's numbers and scales."""
     modes = np.stack([ROWS[0], -ROWS[0], 2 * ROWS[0]])[None]
     best = answered({**WAYPOINTS, "scores": "probs"}, plan=modes, probs=[[0.1, 0.2, 0.7]])
     np.testing.assert_allclose(best, 2 * ROWS[0])
@@ -64,7 +64,7 @@ def test_of_several_modes_the_one_with_the_highest_score_is_followed() -> None:
 
 
 def test_speeds_of_a_plan_can_be_followed_in_place_of_its_waypoints() -> None:
-    """The command is that of the row, the waypoints are kept in metres."""
+    """The command is that of the declared row, and the waypoints are stored in metres."""
     output = {
         **WAYPOINTS,
         "columns": ["x", "y", "speed", "turn"],
@@ -79,8 +79,8 @@ def test_speeds_of_a_plan_can_be_followed_in_place_of_its_waypoints() -> None:
     np.testing.assert_allclose(answer.waypoints, [[2, 0], [4, 0]])
 
 
-def test_wheels_turn_a_robot_by_its_track() -> None:
-    """The same wheels turn a narrower robot more."""
+def test_wheel_speeds_turn_a_robot_by_its_track() -> None:
+    """The same wheel speeds turn a narrower robot more."""
     wheels = {
         "what": "wheels",
         "left": {"name": "y"},
@@ -97,8 +97,8 @@ def test_wheels_turn_a_robot_by_its_track() -> None:
     )
 
 
-def test_steering_slows_down_for_what_it_should_stop_for() -> None:
-    """Speed times 1 less the probability, each with its share of the command before."""
+def test_steering_slows_down_by_the_collision_probability() -> None:
+    """Speed is scaled by 1 less the probability, and both are smoothed with the command before."""
     output = {"what": "steering", "turn": {"name": "steer"}, "unit_radps": -0.5, "speed_mps": 2.0}
     more = {"stop": {"name": "hit"}, "keep_speed": 0.75, "keep_turn": 0.5}
     answer = answered(output | more, last=Command(1.0, 0.2), steer=[[0.4]], hit=[[0.25]])
@@ -107,7 +107,7 @@ def test_steering_slows_down_for_what_it_should_stop_for() -> None:
 
 
 def test_a_command_is_two_numbers_in_their_units() -> None:
-    """Wherever they stand in the outputs."""
+    """The two numbers are read from any place in the outputs."""
     output = {
         "what": "command",
         "v": {"name": "u", "index": 1},
@@ -119,6 +119,6 @@ def test_a_command_is_two_numbers_in_their_units() -> None:
 
 
 def test_an_answer_with_nan_is_the_policys_crash() -> None:
-    """It names the output."""
+    """The message names the output."""
     with pytest.raises(PolicyError, match="output 'plan' of the graph holds NaN or infinity"):
         answered(WAYPOINTS, plan=ROWS * np.nan)

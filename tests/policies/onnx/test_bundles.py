@@ -1,4 +1,4 @@
-"""ONNX bundles as policies: loaded whole, or refused before anything is driven, in words."""
+"""ONNX bundles as policies: loaded completely, or refused with a reason before anything is driven."""
 
 from __future__ import annotations
 
@@ -160,18 +160,18 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
 def test_a_bundle_that_cannot_be_driven_is_refused_when_it_is_loaded(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
 ) -> None:
-    """In one message, with the bundle, the place, what was found and what was wanted; the runtime
+    """One message has the bundle, the place, what was found and what is required; the runtime
     prints nothing."""
-    graph, fields, told = REFUSED[name]
+    graph, fields, expected = REFUSED[name]
     place = bundle(tmp_path / "net", graph, **fields)
     with pytest.raises(UsageError) as caught:
         load_policy(f"onnx:{place}")
-    assert f"policy 'onnx:{place}': " in str(caught.value) and told in str(caught.value)
+    assert f"policy 'onnx:{place}': " in str(caught.value) and expected in str(caught.value)
     assert capfd.readouterr() == ("", "")
 
 
 def test_a_folder_without_a_manifest_is_no_bundle(tmp_path: Path) -> None:
-    """It is said what is missing."""
+    """The message names the missing file."""
     with pytest.raises(UsageError, match=r"no bundle: has no manifest\.json"):
         load_policy(f"onnx:{tmp_path}")
 
@@ -189,7 +189,7 @@ def test_a_bundle_is_a_policy_from_python_too(tmp_path: Path) -> None:
 
 
 def test_the_hash_of_a_bundle_covers_all_that_decides_its_answers(tmp_path: Path) -> None:
-    """Manifest, graph, and weights beside the graph; not where it lies."""
+    """It covers manifest, graph, and external weights, but not the folder's path."""
 
     def hash_of(place: Path) -> str:
         return load_policy(f"onnx:{place}").source_hash
@@ -201,18 +201,18 @@ def test_the_hash_of_a_bundle_covers_all_that_decides_its_answers(tmp_path: Path
     )
     assert first != hash_of(bundle(tmp_path / "b", tiny_graph(), version="2"))
     beside = external(tmp_path / "c")
-    kept = hash_of(beside)
+    before = hash_of(beside)
     data = bytearray((beside / "model.onnx.data").read_bytes())
     data[2] ^= 1
     (beside / "model.onnx.data").write_bytes(data)
-    assert hash_of(beside) != kept
+    assert hash_of(beside) != before
 
 
-def test_weights_are_found_in_a_folder_of_their_own(
+def test_weights_are_found_in_a_separate_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """$COSIM_WEIGHTS, where they do not lie beside the manifest; and they are held against its
-    hash."""
+    """Weights that are not beside the manifest come from $COSIM_WEIGHTS and are checked against
+    their hash."""
     files = {"tiny.onnx": {"bytes": len(tiny_graph()), "blake2b": file_facts(tiny_graph()).blake2b}}
     place = bundle(tmp_path / "net", tiny_graph(), model="tiny.onnx", files=files)
     (tmp_path / "weights").mkdir()
@@ -226,10 +226,10 @@ def test_weights_are_found_in_a_folder_of_their_own(
         load_policy(f"onnx:{place}")
 
 
-def test_a_bundle_below_the_policies_is_one_by_its_plain_name(
+def test_a_bundle_in_the_policies_folder_has_a_plain_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The name of its folder; it is told where a name is unknown."""
+    """Its name is that of its folder, and is listed where a name is unknown."""
     (tmp_path / "bundles").mkdir()
     bundle(tmp_path / "bundles" / "tiny", tiny_graph())
     monkeypatch.setattr("cosim.policies.load.shipped_bundles", lambda: shipped_bundles(tmp_path))
@@ -239,7 +239,7 @@ def test_a_bundle_below_the_policies_is_one_by_its_plain_name(
 
 
 def test_a_run_with_goals_that_a_bundle_cannot_take_is_refused(tmp_path: Path) -> None:
-    """Unless its manifest says what stands for them."""
+    """The run is accepted only if the manifest declares a substitute for the goals."""
     driver = load_policy(f"onnx:{bundle(tmp_path / 'a', tiny_graph())}")
     with pytest.raises(
         UsageError, match="wants goals route_point or final_point or random_point, and gets 'image'"
@@ -253,7 +253,7 @@ def test_a_run_with_goals_that_a_bundle_cannot_take_is_refused(tmp_path: Path) -
 def test_a_provider_that_the_runtime_lacks_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With those that there are."""
+    """The message lists the available ones."""
     monkeypatch.setenv("COSIM_ONNX_PROVIDERS", "NoSuchExecutionProvider")
     with pytest.raises(
         UsageError,
@@ -262,11 +262,11 @@ def test_a_provider_that_the_runtime_lacks_is_refused(
         load_policy(f"onnx:{bundle(tmp_path, tiny_graph())}")
 
 
-def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
+def test_a_graph_off_the_cpu_answers_for_many_episodes_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each as if it were alone, with its own history; where the first axis is fixed, and on the
-    CPU, one by one."""
+    """Each has its own history and answer; with a fixed first axis, and on the CPU, they are
+    queried one by one."""
     place = bundle(tmp_path / "a", tiny_graph())
     fixed = bundle(tmp_path / "b", echo(1, 5, 2), **ONES, output=WAYPOINTS)
     assert not load_policy(f"onnx:{place}").batches
@@ -283,47 +283,47 @@ def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
             together.on_reset("b")
             alone["b"].on_reset()
         grey = example_observation(together.manifest)
-        asked = [
+        observations = [
             replace(grey, episode=name, rgb=draws.integers(0, 255, (32, 32, 3)).astype(np.uint8))
             for name in "cab"
         ]
-        answers = together.act_batch(asked)
-        for one, answer in zip(asked, answers, strict=True):
+        answers = together.act_batch(observations)
+        for one, answer in zip(observations, answers, strict=True):
             np.testing.assert_allclose(answer, alone[one.episode].act(one), rtol=1e-6)
     together.ended("a")
 
 
 @pytest.fixture
-def exemplary(tmp_path: Path) -> Callable[..., OnnxPolicy]:
-    """A bundle with an example of these arrays."""
+def bundle_with_example(tmp_path: Path) -> Callable[..., OnnxPolicy]:
+    """Return a bundle with an example of these arrays."""
 
-    def made(**arrays: np.ndarray[Any, Any]) -> OnnxPolicy:
+    def policy_with_example(**arrays: np.ndarray[Any, Any]) -> OnnxPolicy:
         place = bundle(tmp_path / "net", tiny_graph())
         np.savez(place / "example.npz", **arrays)
         return OnnxPolicy(place)
 
-    return made
+    return policy_with_example
 
 
-def test_the_example_of_a_bundle_is_held_against_its_graph(
-    exemplary: Callable[..., OnnxPolicy],
+def test_the_example_of_a_bundle_is_compared_with_its_graph(
+    bundle_with_example: Callable[..., OnnxPolicy],
 ) -> None:
-    """The largest difference of each output; what does not fit is said."""
+    """The largest difference of each output is reported, and so is an example that does not fit."""
     obs = np.ones((1, 6, 4, 8), np.float32)
     goal = np.array([[1, 0]], np.float32)
-    right = exemplary(obs=obs, goal=goal)
-    told = right.graph.run({"obs": obs, "goal": goal}, ["action"])["action"]
-    expected = {"expected.action": told + np.float32(0.5)}
-    assert example_differences(exemplary(obs=obs, goal=goal, **expected)) == pytest.approx(
-        {"action": 0.5}
-    )
+    right = bundle_with_example(obs=obs, goal=goal)
+    answer = right.graph.run({"obs": obs, "goal": goal}, ["action"])["action"]
+    expected = {"expected.action": answer + np.float32(0.5)}
+    assert example_differences(
+        bundle_with_example(obs=obs, goal=goal, **expected)
+    ) == pytest.approx({"action": 0.5})
     with pytest.raises(UsageError, match=r"example\.npz: has no array 'goal'"):
-        example_differences(exemplary(obs=obs, **expected))
+        example_differences(bundle_with_example(obs=obs, **expected))
     with pytest.raises(UsageError, match="does not fit the graph"):
-        example_differences(exemplary(obs=obs[:, :3], goal=goal, **expected))
+        example_differences(bundle_with_example(obs=obs[:, :3], goal=goal, **expected))
 
 
-def test_the_hash_of_a_bundle_is_another_where_a_processor_answers_otherwise(
+def test_the_hash_of_a_bundle_depends_on_the_processors_rounding(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A runtime that rounds otherwise makes another policy of the same files."""
@@ -333,8 +333,8 @@ def test_the_hash_of_a_bundle_is_another_where_a_processor_answers_otherwise(
 
     def next_number(graph: Graph, *words: Any) -> dict[str, Any]:
         return {
-            name: np.nextafter(told, told.dtype.type(9))
-            for name, told in run(graph, *words).items()
+            name: np.nextafter(output, output.dtype.type(9))
+            for name, output in run(graph, *words).items()
         }
 
     assert OnnxPolicy(folder).digest == here

@@ -1,4 +1,4 @@
-"""From observations to a graph's inputs: history, pictures, goals, and what a graph remembers."""
+"""Conversion of observations to a graph's inputs: history, pictures, goals, and memory."""
 
 from __future__ import annotations
 
@@ -35,34 +35,33 @@ SMALL = {"what": "picture", "size": [4, 2], "layout": "TCHW"}
 def feeder(
     shape: Sequence[int | None], dtype: Any = np.float32, seed: int = 0, **inputs: dict[str, Any]
 ) -> Feeder:
-    """Of inputs as a manifest has them, all of one shape."""
+    """A feeder of inputs as in a manifest, all of one shape."""
     made = msgspec.convert(inputs, dict[str, GraphInput])
     return Feeder(
         made, {name: TensorPort(name, np.dtype(dtype), tuple(shape)) for name in made}, seed
     )
 
 
-def level(value: int) -> NDArray[np.uint8]:
+def grey_picture(value: int) -> NDArray[np.uint8]:
     """A picture of one grey."""
     return np.full((8, 16, 3), value, np.uint8)
 
 
 def first_pixels(feeding: Feeder, *levels: int) -> list[float]:
-    """Of the last question's frames, after pictures of these greys."""
+    """Return the first pixels of the last query's frames, after pictures of these greys."""
     for one in levels:
-        told = feeding.feed(replace(SEEN, rgb=level(one)))["obs"]
-    return [round(float(number) * 255) for number in told[:, 0, 0, 0]]
+        tensor = feeding.feed(replace(SEEN, rgb=grey_picture(one)))["obs"]
+    return [round(float(number) * 255) for number in tensor[:, 0, 0, 0]]
 
 
-def test_history_is_the_last_frames_with_the_first_before_the_beginning() -> None:
-    """Oldest or newest first, every so many, zeros where that is asked for; and the same after the
-    robot was put elsewhere."""
-    told = feeder((3, 3, 2, 4), obs={**SMALL, "frames": 3})
-    assert first_pixels(told, 1) == [1, 1, 1]
-    assert first_pixels(told, 2) == [1, 1, 2]
-    assert first_pixels(told, 3, 4, 5) == [3, 4, 5]
-    told.clear()
-    assert first_pixels(told, 6) == [6, 6, 6]
+def test_history_is_the_last_frames_padded_with_the_first() -> None:
+    """Order, stride and zero padding follow the manifest, and history restarts after a reset."""
+    feeding = feeder((3, 3, 2, 4), obs={**SMALL, "frames": 3})
+    assert first_pixels(feeding, 1) == [1, 1, 1]
+    assert first_pixels(feeding, 2) == [1, 1, 2]
+    assert first_pixels(feeding, 3, 4, 5) == [3, 4, 5]
+    feeding.clear()
+    assert first_pixels(feeding, 6) == [6, 6, 6]
     newest = feeder(
         (3, 3, 2, 4),
         obs={**SMALL, "frames": 3, "every": 2, "order": "newest_first", "before": "zeros"},
@@ -113,21 +112,21 @@ PICTURES: dict[str, tuple[dict[str, Any], tuple[int, ...], tuple[int, ...], floa
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_a_picture_becomes_the_tensor_that_its_input_says(name: str) -> None:
-    """A pixel of a picture that is red at the left and dark blue at the right is where it should
-    be."""
+def test_a_picture_becomes_the_declared_tensor(name: str) -> None:
+    """A pixel of a picture that is red at the left and dark blue at the right is at its declared
+    place."""
     fields, shape, pixel, value = PICTURES[name]
-    told = feeder(shape, obs=SMALL | fields).feed(replace(SEEN, rgb=COLOURED))["obs"]
-    assert told.shape == shape and told.dtype == np.float32 and told.flags.c_contiguous
-    assert told[pixel] == pytest.approx(value, abs=0.005)
+    tensor = feeder(shape, obs=SMALL | fields).feed(replace(SEEN, rgb=COLOURED))["obs"]
+    assert tensor.shape == shape and tensor.dtype == np.float32 and tensor.flags.c_contiguous
+    assert tensor[pixel] == pytest.approx(value, abs=0.005)
 
 
 def test_pictures_stay_bytes_for_a_graph_of_bytes() -> None:
-    """With scale 1, and as they were."""
-    told = feeder(
+    """With scale 1 they are unchanged."""
+    feeding = feeder(
         (None, 8, 16, 3), np.uint8, obs={**SMALL, "size": [16, 8], "layout": "NHWC", "scale": 1}
     )
-    np.testing.assert_array_equal(told.feed(replace(SEEN, rgb=COLOURED))["obs"], COLOURED[None])
+    np.testing.assert_array_equal(feeding.feed(replace(SEEN, rgb=COLOURED))["obs"], COLOURED[None])
 
 
 AHEAD_LEFT = PointGoal(3.0, 4.0)
@@ -152,7 +151,7 @@ VECTORS: dict[str, tuple[dict[str, Any], Goal | None, list[float]]] = {
         [-math.pi / 2],
     ),
     "speeds": ({"what": "speeds", "values": ["v", "w", "-w"]}, None, [1.2, -0.3, 0.3]),
-    "left-told": (
+    "left-instruction": (
         {"what": "command"},
         Instruction("Follow the sidewalk. In 5 m, turn left."),
         [-1.0],
@@ -180,11 +179,11 @@ VECTORS: dict[str, tuple[dict[str, Any], Goal | None, list[float]]] = {
 
 
 @pytest.mark.parametrize("name", VECTORS)
-def test_numbers_are_those_that_the_input_says(name: str) -> None:
-    """Of a robot at 1.2 m/s turning right at 0.3 rad/s, told this goal."""
+def test_numbers_are_given_as_declared(name: str) -> None:
+    """A robot at 1.2 m/s that turns right at 0.3 rad/s has this goal."""
     fields, goal, wanted = VECTORS[name]
-    told = feeder((None, len(wanted)), one=fields).feed(replace(SEEN, goal=goal))["one"]
-    np.testing.assert_allclose(told, [wanted], atol=1e-6)
+    tensor = feeder((None, len(wanted)), one=fields).feed(replace(SEEN, goal=goal))["one"]
+    np.testing.assert_allclose(tensor, [wanted], atol=1e-6)
 
 
 SENSORS: dict[str, tuple[dict[str, Any], list[float]]] = {
@@ -209,60 +208,60 @@ SENSORS: dict[str, tuple[dict[str, Any], list[float]]] = {
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_sensors_are_given_as_the_input_says(name: str) -> None:
-    """A scan with a return missing and one beyond the range, two tracked people, and a reading."""
+def test_sensors_are_given_as_declared(name: str) -> None:
+    """The sensors are a scan with a missing and a too far return, two tracked people, and an
+    inertial reading."""
     fields, wanted = SENSORS[name]
-    told = feeder((None, len(wanted)), one=fields).feed(SENSED)["one"]
-    np.testing.assert_allclose(told, [wanted], atol=1e-6)
+    tensor = feeder((None, len(wanted)), one=fields).feed(SENSED)["one"]
+    np.testing.assert_allclose(tensor, [wanted], atol=1e-6)
 
 
-def test_a_mask_tells_whether_another_input_has_its_goal() -> None:
-    """A picture as goal is given to a graph that takes pictures, another goal is not."""
+def test_a_mask_marks_whether_another_input_has_its_goal() -> None:
+    """An image goal is given to a graph that takes pictures, and another goal is not."""
     goal = {"what": "goal_picture", "size": [4, 2], "layout": "NCHW", "missing": 0}
     ports = {
         "goal": TensorPort("goal", np.dtype(np.float32), (1, 3, 2, 4)),
         "mask": TensorPort("mask", np.dtype(np.int64), (1,)),
     }
-    told = Feeder(
+    feeding = Feeder(
         msgspec.convert({"goal": goal, "mask": {"what": "mask"}}, dict[str, GraphInput]), ports, 0
     )
-    assert told.feed(replace(SEEN, goal=ImageGoal(level(255))))["mask"].tolist() == [0]
-    without = told.feed(replace(SEEN, goal=AHEAD_LEFT))
+    assert feeding.feed(replace(SEEN, goal=ImageGoal(grey_picture(255))))["mask"].tolist() == [0]
+    without = feeding.feed(replace(SEEN, goal=AHEAD_LEFT))
     assert without["mask"].tolist() == [1] and not without["goal"].any()
 
 
-def test_a_route_patch_has_the_numbers_that_the_input_says() -> None:
-    """On the route and beside it, frame by frame."""
+def test_a_route_patch_has_the_declared_numbers() -> None:
+    """Cells on the route and beside it have the declared values, frame by frame."""
     patch = np.zeros((80, 80), np.uint8)
     patch[:40, 40] = 255
     fields = {"what": "route_patch", "frames": 2, "on": 2, "off": -1, "layout": "NTHW"}
-    told = feeder((1, 2, 80, 80), one=fields).feed(replace(SEEN, goal=RoutePatch(patch)))["one"]
+    tensor = feeder((1, 2, 80, 80), one=fields).feed(replace(SEEN, goal=RoutePatch(patch)))["one"]
     assert (
-        told[0, 1, 0, 40] == told[0, 0, 39, 40] == 2
-        and told[0, 1, 41, 40] == told[0, 1, 0, 0] == -1
+        tensor[0, 1, 0, 40] == tensor[0, 0, 39, 40] == 2
+        and tensor[0, 1, 41, 40] == tensor[0, 1, 0, 0] == -1
     )
 
 
-def test_past_positions_are_seen_from_where_the_robot_is_now() -> None:
-    """One that drove 2 m ahead, turned left and drove 1 m has its start 1 m behind and 2 m to the
-    left of it."""
-    told = feeder((1, 3, 2), one={"what": "past_positions", "frames": 3, "before": "zeros"})
+def test_past_positions_are_relative_to_the_robots_pose() -> None:
+    """After 2 m ahead, a left turn and 1 m, the start is 1 m behind and 2 m to the left."""
+    feeding = feeder((1, 3, 2), one={"what": "past_positions", "frames": 3, "before": "zeros"})
     for place in ((0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 1.0, math.pi / 2)):
-        seen = told.feed(replace(SEEN, odometry=Odometry(*place)))["one"]
+        seen = feeding.feed(replace(SEEN, odometry=Odometry(*place)))["one"]
     np.testing.assert_allclose(seen[0], [[-1, 2], [-1, 0], [0, 0]], atol=1e-6)
-    told.clear()
-    again = told.feed(replace(SEEN, odometry=Odometry(9.0, 9.0, 0.0)))["one"]
+    feeding.clear()
+    again = feeding.feed(replace(SEEN, odometry=Odometry(9.0, 9.0, 0.0)))["one"]
     np.testing.assert_array_equal(again, np.zeros((1, 3, 2)))
 
 
-def test_what_a_graph_remembers_comes_back_to_it_until_the_robot_is_put_elsewhere() -> None:
-    """As the output of the answer before, or as the last rows of it."""
-    whole = feeder((1, 2), one={"what": "state", "output": "memory", "begin": 0.5})
-    assert whole.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
-    whole.remember({"memory": np.array([[1.0, 2.0]])})
-    assert whole.feed(SEEN)["one"].tolist() == [[1.0, 2.0]]
-    whole.clear()
-    assert whole.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
+def test_a_graphs_memory_is_fed_back_until_a_reset() -> None:
+    """It is the output of the previous answer, or the last rows of it."""
+    feeding = feeder((1, 2), one={"what": "state", "output": "memory", "begin": 0.5})
+    assert feeding.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
+    feeding.remember({"memory": np.array([[1.0, 2.0]])})
+    assert feeding.feed(SEEN)["one"].tolist() == [[1.0, 2.0]]
+    feeding.clear()
+    assert feeding.feed(SEEN)["one"].tolist() == [[0.5, 0.5]]
     rows = feeder((1, 3, 2), one={"what": "state", "output": "memory", "append": True})
     for number in (1.0, 2.0):
         rows.remember({"memory": np.array([[number, -number]])})
@@ -270,7 +269,7 @@ def test_what_a_graph_remembers_comes_back_to_it_until_the_robot_is_put_elsewher
 
 
 def test_noise_comes_from_the_seed_of_the_episode() -> None:
-    """Anew for every answer, the same for the same seed."""
+    """It is drawn for every answer, and repeats with the seed."""
     first, same, other = (feeder((1, 8), seed=seed, one={"what": "noise"}) for seed in (3, 3, 4))
     drawn = [one.feed(SEEN)["one"] for one in (first, first, same, other)]
     assert (

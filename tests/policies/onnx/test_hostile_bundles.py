@@ -1,5 +1,4 @@
-"""Bundles that were made to do harm: refused in words, before they are read, never a traceback or a
-hang."""
+"""Malicious bundles: refused before they are read, without a traceback or a hang."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ GOAL = np.array([[1, 0]], np.float32)
 HUGE = 4 << 30
 
 
-def saved(path: Path, **arrays: np.ndarray[Any, Any]) -> None:
+def save_npz(path: Path, **arrays: np.ndarray[Any, Any]) -> None:
     np.savez(
         path,
         **{"obs": OBS, "goal": GOAL, "expected.action": np.zeros((1, 5, 2), np.float32)} | arrays,
@@ -33,12 +32,12 @@ def saved(path: Path, **arrays: np.ndarray[Any, Any]) -> None:
 
 
 def cut_off(path: Path) -> None:
-    saved(path)
+    save_npz(path)
     path.write_bytes(path.read_bytes()[:-100])
 
 
 def flipped(path: Path) -> None:
-    saved(path)
+    save_npz(path)
     data = bytearray(path.read_bytes())
     data[200] ^= 0xFF
     path.write_bytes(bytes(data))
@@ -49,16 +48,16 @@ def sparse(path: Path) -> None:
         file.truncate(HUGE)
 
 
-def bomb(path: Path) -> None:
-    """A few bytes that say that they unpack to gigabytes."""
-    with zipfile.ZipFile(path, "w") as held:
-        held.writestr("obs.npy", bytes(64))
-        held.infolist()[0].file_size = HUGE
+def zip_bomb(path: Path) -> None:
+    """A few bytes that claim to unpack to gigabytes."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("obs.npy", bytes(64))
+        archive.infolist()[0].file_size = HUGE
 
 
 def long_header(path: Path) -> None:
-    """An array of a few bytes that says that it has 10**15 numbers."""
-    with zipfile.ZipFile(path, "w") as held, held.open("obs.npy", "w") as out:
+    """An array of a few bytes that claims 10**15 numbers."""
+    with zipfile.ZipFile(path, "w") as archive, archive.open("obs.npy", "w") as out:
         np.lib.format.write_array_header_1_0(
             out, {"descr": "<f4", "fortran_order": False, "shape": (10**15,)}
         )
@@ -74,24 +73,27 @@ EXAMPLES: dict[str, tuple[Callable[[Path], None], str]] = {
         "cannot be read as .npz: File is not a zip",
     ),
     "objects": (
-        lambda path: saved(path, obs=np.array([{}], object)),
+        lambda path: save_npz(path, obs=np.array([{}], object)),
         "'obs' holds objects of Python",
     ),
     "other type": (
-        lambda path: saved(path, obs=OBS.astype(float)),
+        lambda path: save_npz(path, obs=OBS.astype(float)),
         "'obs' is float64 (1, 6, 4, 8), and the graph",
     ),
     "texts": (
-        lambda path: saved(path, **{"expected.action": np.array(["a"])}),
+        lambda path: save_npz(path, **{"expected.action": np.array(["a"])}),
         "'expected.action' is str32 (1,), and",
     ),
     "other shape": (
-        lambda path: saved(path, goal=GOAL[0]),
+        lambda path: save_npz(path, goal=GOAL[0]),
         "'goal' is float32 (2,), and the graph takes float32",
     ),
     "no arrays": (lambda path: np.savez(path), "has no array 'goal'; it has none"),
     "4 GB": (sparse, "holds 4294967296 bytes; at most 536870912 are read"),
-    "a bomb": (bomb, "unpacks to 1 arrays of 4294967296 bytes; at most 536870912 bytes are read"),
+    "a bomb": (
+        zip_bomb,
+        "unpacks to 1 arrays of 4294967296 bytes; at most 536870912 bytes are read",
+    ),
     "a long header": (
         long_header,
         "'obs' should hold (1000000000000000,) of float32, and has 64 bytes",
@@ -105,15 +107,15 @@ EXAMPLES: dict[str, tuple[Callable[[Path], None], str]] = {
 def test_an_example_that_cannot_be_used_is_refused_before_it_is_read(
     tmp_path: Path, name: str
 ) -> None:
-    """In one line with its file, what was found and what is wanted."""
+    """One line has its file, what was found and what is required."""
     place = bundle(tmp_path / "net", tiny_graph())
-    make, told = EXAMPLES[name]
+    make, expected = EXAMPLES[name]
     make(place / "example.npz")
     with pytest.raises(UsageError) as caught:
         example_differences(OnnxPolicy(place))
-    assert str(caught.value).startswith(f"{place}/example.npz: ") and told in str(caught.value), (
+    assert str(caught.value).startswith(f"{place}/example.npz: ") and expected in str(
         caught.value
-    )
+    ), caught.value
     assert "\n" not in str(caught.value)
 
 
@@ -131,7 +133,7 @@ def linked(place: Path) -> None:
     (place / "model.onnx").symlink_to(place.parent / "elsewhere")
 
 
-def located(name: str) -> bytes:
+def with_weights_in(name: str) -> bytes:
     """A graph whose weights lie in a file of this name."""
     model = onnx.load_from_string(tiny_graph())
     for tensor in model.graph.initializer:
@@ -142,7 +144,7 @@ def located(name: str) -> bytes:
 
 
 def in_a_function(place: Path) -> None:
-    """A constant of a function of the graph's own names the file."""
+    """A graph whose own function has a constant that names the file."""
     far = onnx.TensorProto(
         name="far", data_type=onnx.TensorProto.FLOAT, dims=[1], raw_data=bytes(4)
     )
@@ -160,17 +162,20 @@ def in_a_function(place: Path) -> None:
 FACTS = {"bytes": 7, "blake2b": "0" * 64}
 PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
     "NUL": (
-        lambda place: bundle(place, located("a\0b")),
+        lambda place: bundle(place, with_weights_in("a\0b")),
         "has weights in a file beside it: 'a\\x00b' is no name of",
     ),
     "weights above": (
-        lambda place: bundle(place, located("../secret")),
+        lambda place: bundle(place, with_weights_in("../secret")),
         "'../secret' is no name of a file",
     ),
     "weights above, in a function": (in_a_function, "'../secret' is no name of a file"),
-    "weights without a name": (lambda place: bundle(place, located("")), "'' is no name of a file"),
+    "weights without a name": (
+        lambda place: bundle(place, with_weights_in("")),
+        "'' is no name of a file",
+    ),
     "weights that are a folder": (
-        lambda place: (bundle(place, located("d")), (place / "d").mkdir()),
+        lambda place: (bundle(place, with_weights_in("d")), (place / "d").mkdir()),
         "is no regular",
     ),
     "a key above": (
@@ -191,18 +196,17 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("name", PLACES)
 def test_a_bundle_reads_no_file_outside_its_folder(tmp_path: Path, name: str) -> None:
-    """Neither by a key of `files`, nor by a name in the graph, nor by a link: it is named and
-    refused."""
+    """A key of `files`, a name in the graph and a link to an outside file are named and refused."""
     place = bundle(tmp_path / "net", tiny_graph(), MANIFEST)
-    make, told = PLACES[name]
+    make, expected = PLACES[name]
     make(place)
     with pytest.raises(UsageError) as caught:
         load_policy(f"onnx:{place}")
-    assert told in str(caught.value), caught.value
+    assert expected in str(caught.value), caught.value
 
 
 def test_a_graph_of_gigabytes_is_refused_before_it_is_read(tmp_path: Path) -> None:
-    """An ONNX file holds 2 GiB at most."""
+    """A graph above 2 GiB, the limit of ONNX files, is refused."""
     place = bundle(tmp_path / "net", tiny_graph())
     sparse(place / "model.onnx")
     with pytest.raises(UsageError, match="holds 4294967296 bytes; at most 2147483648 are read"):

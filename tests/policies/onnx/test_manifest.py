@@ -1,5 +1,5 @@
-"""The manifest of an ONNX bundle: read whole, or refused with every fault, its place, and what may
-stand there."""
+"""The manifest of an ONNX bundle: read completely, or refused with every fault, its place, and the
+valid values."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-def test_a_manifest_says_what_a_run_wants_to_know(tmp_path: Path) -> None:
-    """Camera, rule of waypoints, and the goals that its inputs are made of."""
+def test_a_manifest_has_the_facts_that_a_run_needs(tmp_path: Path) -> None:
+    """They are the camera, the rule of waypoints, and the goals of its inputs."""
     (tmp_path / "manifest.json").write_text(json.dumps(GNM))
     bundle = read_bundle_manifest(tmp_path)
     assert bundle.policy.camera == CameraSpec(512, 288, 60.0, crop=(0, 88, 512, 288))
@@ -129,16 +129,16 @@ def test_a_manifest_says_what_a_run_wants_to_know(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_manifest_with_a_fault_is_refused_with_its_place(tmp_path: Path, name: str) -> None:
-    """The message has file, place, what was found and what may stand there."""
-    change, told = FAULTS[name]
+    """The message has file, place, what was found and the valid values."""
+    change, expected = FAULTS[name]
     (tmp_path / "manifest.json").write_text(json.dumps(GNM | change))
     with pytest.raises(SpecError) as caught:
         read_bundle_manifest(tmp_path)
-    assert str(tmp_path / "manifest.json") in str(caught.value) and told in str(caught.value)
+    assert str(tmp_path / "manifest.json") in str(caught.value) and expected in str(caught.value)
 
 
-def test_a_manifest_with_several_faults_tells_all_of_them(tmp_path: Path) -> None:
-    """Those of different inputs, and of the output, in one message."""
+def test_all_faults_of_a_manifest_are_reported(tmp_path: Path) -> None:
+    """One message has the faults of several inputs and of the output."""
     inputs = {"obs": {**PICTURE, "size": "large"}, "goal": {"what": "goal_point", "unit_m": -1}}
     (tmp_path / "manifest.json").write_text(
         json.dumps({**GNM, "inputs": inputs, "output": {"what": "wheels"}})

@@ -1,5 +1,4 @@
-"""Runs with an ONNX bundle: the street is that of the same policy as a class, wherever it is
-asked."""
+"""Runs with an ONNX bundle equal those of the same policy as a class, wherever it is hosted."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ SEED = ("--seed", "5")
 
 
 class Twin:
-    """What the graph `BLIND` answers, written out."""
+    """The graph `BLIND`, written as a class."""
 
     manifest = Manifest(
         "tiny",
@@ -55,8 +54,8 @@ def second(name: str) -> Scenario:
 
 @pytest.mark.engine
 def test_a_bundle_drives_like_the_same_policy_as_a_class(tmp_path: Path) -> None:
-    """Same answers, same state hash; its record tells camera, goal and rule of waypoints by the
-    bundle's manifest."""
+    """Answers and state hash are equal, and the record has camera, goal and waypoint rule of the
+    manifest."""
     graph = run_episode(second("a"), load_policy(f"onnx:{bundle(tmp_path / 'net', BLIND)}")).record
     twin = run_episode(second("a"), Twin()).record
     assert graph.state_hash == twin.state_hash and graph.status == "done", graph.reason
@@ -68,10 +67,10 @@ def test_a_bundle_drives_like_the_same_policy_as_a_class(tmp_path: Path) -> None
 
 
 @pytest.mark.engine
-def test_a_bundle_drives_alike_in_its_own_process_and_in_several(
+def test_a_bundle_drives_alike_isolated_and_in_several_processes(
     tmp_path: Path, cosim: Cosim
 ) -> None:
-    """A graph that sees the street gives the same bits with --jobs 2, and with --isolated."""
+    """A graph that uses the picture gives the same bits with --jobs 2 and with --isolated."""
     bundle(tmp_path / "net", tiny_graph())
     write_suite(
         Suite(name="two", version="1", scenarios=(second("a"), second("b"))), tmp_path / "two.json"
@@ -90,9 +89,8 @@ def test_a_bundle_drives_alike_in_its_own_process_and_in_several(
 
 
 @pytest.mark.engine
-def test_the_bundle_of_the_documents_runs_as_it_is_written(tmp_path: Path, cosim: Cosim) -> None:
-    """Its manifest, and its command on a short suite, with a graph of those inputs and that
-    output."""
+def test_the_documented_bundle_runs_as_written(tmp_path: Path, cosim: Cosim) -> None:
+    """Its manifest and command work on a short suite with a graph of those inputs and that output."""
     ((_, _, _, manifest),) = blocks("json", "docs/onnx.md")
     (command,) = (
         words for _, words in shell_lines("docs/onnx.md") if words[-1] == "onnx:my_network"
@@ -116,28 +114,27 @@ def test_the_bundle_of_the_documents_runs_as_it_is_written(tmp_path: Path, cosim
     write_suite(
         Suite(name="reactive", version="1", scenarios=(second("a"),)), tmp_path / "one.json"
     )
-    said = cosim(
+    result = cosim(
         *["one.json" if word == "reactive" else word for word in command[1:]],
         "--out",
         "run",
         cwd=tmp_path,
     )
     (record,) = read_records(tmp_path / "run")
-    assert said.returncode == 0 and (record.manifest.name, record.status) == (
+    assert result.returncode == 0 and (record.manifest.name, record.status) == (
         "my-network",
         "done",
-    ), said.stderr
+    ), result.stderr
 
 
 def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(
     tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Exit code 2, one line, no folder: for goals that the graph cannot take, and for a file that
-    is no graph."""
+    """Unsupported goals and a file that is no graph give exit code 2, one line, and no folder."""
     bundle(tmp_path / "net", tiny_graph())
     write_suite(Suite(name="one", version="1", scenarios=(second("a"),)), tmp_path / "one.json")
     bundle(tmp_path / "text", b"once upon a time")
-    for words, told in (
+    for words, expected in (
         (
             ("--policy", "onnx:net", "--goal", "image"),
             "policy 'tiny' wants goals route_point or final_point or random",
@@ -148,6 +145,6 @@ def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(
             "policy 'onnx:nowhere': nowhere: no bundle: has no manifest.json",
         ),
     ):
-        said = cosim("run", "one.json", "--out", "run", *words, cwd=tmp_path)
-        assert said.returncode == 2 and f"error: {told}" in said.stderr, said.stderr
+        result = cosim("run", "one.json", "--out", "run", *words, cwd=tmp_path)
+        assert result.returncode == 2 and f"error: {expected}" in result.stderr, result.stderr
         assert not (tmp_path / "run").exists()

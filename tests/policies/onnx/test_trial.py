@@ -1,5 +1,4 @@
-"""Graphs on trial: what never answers, asks for too much memory or ends its process is refused, and
-leaves nothing."""
+"""Trial queries of graphs: hanging, memory-hungry and crashing ones are refused and leave nothing."""
 
 from __future__ import annotations
 
@@ -25,8 +24,8 @@ from tests.support.graphs import bundle, graph_bytes, port, tiny_graph
 OBS, ACTION = port("obs", 1, 5, 2), port("action", 1, 5, 2)
 
 
-def constant(value: float) -> dict[str, Any]:
-    """The fields of a manifest whose graph gets so many times this value."""
+def repeated_input(value: float) -> dict[str, Any]:
+    """The fields of a manifest whose graph gets this value so many times."""
     return {
         "inputs": {"obs": {"what": "constant", "value": value}},
         "goal": "none",
@@ -65,11 +64,11 @@ def hungry() -> bytes:
 
 
 def test_a_graph_that_never_answers_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """When the start timeout is over, before anything is run: exit code 2, and how to give more
-    time."""
-    place = bundle(tmp_path / "net", endless(), **constant(1.0))
+    """After the start timeout, before the run, the exit code is 2 and the message says how to
+    extend it."""
+    place = bundle(tmp_path / "net", endless(), **repeated_input(1.0))
     before = {*psutil.Process().children()}
-    said = cosim(
+    result = cosim(
         "run",
         "unit",
         "--policy",
@@ -80,11 +79,13 @@ def test_a_graph_that_never_answers_is_refused(tmp_path: Path, cosim: Cosim) -> 
         "0.5",
         cwd=tmp_path,
     )
-    told = (
+    expected = (
         f"{place}/model.onnx: gives no answer within 0.5 s, to be loaded and to answer: it may "
         f"hold a loop without end"
     )
-    assert said.returncode == 2 and told in said.stderr and "--start-timeout" in said.stderr, said
+    assert (
+        result.returncode == 2 and expected in result.stderr and "--start-timeout" in result.stderr
+    ), result
     assert {path.name for path in tmp_path.iterdir()} == {"net"} and {
         *psutil.Process().children()
     } <= before
@@ -94,8 +95,8 @@ def test_a_graph_that_never_answers_is_refused(tmp_path: Path, cosim: Cosim) -> 
 def test_a_graph_that_never_answers_is_ended_with_its_command(
     tmp_path: Path, how: signal.Signals
 ) -> None:
-    """By Ctrl-C, by kill -9: at once, and its child with it."""
-    place = bundle(tmp_path / "net", endless(), **constant(1.0))
+    """Ctrl-C and kill -9 of the command end its child at once, too."""
+    place = bundle(tmp_path / "net", endless(), **repeated_input(1.0))
     words = [
         sys.executable,
         "-m",
@@ -127,8 +128,8 @@ def test_a_graph_that_never_answers_is_ended_with_its_command(
 
 
 def test_a_graph_that_asks_for_too_much_memory_is_refused(tmp_path: Path) -> None:
-    """With the words of the runtime, and how much a graph may use."""
-    place = bundle(tmp_path / "net", hungry(), **constant(1.0))
+    """The message has the runtime's error and the limit of a graph."""
+    place = bundle(tmp_path / "net", hungry(), **repeated_input(1.0))
     with pytest.raises(
         UsageError,
         match=r"cannot be run by onnxruntime: .*allocate.* \(a graph may use 4 GiB and 8 times",
@@ -139,7 +140,7 @@ def test_a_graph_that_asks_for_too_much_memory_is_refused(tmp_path: Path) -> Non
 def test_a_graph_that_ends_its_process_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a fault of compiled code would: this process goes on, and the signal is named."""
+    """After a fault as of compiled code this process continues, and the signal is named."""
     place = bundle(tmp_path / "net", tiny_graph())
     monkeypatch.setattr(Graph, "run", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
     with pytest.raises(
@@ -149,8 +150,8 @@ def test_a_graph_that_ends_its_process_is_refused(
 
 
 def test_a_trial_answers_with_the_bits_of_this_process(tmp_path: Path) -> None:
-    """The hash of a policy is the same with a trial and without, as in a worker, which its run
-    limits."""
+    """The hash of a policy is the same with and without a trial, and in a worker, which is limited
+    by its run."""
     place = bundle(
         tmp_path / "net",
         tiny_graph(bright=np.random.default_rng(0).random((192, 1)).astype(np.float32)),

@@ -1,5 +1,4 @@
-"""Exports of visnavkit are read as they are: graph, metadata and example inputs beside one
-another."""
+"""Exports of visnavkit are read unchanged: graph, metadata and example inputs side by side."""
 
 from __future__ import annotations
 
@@ -34,8 +33,7 @@ FRAME = {"vision": (1, 3, 24, 32), "feature_buffer": (1, 3, 2), "goal": (1, 3)}
 def exported(
     folder: Path, name: str, graph: bytes, shapes: Mapping[str, tuple[int, ...]], **metadata: Any
 ) -> Path:
-    """The three files, as the exporter writes them; the example of an input is 0, of action bounds
-    the bounds."""
+    """The three files of an export; example inputs are 0, those of action bounds are the bounds."""
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.onnx").write_bytes(graph)
     example = {one: np.zeros(shape, np.float32) for one, shape in shapes.items()}
@@ -43,7 +41,7 @@ def exported(
         folder / f"{name}.inputs.npz",
         **(example | ({"action_bounds": BOUNDS} if "action_bounds" in shapes else {})),
     )
-    told = {
+    defaults = {
         "exp_name": "flowpilot dst",
         "model": "FlowPilotDST",
         "precision": "fp32",
@@ -54,7 +52,7 @@ def exported(
         "input_shapes": dict(shapes),
         "input_dtypes": dict.fromkeys(shapes, "float32"),
     }
-    (folder / f"{name}.metadata.json").write_text(json.dumps(told | metadata))
+    (folder / f"{name}.metadata.json").write_text(json.dumps(defaults | metadata))
     return folder
 
 
@@ -147,8 +145,8 @@ def frame_export(folder: Path) -> Path:
 def test_the_graph_of_a_window_is_driven_by_the_first_speeds_of_its_best_plan(
     tmp_path: Path,
 ) -> None:
-    """Frames, patches, goals and speeds for every slot of 50 ms; bounds as they were exported; the
-    goal ahead, because the run tells the route."""
+    """Every slot of 50 ms has frames, patches, goals and speeds; the bounds are as exported, and
+    the goal is the run's."""
     driver = load_policy(f"onnx:{window_export(tmp_path)}")
     manifest = driver.manifest
     assert (manifest.name, manifest.rate_hz, manifest.goal) == (
@@ -165,21 +163,22 @@ def test_the_graph_of_a_window_is_driven_by_the_first_speeds_of_its_best_plan(
 
 
 def test_the_graph_of_a_frame_gets_its_own_features_back(tmp_path: Path) -> None:
-    """The last three answers' rows, zeros before; the plan with the highest score, at the time of
-    the point."""
+    """It gets the rows of the last three answers, zeros before, and the best-scored plan is
+    followed at its time."""
     driver = load_policy(f"onnx:{frame_export(tmp_path)}")
     rule = driver.manifest.waypoints
     assert (rule.index, rule.dt_s, driver.manifest.goal) == (2, 0.5, "route_point")
     driver.reset("a", 0)
     seen = example_observation(driver.manifest)
-    told = [driver.policy.act(seen) for _ in range(5)]
-    assert [float(np.asarray(one)[0, 0]) for one in told] == [0, 1, 2, 3, 3]
+    answers = [driver.policy.act(seen) for _ in range(5)]
+    assert [float(np.asarray(one)[0, 0]) for one in answers] == [0, 1, 2, 3, 3]
     driver.reset("b", 0)
     assert float(np.asarray(driver.policy.act(seen))[0, 0]) == 0
 
 
 def test_the_path_of_a_graph_names_one_of_several_exports(tmp_path: Path) -> None:
-    """A folder of several is refused with their names; an engine's metadata are no graph's."""
+    """A folder of several is refused with their names, and metadata of an engine are not those of a
+    graph."""
     frame_export(window_export(tmp_path))
     (tmp_path / "dst.fp16.metadata.json").write_text("{}")
     with pytest.raises(
@@ -215,8 +214,8 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", BROKEN)
 def test_an_export_that_cannot_be_driven_is_refused(tmp_path: Path, name: str) -> None:
-    """Its file is named, with what was found."""
-    fields, told = BROKEN[name]
+    """The message names its file and what was found."""
+    fields, expected = BROKEN[name]
     with pytest.raises(UsageError) as caught:
         load_policy(f"onnx:{window_export(tmp_path, **fields)}")
-    assert told in str(caught.value)
+    assert expected in str(caught.value)

@@ -16,9 +16,8 @@ pytestmark = pytest.mark.engine
 def test_a_run_across_hosts_loses_nothing_when_a_link_goes_down(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """With --whole, as it waits for links: every episode has one result though a worker's link is
-    down for 6 s in the middle of one; meanwhile a viewer on a host of its own sees that there is a
-    run, and can finish none of its jobs."""
+    """Every episode has one result though a worker's link is down for 6 s; a viewer on another host
+    cannot finish any job."""
     if not request.config.getoption("--whole"):
         pytest.skip("with --whole, or as a command: python -m tests.support.across")
     seen: list[str] = []

@@ -23,7 +23,7 @@ TURNED = np.float32([[1.0, 0.0, 0.6, 0.8]])
 
 
 def log_of(*answers: tuple[int, int, Command]) -> Log:
-    """Ten ticks of a log with answers: their ticks, delays, and commands."""
+    """Ten ticks of a log with answers, given by their ticks, delays, and commands."""
     commands = CommandDelay()
     for answer in answers:
         commands.add(*answer)
@@ -35,13 +35,13 @@ def log_of(*answers: tuple[int, int, Command]) -> Log:
 
 
 def step_at(tick: int, pose: Pose) -> Step:
-    """A step of which the robot's place at its beginning is told, and nothing else."""
+    """A step with only the robot's pose at its beginning."""
     return Step(tick, RobotState(pose), *[None] * 8)  # type: ignore[arg-type]
 
 
-def test_waypoints_of_every_kind_lie_in_the_file_as_they_were_answered(tmp_path: Path) -> None:
-    """Two of them, a command, one with a heading: ragged, the missing headings NaN; a file without
-    any has no word of them."""
+def test_waypoints_of_every_kind_are_stored_as_answered(tmp_path: Path) -> None:
+    """Two, a command, and one with a heading are stored ragged with NaN headings; files without any
+    omit the arrays."""
     log = log_of(
         (0, 0, WaypointCommand(1.0, 0.0, AHEAD, 1)),
         (4, 0, Command(1.0, 0.0)),
@@ -68,30 +68,28 @@ def test_waypoints_of_every_kind_lie_in_the_file_as_they_were_answered(tmp_path:
 
 
 @pytest.mark.parametrize("name", ["plan_sizes", "plan_points", "plan_index"])
-def test_a_trajectory_with_a_part_of_its_waypoints_is_none(tmp_path: Path, name: str) -> None:
-    """An array of them that is gone is refused, with the file's name."""
-    held = dataclasses.asdict(log_of((0, 0, WaypointCommand(1.0, 0.0, AHEAD, 1))))
-    del held[name]
-    np.savez(tmp_path / "t.npz", **held)
+def test_a_trajectory_with_incomplete_waypoints_is_refused(tmp_path: Path, name: str) -> None:
+    """A missing array of waypoints is refused with the file's name."""
+    arrays = dataclasses.asdict(log_of((0, 0, WaypointCommand(1.0, 0.0, AHEAD, 1))))
+    del arrays[name]
+    np.savez(tmp_path / "t.npz", **arrays)
     with pytest.raises(RunError, match=r"t\.npz: not a trajectory"):
         Log.load(tmp_path / "t.npz")
 
 
-def test_waypoints_are_followed_from_when_they_take_effect_until_others_do_or_the_robot_is_put_elsewhere() -> (
-    None
-):
-    """By hand: answered at tick 0 with a delay of 2, at (1, 2) heading north; at 4 a command; at 6
-    waypoints, which are on their way when the robot is put elsewhere."""
+def test_waypoints_are_followed_from_their_effect_to_the_next_or_a_reset() -> None:
+    """By hand, with a delay of 2: waypoints of tick 0, a command at 4, and waypoints of 6 that a
+    reset discards."""
     planned = WaypointCommand(1.0, 0.0, AHEAD, 1)
     following = WaypointReplay(
         log_of((0, 2, planned), (4, 2, Command(1.0, 0.0)), (5, 2, planned), (6, 2, planned))
     )
     assert following.follows == 2
     poses = [Pose(1.0, 2.0 + tick, math.pi / 2.0) for tick in range(9)]
-    came = [
+    followed = [
         following.update(step_at(tick, pose), reset=tick == 7) for tick, pose in enumerate(poses)
     ]
-    assert [one is None for one in came] == [
+    assert [one is None for one in followed] == [
         True,
         True,
         False,
@@ -102,6 +100,8 @@ def test_waypoints_are_followed_from_when_they_take_effect_until_others_do_or_th
         False,
         True,
     ]
-    assert all(one is came[2] for one in came[2:6])
-    for tick, asked in ((2, 0), (7, 5)):
-        assert np.allclose(came[tick], [(1.0, 2.0 + asked), (1.0, 3.0 + asked), (0.5, 4.0 + asked)])
+    assert all(one is followed[2] for one in followed[2:6])
+    for tick, answered in ((2, 0), (7, 5)):
+        assert np.allclose(
+            followed[tick], [(1.0, 2.0 + answered), (1.0, 3.0 + answered), (0.5, 4.0 + answered)]
+        )

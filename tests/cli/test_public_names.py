@@ -1,4 +1,4 @@
-"""`import cosim`: what it gives, what it costs, and what its documentation says."""
+"""The public interface of `import cosim`: names, import cost, and documentation."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ PRODUCT = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
 def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
-    """A new process that imports cosim has loaded no other package, and one file of ours: so it
-    takes no time."""
-    told = subprocess.run(
+    """A new process that imports cosim has loaded one file of the project and no other package."""
+    result = subprocess.run(
         [
             sys.executable,
             "-c",
@@ -33,8 +32,8 @@ def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
         check=True,
         cwd=ROOT,
     ).stdout.split()
-    strangers = {name.split(".")[0] for name in told} - set(sys.stdlib_module_names) - {"cosim"}
-    assert not strangers and {n for n in told if n.startswith("cosim")} == {
+    strangers = {name.split(".")[0] for name in result} - set(sys.stdlib_module_names) - {"cosim"}
+    assert not strangers and {n for n in result if n.startswith("cosim")} == {
         "cosim",
         "cosim.rounding",
     }
@@ -44,27 +43,27 @@ def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
     "name",
     [pytest.param(name, marks=[pytest.mark.engine] * (name in DRIVES)) for name in cosim.__all__],
 )
-def test_the_example_of_every_public_name_is_true(name: str) -> None:
-    """Every name of `__all__` says what it is and shows an example, which gives what it says."""
+def test_the_example_of_every_public_name_is_correct(name: str) -> None:
+    """Every name of `__all__` is documented with an example whose output is correct."""
     value = getattr(cosim, name)
     (shown,) = doctest.DocTestFinder(recurse=False).find(
         value, name, globs=vars(sys.modules[value.__module__]).copy()
     )
     assert shown.examples
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
-    told = io.StringIO()
-    runner.run(shown, out=told.write)
-    assert not runner.failures, told.getvalue()
+    output = io.StringIO()
+    runner.run(shown, out=output.write)
+    assert not runner.failures, output.getvalue()
 
 
-def test_another_name_is_refused_with_the_valid_ones() -> None:
-    """A misspelt name is an AttributeError that lists what there is."""
+def test_an_unknown_name_is_refused_with_the_valid_ones() -> None:
+    """A misspelt name is an AttributeError that lists the valid ones."""
     with pytest.raises(AttributeError, match=r"no attribute 'Epsiode'.*Episode"):
         cosim.Epsiode  # noqa: B018  the access is the test
 
 
 def test_the_crowd_is_created_in_one_file() -> None:
-    """One module connects SUMO's crowd to episodes."""
+    """Exactly one module connects SUMO's crowd to episodes."""
     files = [path for top in PRODUCT for path in (ROOT / top).rglob("*.py")]
     calls = [
         str(p.relative_to(ROOT))

@@ -1,4 +1,4 @@
-"""Where a way on the ground is in a picture."""
+"""Projection of a way on the ground into a picture."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ LEVEL = Shot(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 1.0]), (200, 100), 9
 the lower edge."""
 
 
-def test_points_of_the_ground_are_where_hand_and_eye_put_them() -> None:
-    """2 m ahead 25 pixels below the middle, 1 m to the left of it as much to the left; at 1 m the
-    lower edge; nearer, behind and aside out of the picture."""
+def test_ground_points_are_projected_as_worked_out_by_hand() -> None:
+    """2 m ahead is 25 pixels below the middle, 1 m aside 25 pixels aside, 1 m ahead the lower edge;
+    others are outside."""
     way = np.array(
         [
             [-1.0, 0.0, 0.0],
@@ -41,7 +41,7 @@ def test_points_of_the_ground_are_where_hand_and_eye_put_them() -> None:
 
 
 def test_a_camera_that_looks_down_has_the_ground_under_its_axis_in_the_middle() -> None:
-    """45 degrees down from 2 m: 2 m ahead is the middle; 1 m aside of it is 50 / sqrt(8) pixels
+    """45 degrees down from 2 m, 2 m ahead is the middle, and 1 m aside of it 50 / sqrt(8) pixels
     aside."""
     shot = Shot(np.array([0.0, 0.0, 2.0]), np.array([0.0, 2.0, 0.0]), (200, 100), 90.0)
     middle, aside = way_in_picture(
@@ -53,8 +53,8 @@ def test_a_camera_that_looks_down_has_the_ground_under_its_axis_in_the_middle() 
 
 
 def test_a_lens_bends_the_way() -> None:
-    """Brown's first term: at r^2 = 1/2 and k1 = 0.1 all is farther out by a twentieth; what folds
-    is left out."""
+    """By Brown's first term, at r^2 = 1/2 and k1 = 0.1, points move out by a twentieth; folded ones
+    are left out."""
     way = np.array([[2.0, 0.0, 0.0], [2.0, 1.0, 0.0]])
     assert np.allclose(
         way_in_picture(LEVEL, Lens(k1=0.1), way).points[1], (100.0 - 26.25, 50.0 + 26.25)
@@ -67,8 +67,7 @@ def test_a_lens_bends_the_way() -> None:
 
 @pytest.mark.parametrize("w_radps", [0.0, 0.5], ids=["straight", "turning"])
 def test_a_command_leads_along_its_arc(w_radps: float) -> None:
-    """1 m/s for 1.5 s from a pose that heads north: as long a way, on the circle of its radius to
-    the left."""
+    """1 m/s for 1.5 s from a pose heading north is 1.5 m on the circle of its radius to the left."""
     way = led_to(Command(1.0, w_radps), Pose(3.0, 4.0, math.pi / 2.0))
     assert np.allclose(way[0], (3.0, 4.0)) and np.hypot(
         *np.diff(way, axis=0).T

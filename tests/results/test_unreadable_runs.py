@@ -1,4 +1,4 @@
-"""Run folders that cannot be read: of another version, of other things, or not there yet; each in
+"""Unreadable run folders: of another version, of other content, or not there yet; each refused in
 one line."""
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ READS: tuple[tuple[str, ...], ...] = (
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs, `run` and `other`, of which the first is of another schema."""
+    """Two runs, `run` and `other`, of which the first has another schema."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("run", "other"):
         run_of(folder / name, ["goal"])
@@ -59,89 +59,91 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_of_another_schema_is_refused_by_every_command(
     runs: Path, cosim: Cosim, words: tuple[str, ...]
 ) -> None:
-    """File, schema, what this version reads, and the remedy; exit code 2; the folder stays as it
-    was."""
+    """File, schema, readable schema and remedy are named, the exit code is 2, and the folder is
+    unchanged."""
     before = sorted(path.name for path in (runs / "run").iterdir())
-    said = cosim(*words, cwd=runs)
-    told = (
+    result = cosim(*words, cwd=runs)
+    expected = (
         "run.json: run schema 99, and this version reads 1: use the version of cosim that made "
         "the run"
     )
-    assert said.returncode == 2 and told in said.stderr.splitlines()[-1], said
+    assert result.returncode == 2 and expected in result.stderr.splitlines()[-1], result
     assert (
         before == sorted(path.name for path in (runs / "run").iterdir())
         and not (runs / "both").exists()
     )
 
 
-def test_what_never_began_cannot_be_resumed(tmp_path: Path, cosim: Cosim) -> None:
-    """Stopped before its folder was there, or before it was written: it is said how to begin it."""
+def test_a_run_that_never_began_cannot_be_resumed(tmp_path: Path, cosim: Cosim) -> None:
+    """A run that was stopped before its folder existed or was written is refused with how to begin
+    it."""
     words = ("run", "reactive", "--policy", "straight", "--episodes", "1", "--out")
-    said = cosim(*words, "mine", "--resume", "--seed", "1", cwd=tmp_path)
-    told = "mine: no run has begun there, so there is nothing to resume: give the command of the run without"
-    assert said.returncode == 2 and told in said.stderr.splitlines()[-1], said
+    result = cosim(*words, "mine", "--resume", "--seed", "1", cwd=tmp_path)
+    expected = "mine: no run has begun there, so there is nothing to resume: give the command of the run without"
+    assert result.returncode == 2 and expected in result.stderr.splitlines()[-1], result
     (tmp_path / "half" / "episodes").mkdir(parents=True)
     (tmp_path / "half" / "lock").touch()
-    said = cosim(*words, "half", "--resume", cwd=tmp_path)
+    result = cosim(*words, "half", "--resume", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "half: no run has begun there" in said.stderr.splitlines()[-1]
-    ), said
-    said = cosim("show", "half", cwd=tmp_path)
+        result.returncode == 2 and "half: no run has begun there" in result.stderr.splitlines()[-1]
+    ), result
+    result = cosim("show", "half", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "half: no run has begun there" in said.stderr.splitlines()[-1]
-    ), said
+        result.returncode == 2 and "half: no run has begun there" in result.stderr.splitlines()[-1]
+    ), result
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["a-pipe", "a-folder"])
 def test_a_run_json_that_is_no_file_is_refused(tmp_path: Path, cosim: Cosim, make: object) -> None:
-    """It is not waited for."""
+    """It is refused without waiting for it."""
     (tmp_path / "run").mkdir()
     make(tmp_path / "run" / "run.json")  # type: ignore[operator]
-    said = cosim("show", "run", cwd=tmp_path)
-    assert said.returncode == 2 and "run.json: cannot be read: is no regular file" in said.stderr, (
-        said
-    )
+    result = cosim("show", "run", cwd=tmp_path)
+    assert (
+        result.returncode == 2 and "run.json: cannot be read: is no regular file" in result.stderr
+    ), result
 
 
-def test_a_run_stopped_before_it_began_is_no_run_to_resume(
+def test_ctrl_c_before_a_run_began_reports_that_nothing_is_saved(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C while its policy is loaded: that nothing is kept is said."""
+    """Ctrl-C while the policy is loaded leaves no run to resume."""
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("scenarios.runs.run.planned_run", interrupted)
-    said = cosim("run", "reactive", "--policy", "straight", "--out", "mine", cwd=tmp_path)
+    result = cosim("run", "reactive", "--policy", "straight", "--out", "mine", cwd=tmp_path)
     assert (
-        said.returncode == 130 and "Stopped before the run began: mine holds nothing" in said.stderr
-    ), said
+        result.returncode == 130
+        and "Stopped before the run began: mine holds nothing" in result.stderr
+    ), result
 
 
-def test_a_run_whose_events_never_came_has_no_sheet(tmp_path: Path, cosim: Cosim) -> None:
-    """Also where its scenarios have none: a line in place of a table."""
+def test_a_run_whose_events_never_triggered_has_no_sheet(tmp_path: Path, cosim: Cosim) -> None:
+    """A line replaces the table, also where the scenarios have no events."""
     run_of(tmp_path / "run", ["goal"])
-    said = cosim("show", "run", "--events", cwd=tmp_path)
-    assert (said.returncode, said.stdout) == (
+    result = cosim("show", "run", "--events", cwd=tmp_path)
+    assert (result.returncode, result.stdout) == (
         0,
         "No event of this run's episodes was triggered.\n",
-    ), said
+    ), result
 
 
-def test_a_table_that_is_none_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """A results.csv with a cell without end, or with bytes of another kind."""
+def test_an_unreadable_results_table_is_refused(tmp_path: Path, cosim: Cosim) -> None:
+    """A results.csv with an endless cell, or with bytes of another encoding, is refused."""
     run = run_of(tmp_path / "run", ["goal"])
     for content in (b"scenario\n" + b"9" * 200_000, b'scenario\n"a\0b\n', b"\xff\xfe"):
         (run / "results.csv").write_bytes(content)
-        said = cosim("score", "run", cwd=tmp_path)
+        result = cosim("score", "run", cwd=tmp_path)
         assert (
-            said.returncode == 2
-            and "results.csv: not the table of this run: remove it" in said.stderr
-        ), said
+            result.returncode == 2
+            and "results.csv: not the table of this run: remove it" in result.stderr
+        ), result
 
 
-def test_attempts_that_cannot_be_read_count_for_nothing(tmp_path: Path) -> None:
-    """Bytes that are no text, brackets without end: the other lines count."""
+def test_unreadable_attempts_are_ignored(tmp_path: Path) -> None:
+    """Lines that are no text or have endless brackets are ignored, and the others count."""
     run = run_of(tmp_path / "run", ["goal"])
     (run / "attempts.jsonl").write_bytes(
         b'\x9f\n["s-000", false]\n' + b"[" * 100_000 + b'\n["s-000"'

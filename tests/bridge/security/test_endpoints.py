@@ -1,5 +1,5 @@
-"""Every command that listens or connects: to its own machine alone, and what else it needs is said
-before it begins."""
+"""Commands that listen or connect: only this machine by default, anything else is checked before
+work begins."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cosim.spec.connection import Connection
 from tests.conftest import Cosim
 from tests.support.plain import free_port
 
-DOORS = {
+ENDPOINT_COMMANDS = {
     "run --live": ("run", "no-such-suite", "--live"),
     "run --director": ("run", "no-such-suite", "--director"),
     "coordinator": ("coordinator", "no-such-suite", "--listen"),
@@ -33,15 +33,17 @@ DOORS = {
 }
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path: Path) -> None:
-    """Beyond this machine: without TLS, with TLS and no files, with files and no TLS, with files
-    that are not there."""
-    words = DOORS[door]
+@pytest.mark.parametrize("command", ENDPOINT_COMMANDS)
+def test_no_endpoint_is_open_to_other_machines_by_default(
+    command: str, cosim: Cosim, tmp_path: Path
+) -> None:
+    """Beyond this machine an endpoint is refused without TLS, with TLS but no files, with files but
+    no TLS, and with missing files."""
+    words = ENDPOINT_COMMANDS[command]
     beyond = "tcp/10.0.0.7:7447"
     guarded = "tls/10.0.0.7:7447"
     files = str(tmp_path / "none")
-    for more, said in {
+    for more, expected in {
         (beyond,): f"Use {guarded} with --tls FOLDER (`cosim certs` makes it), or say --insecure",
         (
             guarded,
@@ -59,17 +61,18 @@ def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path:
         (guarded, "--tls", files, "--insecure"): "--tls guards and --insecure does not",
     }.items():
         refused = cosim(*words, *more)
-        assert refused.returncode == 2 and said in refused.stderr, refused.stderr
+        assert refused.returncode == 2 and expected in refused.stderr, refused.stderr
 
 
 @pytest.mark.engine
-def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
-    """On standard error, of who listens and of who connects."""
+def test_insecure_explains_itself_in_one_line(cosim: Cosim) -> None:
+    """Both the listening and the connecting command print the meaning of --insecure on standard
+    error."""
     port = free_port()
-    said = list[str]()
+    lines = list[str]()
     open_to_all = Connection(role="coordinator", listen=f"tcp/0.0.0.0:{port}", insecure=True)
-    with open_session(open_to_all, said.append):
-        (line,) = said
+    with open_session(open_to_all, lines.append):
+        (line,) = lines
         assert line.startswith(
             f"--insecure: anyone who can reach tcp/0.0.0.0:{port} may watch, inject pedestrians, take"
         )
@@ -80,8 +83,8 @@ def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
     assert tried.returncode == 3 and "none of its episodes is on the air" in tried.stderr
 
 
-def test_guards_without_a_door_are_refused(cosim: Cosim, tmp_path: Path) -> None:
-    """--tls and --insecure of a run that nobody can reach."""
+def test_security_options_without_an_endpoint_are_refused(cosim: Cosim, tmp_path: Path) -> None:
+    """--tls and --insecure are refused for a run that has no endpoint."""
     for more in (("--tls", str(tmp_path)), ("--insecure",)):
         refused = cosim("run", "no-such-suite", *more)
         assert (

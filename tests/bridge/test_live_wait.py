@@ -1,5 +1,4 @@
-"""`cosim listen` and `cosim inject` beside a run whose episode is not on the air yet: real Zenoh,
-no simulator."""
+"""`cosim listen` and `cosim inject` before an episode is live: real Zenoh, no simulator."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ PEDESTRIAN = json.dumps({"id": "anna", "path": [[1, 2], [3, 4]]})
 
 
 def started(*words: str) -> subprocess.Popen[str]:
-    """A command of `cosim` that has said on standard error that it waits."""
+    """A command of `cosim` that has printed on standard error that it waits."""
     command = subprocess.Popen(
         [sys.executable, "-m", "cosim", *words],
         stdout=subprocess.PIPE,
@@ -35,7 +34,7 @@ def started(*words: str) -> subprocess.Popen[str]:
     return command
 
 
-def put_on_the_air(hub: Session, name: str) -> None:
+def declare_live_episode(hub: Session, name: str) -> None:
     """Answer as an episode of a run does."""
     serve_injections(
         hub,
@@ -46,34 +45,35 @@ def put_on_the_air(hub: Session, name: str) -> None:
     hub.serve(f"cosim/r/env/{name}/status", lambda _: b"{}", found=True)
 
 
-def test_listen_waits_until_an_episode_is_on_the_air(tmp_path: Path) -> None:
+def test_listen_waits_until_an_episode_is_live(tmp_path: Path) -> None:
     """`cosim listen` waits for an episode, says so, and then prints its messages."""
     at = f"unixsock-stream/{tmp_path}/air.sock"
     words = ("listen", "events", "--connect", at, "--seconds", "0", "--wait", str(PATIENCE_S))
     with started(*words) as listening, listening_at(at) as hub:
-        put_on_the_air(hub, "t-0")
+        declare_live_episode(hub, "t-0")
         out, err = listening.communicate()
     assert listening.returncode == 0 and out == '{"tick":7}\n'
     assert "r/t-0 is on the air" in err
 
 
-def test_inject_waits_for_the_episode_that_is_named(tmp_path: Path) -> None:
-    """Another episode of the same run does not do."""
+def test_inject_waits_for_the_named_episode(tmp_path: Path) -> None:
+    """Another live episode of the same run does not end the wait."""
     at = f"unixsock-stream/{tmp_path}/air.sock"
     with listening_at(at) as hub:
-        put_on_the_air(hub, "t-0")
+        declare_live_episode(hub, "t-0")
         words = ("inject", PEDESTRIAN, "--connect", at, "--env", "r/t-1", "--wait", str(PATIENCE_S))
         with started(*words) as injecting:
-            put_on_the_air(hub, "t-1")
+            declare_live_episode(hub, "t-1")
             out, err = injecting.communicate()
     assert injecting.returncode == 0 and "'anna' enters at tick 3" in out
     assert "r/t-1 is on the air" in err
 
 
-def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(
+def test_a_refusal_without_or_after_a_wait_has_a_remedy(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No run, a run without an episode, another episode: each is told apart, with the remedy."""
+    """A missing run, a run without an episode and another episode are distinguished, each with its
+    remedy."""
     monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     at = f"unixsock-stream/{tmp_path}/air.sock"
     refused = cosim("listen", "--connect", at)
@@ -96,7 +96,7 @@ def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(
             and "none of its episodes" in early.stderr
             and "--wait 60 waits" in early.stderr
         )
-        put_on_the_air(hub, "t-0")
+        declare_live_episode(hub, "t-0")
         (tmp_path / "long.json").write_text(json.dumps({"id": "anna", "path": [[1, 2]] * 20_000}))
         too_long = cosim("inject", f"@{tmp_path}/long.json", "--connect", at)
         assert too_long.returncode == 2 and "an injection has at most 65536" in too_long.stderr

@@ -1,4 +1,4 @@
-"""The ways to step into a live run as docs/viewing.md, `--help` and the run itself print them, on
+"""The ways to step into a live run, as docs/viewing.md, `--help` and the run itself print them, on
 one scenario."""
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from tests.support.plain import free_port
 
 SECTION = re.search(r"\n## Live injection\n(.*?)\n## ", text_of("docs/viewing.md"), re.DOTALL)
 WRITTEN = "tcp/127.0.0.1:7447"
-"""The address of the examples, in whose place the test has a free one."""
+"""The address in the examples, which the test replaces with a free one."""
 
 
 def examples_in(text: str, name: str, at: str) -> list[list[str]]:
-    """The words of the commands `cosim NAME` of a text, for the address `at`; those over a network
-    are left out."""
+    """Return the commands `cosim NAME` of a text with the address `at`, without those over a
+    network."""
     lines = re.findall(rf"^ *(?:\.venv/bin/)?cosim ({name} .*)$", text, re.MULTILINE)
     found = [
         shlex.split(line.replace(WRITTEN, at), comments=True)
@@ -36,11 +36,9 @@ def examples_in(text: str, name: str, at: str) -> list[list[str]]:
 
 
 @pytest.mark.engine
-def test_the_examples_of_documents_and_help_step_into_the_first_scenario(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """Run, inject, listen and the Python script of the page, the examples of `cosim inject --help`,
-    and the command that the run prints: each is accepted as written, but for the address."""
+def test_the_documented_examples_work_on_the_first_scenario(tmp_path: Path, cosim: Cosim) -> None:
+    """Commands of the page, the help and the run, and the Python script of the page, are accepted
+    with only the address changed."""
     assert SECTION is not None
     at = f"tcp/127.0.0.1:{free_port()}"
     (script,) = re.findall(r"```python\n(.*?)```", SECTION[1], re.DOTALL)
@@ -48,20 +46,20 @@ def test_the_examples_of_documents_and_help_step_into_the_first_scenario(
     (tmp_path / "pedestrian.json").write_text('{"id": "emil", "path": [{"ahead": 8}]}')
     (run,) = (words for words in examples_in(SECTION[1], "run", at) if "--live" in words)
     accepted = []
-    said = ""
+    stderr = ""
     with subprocess.Popen(
         [sys.executable, "-m", "cosim", *run], cwd=tmp_path, stderr=subprocess.PIPE, text=True
     ) as running:
         try:
             assert running.stderr is not None
-            while "cosim inject" not in said:
-                said += (line := running.stderr.readline())
-                assert line, said
+            while "cosim inject" not in stderr:
+                stderr += (line := running.stderr.readline())
+                assert line, stderr
             waits = cosim(
                 "listen", "events", "--connect", at, "--wait", str(PATIENCE_S), "--seconds", "0"
             )
             assert waits.returncode == 0, waits.stderr
-            texts = SECTION[1], cosim("inject", "--help").stdout, said
+            texts = SECTION[1], cosim("inject", "--help").stdout, stderr
             examples = [words for text in texts for words in examples_in(text, "inject", at)]
             assert len(examples) >= 5
             for example in examples:
@@ -87,15 +85,15 @@ def test_the_examples_of_documents_and_help_step_into_the_first_scenario(
                     listening.stdout.readline()
                 )
                 listening.kill()
-            told = cosim("listen", "events", "--connect", at, "--seconds", "0").stdout
+            result = cosim("listen", "events", "--connect", at, "--seconds", "0").stdout
         finally:
             running.kill()
-    injected = [one["injection"] for one in json.loads(told.splitlines()[0])["injections"]]
+    injected = [one["injection"] for one in json.loads(result.splitlines()[0])["injections"]]
     assert {one["id"] for one in injected} == {*accepted, "bob"}
     assert all(
         isinstance(number, float) for one in injected for point in one["path"] for number in point
     )
-    assert "held to 1 x real time" in said and f"On the air at {at}" in said
+    assert "held to 1 x real time" in stderr and f"On the air at {at}" in stderr
 
 
 @pytest.mark.parametrize(
