@@ -26,7 +26,7 @@ GO_ON = [name for name, kind in EVENT_KINDS.items() if kind.decoy is not None]
 
 
 def event(kind: str, half_width_m: float | None = None, **fields: object) -> Event:
-    """An event 50 m along a route on the x axis, with a free side where its kind has one."""
+    """Return an event 50 m along a route on the x axis, with a free side where its kind has one."""
     row = EVENT_KINDS[kind]
     gate = row.layout.gate_half_m if row.layout is not None else None
     known = {
@@ -52,7 +52,7 @@ def drive(
     left_m: float = 0.0,
     weaves_m: float = 0.0,
 ) -> list[tuple[Pose, EventReply]]:
-    """Pose and reply at every tick of a robot that drives beside the x axis."""
+    """Return pose and reply at every tick of a robot that drives beside the x axis."""
     track: list[tuple[Pose, EventReply]] = []
     states: tuple[object, ...] = ()
     for tick in itertools.count():
@@ -89,7 +89,8 @@ def least_gap_m(track: list[tuple[Pose, EventReply]]) -> float:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_event_and_decoy_are_equal_until_the_trigger_and_then_differ(kind: str) -> None:
-    """Tick by tick under the same motion of the robot, also with a trigger distance of its own."""
+    """Event and decoy are equal tick by tick under the same motion of the robot, also with a given
+    trigger distance."""
     own_m = {"overtaking": -1.5, "ped_crossing": 3.0, "lateral": 3.3}.get(kind, 8.5)
     for side, trigger_m in itertools.product((-1, 1), (None, own_m)):
         one = event(kind, side=side, trigger_m=trigger_m)
@@ -135,7 +136,7 @@ def _taken_m(kind: str, one: Event) -> float:
 
 @pytest.mark.parametrize("kind", MIRRORED)
 def test_people_are_in_place_before_the_fastest_robot_arrives(kind: str) -> None:
-    """From either edge they reach the closed side, and stand where the row says."""
+    """From either edge people reach the closed side, and stand where the row says."""
     row = EVENT_KINDS[kind]
     assert row.layout is not None and row.layout.gate_half_m is not None
     for half_m, side, free in itertools.product(row.layout.gate_half_m, (-1, 1), (-1, 1)):
@@ -151,7 +152,7 @@ def test_people_are_in_place_before_the_fastest_robot_arrives(kind: str) -> None
 
 @pytest.mark.parametrize("kind", MIRRORED)
 def test_a_blind_robot_meets_people_of_the_event_or_of_its_mirror(kind: str) -> None:
-    """Whatever its lane and speed."""
+    """A blind robot meets people of one of the two at any lane and speed."""
     row = EVENT_KINDS[kind]
     assert row.layout is not None and row.layout.gate_half_m is not None
     half_m = row.layout.gate_half_m[1]
@@ -167,7 +168,7 @@ def test_a_blind_robot_meets_people_of_the_event_or_of_its_mirror(kind: str) -> 
 
 @pytest.mark.parametrize("kind", GO_ON)
 def test_a_robot_that_continues_passes_the_people_of_a_decoy(kind: str) -> None:
-    """On the middle of the way at its cruising speed, on ways of several widths."""
+    """A robot on the middle of the way at its cruising speed passes, on ways of several widths."""
     row = EVENT_KINDS[kind]
     for half_m, side, speed_mps in itertools.product((1.3, 1.6, 2.88), (-1, 1), (1.1, 1.65)):
         if kind == "overtaking" and half_m < 1.4:
@@ -198,7 +199,7 @@ def test_decoys_of_gestures_show_one_of_four_others_at_the_same_place() -> None:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_people_of_decoys_stay_where_the_row_says(kind: str) -> None:
-    """When the robot has passed, they are there; people without a place still walk."""
+    """When the robot has passed, they are at their places; people without a place still walk."""
     row = EVENT_KINDS[kind]
     for side, left_m in itertools.product((-1, 1), (-0.3, 0.0, 0.3)):
         decoy = row.decoy_of(event(kind, side=side, people=row.people[1]))
@@ -215,10 +216,10 @@ def test_people_of_decoys_stay_where_the_row_says(kind: str) -> None:
 
 @pytest.mark.parametrize("patience_s", [2.0, 4.0])
 @pytest.mark.parametrize("kind", ["frontal", "lateral", "ped_crossing"])
-def test_people_wait_for_their_patience_before_a_standing_robot(
+def test_people_wait_before_a_standing_robot_until_their_patience_ends(
     kind: str, patience_s: float
 ) -> None:
-    """Then they walk round it, without a touch."""
+    """Then they walk round it without touching it."""
     one = event(kind, 1.9, patience_s=patience_s)
     states: tuple[object, ...] = ()
     x_m, met, went = 44.0, None, None
