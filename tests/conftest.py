@@ -136,7 +136,7 @@ def pytest_configure(config: pytest.Config) -> None:
         )  # consoles look at the environment once, when they are made
 
 
-class Said(NamedTuple):
+class CliResult(NamedTuple):
     """What a command printed, and its exit code."""
 
     returncode: int
@@ -144,7 +144,7 @@ class Said(NamedTuple):
     stderr: str
 
 
-Cosim = Callable[..., Said]
+Cosim = Callable[..., CliResult]
 """cosim(*words, cwd=folder)."""
 
 
@@ -161,7 +161,7 @@ def fresh_cosim() -> Cosim:
     return _in_a_process
 
 
-def _in_a_process(*words: str, cwd: Path | None = None) -> Said:
+def _in_a_process(*words: str, cwd: Path | None = None) -> CliResult:
     command = [sys.executable, "-m", "cosim", *words]
     done = subprocess.run(
         command,
@@ -172,10 +172,10 @@ def _in_a_process(*words: str, cwd: Path | None = None) -> Said:
         timeout=PATIENCE_S,
         check=False,
     )
-    return Said(done.returncode, done.stdout, done.stderr)
+    return CliResult(done.returncode, done.stdout, done.stderr)
 
 
-def _here(*words: str, cwd: Path | None = None) -> Said:
+def _here(*words: str, cwd: Path | None = None) -> CliResult:
     from cosim.__main__ import main
 
     out, err = io.StringIO(), io.StringIO()
@@ -185,7 +185,7 @@ def _here(*words: str, cwd: Path | None = None) -> Said:
             code = 0
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
-    return Said(code, out.getvalue(), err.getvalue())
+    return CliResult(code, out.getvalue(), err.getvalue())
 
 
 @contextmanager
