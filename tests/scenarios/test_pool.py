@@ -648,20 +648,20 @@ def test_processes_that_never_start_end_the_run(tmp_path: Path) -> None:
 def test_a_job_of_any_length_reaches_a_worker_that_listens_late() -> None:
     """More than a socket buffers is posted without waiting, and arrives complete and in order."""
     ours, theirs = socket.socketpair()
-    run_policy = MessageSocket(ours)
+    run = MessageSocket(ours)
     worker = MessageSocket(theirs)
     jobs = [os.urandom(3_000_000), b"the next"]
     for job in jobs:
-        run_policy.post(job)
+        run.post(job)
     received: list[bytes] = []
     while len(received) < len(jobs):
         received += worker.received()
-        run_policy.flush()
+        run.flush()
     assert received == jobs
     worker.close()
     with pytest.raises(OSError):
-        run_policy.post(jobs[0])
-    run_policy.close()
+        run.post(jobs[0])
+    run.close()
 
 
 class RecordingProcess(FakeProcess):
