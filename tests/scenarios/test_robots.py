@@ -283,7 +283,7 @@ def test_another_robot_is_another_run_of_the_same_suite(tmp_path: Path) -> None:
     with RunFolder.create(tmp_path / "run", spec, none):
         pass
     with pytest.raises(
-        RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, now asked"
+        RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, and this command has"
     ):
         RunFolder.resume(tmp_path / "run", changed(spec, robots={"scout": "h"}))
     parts = [run_of(tmp_path / name, ["goal"], robot=name) for name in ("courier", "scout")]
