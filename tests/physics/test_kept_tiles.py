@@ -24,7 +24,7 @@ from physics.street import tile_cache as kept_tiles
 from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place, surface_of_place
 from tests.conftest import ROOT
-from tests.support import in_turn
+from tests.support import episode_order
 
 CITY = City(seed=1, size_m=500.0)
 
@@ -175,12 +175,12 @@ def test_an_episode_is_the_same_with_stored_tiles(
 ) -> None:
     """State hash and pictures are equal when no tile is made, and when some are made again after
     files are lost."""
-    scenario, manifest = next(iter(in_turn.drawn()))
+    scenario, manifest = next(iter(episode_order.drawn()))
     assert manifest.camera is not None
 
     def driven() -> str:
         surface_of_place.cache_clear()
-        return in_turn.hash_of(scenario, manifest)
+        return episode_order.hash_of(scenario, manifest)
 
     made = driven()
     files = sorted(path for path in (cache / "tiles").rglob("*") if path.is_file())

@@ -17,7 +17,7 @@ from physics.ground.tiles import (
     tiles_within,
 )
 from physics.street.buildings import BuildingRows
-from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
+from tests.support.tiny_street import KEYS, assert_no_cracks, plan_areas, tiny_map, triangles
 
 MAP = tiny_map()
 
@@ -41,7 +41,7 @@ def test_neighbouring_triangles_share_their_corners(tiles: dict[Key, Tile]) -> N
     """Within a tile every edge off the border is shared by two triangles, also at walls and their
     feet."""
     for key, tile in tiles.items():
-        no_cracks(key, np.concatenate([triangles(tile, name) for name in tile.parts]))
+        assert_no_cracks(key, np.concatenate([triangles(tile, name) for name in tile.parts]))
 
 
 def test_heights_meet_at_tile_borders(tiles: dict[Key, Tile]) -> None:

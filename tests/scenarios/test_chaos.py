@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from cosim.results.run_folder import read_records
-from tests.support.chaos import PlannedBlow, chaos, differences, quiet, tiny_suite
-from tests.support.coordinating import serve_made_up
+from tests.support.chaos import PlannedFault, chaos, differences, tiny_suite, undisturbed
+from tests.support.coordinating import serve_fabricated
 
 PLAN = [
-    PlannedBlow(1, "kill worker"),
-    PlannedBlow(2, "stop worker"),
-    PlannedBlow(3, "kill process"),
-    PlannedBlow(4, "kill coordinator"),
-    PlannedBlow(5, "end worker"),
+    PlannedFault(1, "kill worker"),
+    PlannedFault(2, "stop worker"),
+    PlannedFault(3, "kill process"),
+    PlannedFault(4, "kill coordinator"),
+    PlannedFault(5, "end worker"),
 ]
 """So early that episodes are left for the last blow where several end between two looks."""
 SEED = 143
@@ -33,9 +33,9 @@ def test_killed_workers_and_coordinators_change_no_result(
     terminated; an environment process and the coordinator are killed."""
     tiny_suite(tmp_path, 10)
     with ThreadPoolExecutor(1) as executor:
-        undisturbed = executor.submit(quiet, tmp_path, jobs=1)
+        reference_run = executor.submit(undisturbed, tmp_path, jobs=1)
         found = chaos(tmp_path, "chaos", 3, PLAN, seed=SEED, replaced=False)
-    reference = undisturbed.result()
+    reference = reference_run.result()
     logs = (tmp_path / "chaos.log").read_text() + (tmp_path / "chaos-workers.log").read_text()
     assert found.wrong == [] and sum(found.faults.values()) == len(PLAN), logs
     assert differences(reference, tmp_path / "chaos") == [], logs
@@ -50,5 +50,5 @@ def test_killed_workers_and_coordinators_change_no_result(
 def test_a_coordinator_receives_every_fabricated_result() -> None:
     """Three workers with immediate results serve thirty jobs, the run ends, and a round takes a
     positive time."""
-    served = serve_made_up(workers=3, jobs=30)
+    served = serve_fabricated(workers=3, jobs=30)
     assert served.jobs == 30 and served.wall_s > served.round_s > 0.0

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from tests.conftest import PATIENCE_S
-from tests.support.in_turn import COUNT, SAMPLE
+from tests.support.episode_order import COUNT, SAMPLE
 
 NOT_DRIVEN_WITH = (
     "pandas",
@@ -48,7 +48,7 @@ def test_later_episodes_of_a_process_equal_first_ones(
     have the same states and pictures in random order."""
     whole = request.config.getoption("--whole")
     count, only = (COUNT, []) if whole else (len(SAMPLE), ["--sample"])
-    command = [sys.executable, "-m", "tests.support.in_turn", *only]
+    command = [sys.executable, "-m", "tests.support.episode_order", *only]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split("\n")[-2] == f"[] {count} {count}", done.stderr

@@ -22,7 +22,7 @@ from scenarios.ipc.messages import Done, Hello, Job, Message, MessageHandler
 from scenarios.runs import run as suite_run
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.tools.verify.doctor import small_scenario
-from tests.support.equality import thirty
+from tests.support.equality import thirty_scenarios
 
 
 class Ahead:
@@ -123,5 +123,5 @@ def test_a_suite_has_the_same_results_over_every_transport(
 
 def test_equality_runs_thirty_scenarios() -> None:
     """The script that compares all mechanisms selects thirty scenarios, without decoys."""
-    chosen = thirty().scenarios
+    chosen = thirty_scenarios().scenarios
     assert len(chosen) == 30 and not any(one.decoy_of for one in chosen)

@@ -161,7 +161,7 @@ def test_a_member_walking_aside_steps_nearer_unless_blocked() -> None:
     """1.9 m beside the other it steps 0.34 m nearer, but not where another person approaches that
     place."""
     walkers = FakeSumo(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
-    given_speeds(walkers, looks=3)
+    given_speeds(walkers, updates=3)
     assert sorted(y for _, _, y in walkers.at.values()) in ([0.0, 1.58], [0.34, 1.92])
     walkers = FakeSumo(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)

@@ -1,4 +1,4 @@
-"""Kinematic robots that drive by a schedule, without looking."""
+"""Kinematic robots that drive by a schedule without sensors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class Schedule(NamedTuple):
 def outcome(
     one: Event, schedule: Schedule, before_m: float, limit_s: float, after_m: float = 13.0
 ) -> Outcome:
-    """Drive along the x axis from `before_m` before an event at x = 0 to `after_m` beyond it."""
+    """Drive along the x axis from `before_m` before an event at x = 0 to `after_m` beyond it, and
+    return the result."""
     x_m, y_m, heading, v_mps, w_radps, driven_m = -before_m, 0.0, 0.0, 0.0, 0.0, 0.0
     stops = list(schedule.stops)
     stands_until_s = math.inf

@@ -1,4 +1,4 @@
-"""Texts of matplotlib figures that are cut off or cover another."""
+"""Texts of matplotlib figures that are cut off or overlap."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _SLACK_PX = 1.0
 
 
 def clipped_texts(monkeypatch: pytest.MonkeyPatch, draw: Callable[[], object]) -> list[str]:
-    """Draw a figure; return each text that is not whole within it, and each pair of which one
-    covers the other."""
+    """Draw a figure; return each text that is not completely within it, and each pair of
+    overlapping texts."""
     from matplotlib.backends.backend_agg import RendererAgg
     from matplotlib.figure import Figure
     from matplotlib.text import Text

@@ -20,7 +20,7 @@ from scenarios.tools.policy_check.checks import POLICY_CHECKS, CheckedPolicy, ch
 from scenarios.tools.policy_check.drives import Drive, SceneName, drives_for
 from scenarios.tools.policy_check.query import PolicyQuery
 from tests.conftest import Cosim
-from tests.support import planted
+from tests.support import faulty_policies
 from tests.support.graphs import bundle, tiny_graph
 
 Drives = Mapping[SceneName, Drive]
@@ -28,7 +28,7 @@ Drives = Mapping[SceneName, Drive]
 
 @pytest.fixture(scope="module")
 def drives() -> Drives:
-    return drives_for(planted.Right.manifest, 6, camera_of_choice("auto"))
+    return drives_for(faulty_policies.Right.manifest, 6, camera_of_choice("auto"))
 
 
 def outcomes_of(policy: Policy, drives: Drives) -> CheckedPolicy:
@@ -40,18 +40,21 @@ def outcomes_of(policy: Policy, drives: Drives) -> CheckedPolicy:
 def test_a_right_policy_passes_every_check(drives: Drives) -> None:
     """A policy that sees, takes goals and remembers pictures passes, and every check applies to
     it."""
-    found = outcomes_of(planted.Right(), drives)
+    found = outcomes_of(faulty_policies.Right(), drives)
     assert {
         name: one for name, one in found.outcomes.items() if one.outcome != "passed"
     }.keys() == {"example"}
     assert (
-        {*planted.FAULTS, *planted.DOUBTS, "example"} == set(POLICY_CHECKS) == set(found.outcomes)
+        {*faulty_policies.FAULTS, *faulty_policies.DOUBTS, "example"}
+        == set(POLICY_CHECKS)
+        == set(found.outcomes)
     )
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize(
-    ("check", "fault"), [(check, one) for check, faults in planted.FAULTS.items() for one in faults]
+    ("check", "fault"),
+    [(check, one) for check, faults in faulty_policies.FAULTS.items() for one in faults],
 )
 def test_a_planted_fault_is_told(check: str, fault: type[Policy], drives: Drives) -> None:
     """The check that a fault was planted for fails, and says why."""
@@ -62,10 +65,10 @@ def test_a_planted_fault_is_told(check: str, fault: type[Policy], drives: Drives
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("check", list(planted.DOUBTS))
+@pytest.mark.parametrize("check", list(faulty_policies.DOUBTS))
 def test_what_may_be_right_is_doubted_only(check: str, drives: Drives) -> None:
     """A policy that may be right is doubted, with the reason why it may be, and has not failed."""
-    found = outcomes_of(planted.DOUBTS[check](), drives)
+    found = outcomes_of(faulty_policies.DOUBTS[check](), drives)
     assert found.outcomes[check].outcome == "warning" and "right" in found.outcomes[check].words
     assert found.count("failed") == 0
 
@@ -82,10 +85,10 @@ def test_a_policy_that_is_told_the_street_passes() -> None:
 def test_the_command_says_what_it_found(cosim: Cosim, tmp_path: Path) -> None:
     """A table, or JSON, a picture with the way in it, and exit code 1 where something has
     failed."""
-    source = Path(planted.__file__).read_text()
-    (tmp_path / "planted.py").write_text(source)
+    source = Path(faulty_policies.__file__).read_text()
+    (tmp_path / "faulty_policies.py").write_text(source)
     words = ("--frames", "4", "-o", "check.png")
-    right = cosim("policy", "check", "planted:Right", *words, cwd=tmp_path)
+    right = cosim("policy", "check", "faulty_policies:Right", *words, cwd=tmp_path)
     assert (
         right.returncode == 0 and "0 failed" in right.stdout and "colour_order" in right.stdout
     ), right.stderr
@@ -94,7 +97,9 @@ def test_the_command_says_what_it_found(cosim: Cosim, tmp_path: Path) -> None:
     assert (
         np.abs(picture.astype(int) - (60, 70, 255)).max(axis=2) < 8
     ).sum() > 100  # the waypoint that is followed
-    wrong = cosim("policy", "check", "planted:BlueForRed", "--frames", "4", "--json", cwd=tmp_path)
+    wrong = cosim(
+        "policy", "check", "faulty_policies:BlueForRed", "--frames", "4", "--json", cwd=tmp_path
+    )
     told = json.loads(wrong.stdout)
     assert wrong.returncode == 1 and told["checks"]["colour_order"]["outcome"] == "failed"
     assert (
