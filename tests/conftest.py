@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 PATIENCE_S = 600.0
-"""How long a test waits for what must happen: far beyond what a slow and busy machine needs. A test
-never waits for it to be over, so that it costs nothing where all is well."""
+"""Longest time that a test waits for a condition, far beyond what a slow and busy machine needs. A
+test never waits for it to pass, so it costs nothing if the test passes."""
 
 WIDE = {"COLUMNS": "200", "NO_COLOR": "1"}
-"""So that what the command line prints can be read by a test."""
+"""Environment in which a test can read the output of the command line."""
 
 settings.register_profile(
     "tests", deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
@@ -61,11 +61,11 @@ LONGEST = (
     "sumo_nets/test_crowd.py",
     "scenarios/test_verify.py",
 )
-"""Files of engine tests that take longest. They are the first of these, so that no worker of
-pytest-xdist is left alone with one of them in the end."""
+"""Files of engine tests that take longest. They run before the other engine tests, so that no worker
+of pytest-xdist is left with one of them at the end."""
 
 COLLECTED = pytest.StashKey[list[str]]()
-"""The ids of all tests of a session, those that it leaves out included."""
+"""The ids of all tests of a session, including those that it deselects."""
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -35,8 +35,7 @@ RUN_ELSEWHERE = {
     "from policy_server import serve": "scenarios/test_remote.py",
     "import json, zenoh": "bridge/test_step_in.py",
 }
-"""Beginnings of Python blocks that need a run at the other end, and the tests that run them as
-written."""
+"""Beginnings of Python blocks that need a run to connect to, and the tests that run them as written."""
 COMMANDS: Any = get_command(app)
 CHEAP = (
     "list ",
@@ -48,7 +47,7 @@ CHEAP = (
     "scenario draw ",
     "look night.toml ",
 )
-"""Commands that are run for real, as they take a second or two; the others are parsed."""
+"""Commands that are run, as they take a second or two; the others are parsed."""
 PYTHON = [block for block in blocks("python") if not block.text.startswith(tuple(RUN_ELSEWHERE))]
 POLICY = re.compile(r"^class (\w+):\n    manifest = ", re.MULTILINE)
 

@@ -366,7 +366,7 @@ FOUND = {
     name: rf"tiny\.onnx: .* bytes, .*; expected tiny\.onnx: .*\. Different: {words}$"
     for name, words in (("bytes", "size"), ("blake2b", "BLAKE2b"), ("sha256", "SHA-256"))
 }
-"""Messages for another file."""
+"""Error messages for a file with another size or hash."""
 
 
 @pytest.mark.parametrize("wrong", ["bytes", "blake2b", "sha256"])

@@ -114,9 +114,9 @@ def moment(world: BulletWorld, n: int = 0) -> tuple[RobotState, Street]:
     return robot, street_at(place(CITIES[0])[1], robot.pose.xy, np.random.default_rng(n))
 
 
-def same(one: Frame, other: Frame) -> bool:
-    assert one.labels is not None and other.labels is not None
-    return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
+def same(first: Frame, second: Frame) -> bool:
+    assert first.labels is not None and second.labels is not None
+    return np.array_equal(first.rgb, second.rgb) and np.array_equal(first.labels, second.labels)
 
 
 def test_a_closed_camera_frees_its_graphics_memory(

@@ -192,17 +192,17 @@ def test_a_picture_whose_drawing_or_wait_failed_is_not_returned(
 
 
 def _single_camera(
-    world: BulletWorld, light: Light, asked: list[tuple[RobotState, Street]]
+    world: BulletWorld, light: Light, queries: list[tuple[RobotState, Street]]
 ) -> list[Frame]:
     from physics.cameras.gl.camera import GlCamera
 
     with GlCamera(world, SPEC, light=light) as camera:
-        return [camera.render(robot, street) for robot, street in asked]
+        return [camera.render(robot, street) for robot, street in queries]
 
 
-def _same(one: Frame, other: Frame) -> bool:
-    assert one.labels is not None and other.labels is not None
-    return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
+def _same(first: Frame, second: Frame) -> bool:
+    assert first.labels is not None and second.labels is not None
+    return np.array_equal(first.rgb, second.rgb) and np.array_equal(first.labels, second.labels)
 
 
 def test_an_atlas_refuses_too_many_pixels_and_closed_use(worlds: list[BulletWorld]) -> None:

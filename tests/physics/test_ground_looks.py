@@ -30,7 +30,7 @@ from physics.textures.ground import SURFACE_LAYERS, layer_of
 from tests.support.tiny_street import KEYS, tiny_map
 
 MIN_DISTANCE = 15.0
-"""Between two mean colours in CIELAB: 2.3 can just be told apart side by side."""
+"""Minimum distance of two mean colours in CIELAB; 2.3 is just noticeable side by side."""
 HOUSE = shapely.box(-60.0, 8.0, -4.0, 16.0)
 LOT = shapely.box(5.0, 9.0, 40.0, 30.0)
 PARK = shapely.box(-200.0, -100.0, 200.0, -8.0)

@@ -21,7 +21,7 @@ from physics.street.street_surface import StreetSurface
 from tests.support.tiny_street import tiny_map
 
 LOW = Barrier(x_m=-16.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end=0, height_m=0.6)
-"""Across the northern sidewalk."""
+"""A low fence across the northern sidewalk."""
 
 
 @pytest.mark.engine

@@ -60,28 +60,28 @@ def hilly(street_map: StreetMap) -> StreetMap:
     ).with_input_hash("hilly")
 
 
-def equal(one: object, other: object) -> bool:
+def equal(first: object, second: object) -> bool:
     """Return whether two values are the same to the bit, with their arrays and shapes."""
-    if type(one) is not type(other):
+    if type(first) is not type(second):
         return False
-    if isinstance(one, np.ndarray):
-        assert isinstance(other, np.ndarray)
-        same_layout = (one.dtype, one.shape, one.flags.c_contiguous) == (
-            other.dtype,
-            other.shape,
-            other.flags.c_contiguous,
+    if isinstance(first, np.ndarray):
+        assert isinstance(second, np.ndarray)
+        same_layout = (first.dtype, first.shape, first.flags.c_contiguous) == (
+            second.dtype,
+            second.shape,
+            second.flags.c_contiguous,
         )
-        return same_layout and one.tobytes() == other.tobytes()
-    if isinstance(one, shapely.Geometry):
-        return shapely.to_wkb(one) == shapely.to_wkb(other)
-    if isinstance(one, dict):
-        return [*one] == [*other] and all(map(equal, one.values(), other.values()))  # type: ignore[call-overload,attr-defined]
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(equal, one, other))  # type: ignore[arg-type]
-    if dataclasses.is_dataclass(one):
-        names = [field.name for field in dataclasses.fields(one)]
-        return all(equal(getattr(one, name), getattr(other, name)) for name in names)
-    return repr(one) == repr(other)
+        return same_layout and first.tobytes() == second.tobytes()
+    if isinstance(first, shapely.Geometry):
+        return shapely.to_wkb(first) == shapely.to_wkb(second)
+    if isinstance(first, dict):
+        return [*first] == [*second] and all(map(equal, first.values(), second.values()))  # type: ignore[call-overload,attr-defined]
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(equal, first, second))  # type: ignore[arg-type]
+    if dataclasses.is_dataclass(first):
+        names = [field.name for field in dataclasses.fields(first)]
+        return all(equal(getattr(first, name), getattr(second, name)) for name in names)
+    return repr(first) == repr(second)
 
 
 @pytest.mark.parametrize("ground", ["flat", "rough", "hilly"])

@@ -213,8 +213,8 @@ def test_outfit_colours_patterns_and_girth_are_independent() -> None:
     def classes(values: Sequence[object]) -> np.ndarray:
         return np.unique(np.array([str(one) for one in values]), return_inverse=True)[1]
 
-    def darker(one: Look, coat: str) -> int:
-        return int(one.colours[COATS.index(coat)].astype(int).sum())
+    def darker(look: Look, coat: str) -> int:
+        return int(look.colours[COATS.index(coat)].astype(int).sum())
 
     girth = np.argsort(np.argsort([one.girth_m for one in men])) * 8 // len(men)
     draws = {

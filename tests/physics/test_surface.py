@@ -33,7 +33,7 @@ PROFILE = {
     "curb": ((LONG_M, GRADE * LONG_M), (LONG_M, TOP_M)),
     "plateau": ((LONG_M, TOP_M), (14.0, TOP_M)),
 }
-"""Seen from the side, in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet
+"""Profile in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet
 at x = 0.41."""
 LABEL = {
     "sidewalk": "sidewalk",
@@ -61,12 +61,12 @@ class Hill(Surface):
         for name, ((begin, z0), (end, z1)) in PROFILE.items():
             left, right = max(begin, x0), min(end, x1)
             if begin == end:
-                there = x0 <= begin < x1
+                overlaps = x0 <= begin < x1
                 z = np.array([z0, z1])
             else:
-                there = left < right
+                overlaps = left < right
                 z = np.interp((left, right), (begin, end), (z0, z1))
-            if low >= high or not there:
+            if low >= high or not overlaps:
                 continue
             corners = np.array(
                 [(left, low, z[0]), (right, low, z[1]), (right, high, z[1]), (left, high, z[0])]

@@ -73,7 +73,7 @@ def test_a_pushed_walker_steps_and_stands_again(walk: Walk) -> None:
 
 
 SLOPE = Course([(-48.0, 0.0), (0.0, 4.0), (48.0, 0.0)])
-"""1:12 along x."""
+"""A slope of 1:12 along x."""
 
 
 @pytest.mark.parametrize(

@@ -44,9 +44,9 @@ def test_each_person_counts_at_the_density_around_it() -> None:
     assert set(np.unique(found[:, 0])) == {0.25, 0.75, 1.0}
     assert found[found[:, 0] == 0.75, 1] == pytest.approx(1.0)
     assert found[found[:, 0] == 0.25, 1] == pytest.approx(1.5)
-    (low, few), (_, many), (nobody, none) = in_bins(found, (0.0, 0.5, 1.5, 2.0))
+    (low, few), (_, many), (empty, empty_count) = in_bins(found, (0.0, 0.5, 1.5, 2.0))
     assert low.mean == pytest.approx(1.5)
-    assert few + many == len(found) and none == 0 and np.isnan(nobody.mean)
+    assert few + many == len(found) and empty_count == 0 and np.isnan(empty.mean)
 
 
 def test_the_nearest_person_is_searched_in_the_same_frame() -> None:
@@ -66,9 +66,9 @@ def test_a_gap_lasts_from_leaving_to_the_next_arrival() -> None:
     person = np.column_stack([times_s, np.zeros_like(times_s), times_s - 10.0])
 
     def vehicle(at_s: float, y_m: float) -> np.ndarray:
-        there = np.ones_like(times_s)
+        ones = np.ones_like(times_s)
         return np.column_stack(
-            [times_s, 10.0 * (times_s - at_s), y_m * there, 4.0 * there, 1.4 * there]
+            [times_s, 10.0 * (times_s - at_s), y_m * ones, 4.0 * ones, 1.4 * ones]
         )
 
     # It is on the far lane, at y = 2, from 11 s to 13 s.

@@ -60,7 +60,7 @@ class Driven(NamedTuple):
 
 
 def drive(
-    one: Event,
+    planned: Event,
     speed_at: Callable[[float], float],
     start_m: float,
     seconds: float,
@@ -89,7 +89,7 @@ def drive(
             route_s_m=x_m,
             robot_length_m=0.7,
             robot_width_m=0.55,
-            events=(one,),
+            events=(planned,),
             states=states,
         )
         states = react(query).states
@@ -105,7 +105,7 @@ def drive(
         nearest_m = min(nearest_m, float(gaps.min()))
         if len(at) > 1 and min(ahead_m) <= 0.0 and max(ahead_m) >= before_m - x_m:
             between |= passed_between(np.array([before_m, left_m]), np.array([x_m, left_m]), at)
-        if nearest_m < 0.0 or (between and one.kind == "conversing" and len(at) == 2):
+        if nearest_m < 0.0 or (between and planned.kind == "conversing" and len(at) == 2):
             break
     return Driven(nearest_m, between, states[0], seen)
 
@@ -121,15 +121,15 @@ def test_a_blind_robot_at_any_constant_speed_meets_people_of_every_event(
         for half_m in (1.45, 1.9, 2.9):
             half_width_m = HALF_WIDTHS_M.get(kind, {}).get(people, half_m)
             for side, speed_mps in ((1, 1.1), (-1, 1.65)):
-                one = event(kind, half_width_m, people, side, speed_mps)
+                planned = event(kind, half_width_m, people, side, speed_mps)
                 before_m = (
                     2.0
                     if kind == "overtaking"
-                    else 1.0 + (EVENT_KINDS[kind].trigger_m or one.half_length_m)
+                    else 1.0 + (EVENT_KINDS[kind].trigger_m or planned.half_length_m)
                 )
                 start_m = 50.0 - before_m
                 way_m = before_m + (16.0 if kind == "overtaking" else 14.0)
-                driven = drive(one, lambda _: v_mps, start_m, way_m / v_mps)
+                driven = drive(planned, lambda _: v_mps, start_m, way_m / v_mps)
                 assert driven.gap_m < 0.0 if (kind, people) != ("conversing", 2) else driven.between
                 assert driven.between or driven.state.phase == "acting"
 
@@ -175,8 +175,8 @@ def test_a_robot_on_one_side_of_the_sidewalk_meets_standing_people(
 ) -> None:
     """Standing people step in front of the robot; a robot near the middle is met on the middle."""
     for side in (-1, 1):
-        one = event(kind, 1.9, PEOPLE.get(kind, (1,))[0], side)
-        driven = drive(one, lambda _: 0.8, 38.0, 25.0, left_m)
+        planned = event(kind, 1.9, PEOPLE.get(kind, (1,))[0], side)
+        driven = drive(planned, lambda _: 0.8, 38.0, 25.0, left_m)
         assert driven.gap_m < 0.0 or (kind == "conversing" and driven.between)
     near = drive(event(kind, 1.9, PEOPLE.get(kind, (1,))[0]), lambda _: 0.2, 39.0, 20.0, 0.25)
     middle = drive(event(kind, 1.9, PEOPLE.get(kind, (1,))[0]), lambda _: 0.2, 39.0, 20.0)
@@ -199,12 +199,12 @@ def test_standing_people_stay_until_the_robot_is_three_metres_past_the_last_one(
     kind: str,
 ) -> None:
     """A robot that creeps past at 0.06 m/s does not make them move earlier."""
-    one = event(kind, 2.9, PEOPLE.get(kind, (1,))[0])
-    driven = drive(one, lambda t_s: 1.0 if t_s < 9.0 else 0.06, 38.0, 150.0, left_m=-4.0)
+    planned = event(kind, 2.9, PEOPLE.get(kind, (1,))[0])
+    driven = drive(planned, lambda t_s: 1.0 if t_s < 9.0 else 0.06, 38.0, 150.0, left_m=-4.0)
     last_m = max(walker.x_m for walker in driven.seen[200][1].walkers)
     over = [x_m for x_m, state in driven.seen if state.phase != "acting" and x_m > 41.0]
     assert over[0] == pytest.approx(last_m + 3.0, abs=0.01)
-    waiting = drive(one, lambda t_s: 1.0 if t_s < 6.0 else 0.0, 38.0, 120.0)
+    waiting = drive(planned, lambda t_s: 1.0 if t_s < 6.0 else 0.0, 38.0, 120.0)
     assert waiting.state.phase == "acting"
 
 
@@ -245,9 +245,9 @@ def test_a_person_who_approaches_a_standing_robot_walks_round_it(
     """A robot that has stopped near the walker is passed at a distance, and the walker
     continues."""
     for stops_m in (1.4, 1.9, 2.3):
-        one = event("frontal", 1.9, speed_mps=speed_mps)
+        planned = event("frontal", 1.9, speed_mps=speed_mps)
         drives_s = (20.0 - stops_m) / (1.2 + speed_mps)
-        driven = drive(one, lambda t_s, d=drives_s: 1.2 if t_s < d else 0.0, 30.0, 40.0, left_m)  # type: ignore[misc]
+        driven = drive(planned, lambda t_s, d=drives_s: 1.2 if t_s < d else 0.0, 30.0, 40.0, left_m)  # type: ignore[misc]
         assert driven.gap_m > 0.02
         assert driven.state.walkers[0].x_m < 30.0
 
@@ -266,10 +266,10 @@ def test_a_robot_that_does_not_give_way_is_hit_within_the_window_of_the_rule(v_m
     for half_m, side, left_m, speed_mps in itertools.product(
         (1.45, 2.9), (-1, 1), (-0.9, 0.0, 0.9), (1.1, 1.65)
     ):
-        one = event("overtaking", half_m, 1, side, speed_mps)
-        driven = drive(one, lambda _: v_mps, 48.0, 14.0 / v_mps, left_m)
+        planned = event("overtaking", half_m, 1, side, speed_mps)
+        driven = drive(planned, lambda _: v_mps, 48.0, 14.0 / v_mps, left_m)
         assert driven.gap_m < 0.0
-        end_m = overtaken_at_m(one, kind)
+        end_m = overtaken_at_m(planned, kind)
         assert end_m is not None and driven.seen[-1][0] < end_m
 
 
@@ -278,11 +278,11 @@ def test_an_overtaking_person_is_faster_than_the_robot_and_passes_close_by(v_mps
     """The person walks at up to 4.0 m/s, and is in front of a fast robot within 9 m of its way."""
     driven = drive(event("overtaking"), lambda _: v_mps, 49.0, 60.0 / v_mps)
     for (x_m, before), (_, after) in itertools.pairwise(driven.seen):
-        (one,) = after.walkers
-        if after.phase == "acting" and before.phase == "acting" and one.pace_mps is None:
-            assert v_mps < math.hypot(one.vx_mps, one.vy_mps) < 4.0 + 1e-6
-        if abs(one.x_m - x_m) < 0.3 and after.phase == "acting":
-            assert 0.575 < abs(one.y_m) < 1.25
+        (walker,) = after.walkers
+        if after.phase == "acting" and before.phase == "acting" and walker.pace_mps is None:
+            assert v_mps < math.hypot(walker.vx_mps, walker.vy_mps) < 4.0 + 1e-6
+        if abs(walker.x_m - x_m) < 0.3 and after.phase == "acting":
+            assert 0.575 < abs(walker.y_m) < 1.25
     slow = [x_m for x_m, state in driven.seen if state.walkers[0].pace_mps is not None]
     assert slow[0] < 51.0 + 9.0
 
@@ -367,12 +367,12 @@ def test_a_schedule_of_stops_and_swerves_rarely_solves_an_event(
     rng = np.random.default_rng(5)
     solved = 0
     for before_m in np.linspace(7.0, 25.0, 12).tolist():
-        one = msgspec.structs.replace(
+        planned = msgspec.structs.replace(
             event(kind, 1.6, 3 if kind == "ped_crossing" else 1, side=int(rng.choice([-1, 1]))),
             x_m=0.0,
             speed_mps=float(rng.uniform(1.1, 1.65)),
             patience_s=float(rng.uniform(2.0, 4.0)),
         )
         limit_s = 1.5 * ((before_m + 13.0) / 1.4 + 6.0) + 3.0
-        solved += outcome(one, schedule, before_m, limit_s) == "solved"
+        solved += outcome(planned, schedule, before_m, limit_s) == "solved"
     assert solved <= 3

@@ -19,9 +19,9 @@ PLAN = [
     PlannedFault(4, "kill coordinator"),
     PlannedFault(5, "end worker"),
 ]
-"""So early that episodes are left for the last blow where several end between two looks."""
+"""Early enough that episodes are left for the last fault, where several end between two polls."""
 SEED = 143
-"""With this one who is stopped is so for 0.6 s."""
+"""With this seed the paused worker is paused for 0.6 s."""
 
 
 @pytest.mark.engine

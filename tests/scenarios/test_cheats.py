@@ -21,8 +21,7 @@ KINDS = tuple(EVENT_KINDS)
 NAMES = tuple(name for name in cheats.CHEATS if name != "Quitter")
 
 HARDEST = {"StopAndGo": ("lateral", "overtaking")}
-"""Who crosses or cuts in lets the robot go by its speed, so it is there that stops by the clock
-could pay."""
+"""People who cross or cut in adapt to the robot's speed, so periodic stops could work best there."""
 
 
 def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:

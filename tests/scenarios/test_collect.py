@@ -176,9 +176,9 @@ def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
         np.testing.assert_allclose(packed.state[rows], speed[ticks], atol=1e-6)
         as_driven = np.abs(packed.command[rows] - log.command[ticks]).max(axis=1) < 1e-6
         assert (as_driven | packed.disturbed[rows]).all()
-        there = packed.driven[rows] > 0
-        far_m = np.hypot(*(pose[ticks[there] + 4] - pose[ticks[there]])[:, :2].T)
-        np.testing.assert_allclose(np.hypot(*packed.waypoints[rows][there, 0].T), far_m, atol=1e-5)
+        driven = packed.driven[rows] > 0
+        far_m = np.hypot(*(pose[ticks[driven] + 4] - pose[ticks[driven]])[:, :2].T)
+        np.testing.assert_allclose(np.hypot(*packed.waypoints[rows][driven, 0].T), far_m, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -248,13 +248,13 @@ def test_an_incomplete_data_set_is_written_again(desk: Desk, cosim: Cosim) -> No
     """Without meta/ a data set is incomplete: --resume drives nothing again and writes the same
     bytes."""
     made = desk.folder / "demos"
-    there = [
+    files_written = [
         path
         for name in ("meta", "data", "videos")
         for path in (made / name).rglob("*")
         if path.is_file()
     ]
-    files = {path: path.read_bytes() for path in there}
+    files = {path: path.read_bytes() for path in files_written}
     shutil.rmtree(made / "meta")
     (made / "writing").mkdir()
     (made / "writing/half").write_bytes(b"")
@@ -270,8 +270,8 @@ def test_fresh_scenarios_do_not_depend_on_how_they_are_divided() -> None:
     parts gives the same scenarios."""
     from scenarios.suites.new_scenarios import Fresh
 
-    there = Fresh(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
-    drawn = there.drawn(0, 5)
+    fresh = Fresh(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
+    drawn = fresh.drawn(0, 5)
     assert {one.id for one in drawn} <= {
         "straight-1-000",
         "curve-1-000",
@@ -280,7 +280,7 @@ def test_fresh_scenarios_do_not_depend_on_how_they_are_divided() -> None:
         "straight-1-001",
     }
     assert len({one.light for one in drawn}) == len(drawn) >= 3
-    assert [*there.drawn(0, 2), *there.drawn(2, 3)] == drawn
+    assert [*fresh.drawn(0, 2), *fresh.drawn(2, 3)] == drawn
 
 
 class SeeingExpert:

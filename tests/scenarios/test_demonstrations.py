@@ -323,10 +323,10 @@ def test_raw_demonstrations_are_packed_in_parts(
     assert [path.name for path in sorted(tmp_path.glob("e-*"))] == ["e-000.npz", "e-f-001.npz"]
     assert read_packed(tmp_path / "e-000.npz").frames.shape == (sum(LENGTHS), 24, 32, 3)
     for number, way in ((100, ways[3]), (11, ways[2])):
-        whole = Suite(name="ways", version="1", scenarios=(way,))
+        one_way = Suite(name="ways", version="1", scenarios=(way,))
         folder = tmp_path / f"many/runs/{number:02d}"
         (folder / "episodes" / way.id).mkdir(parents=True)
-        write_suite(whole, folder / "scenarios.json")
+        write_suite(one_way, folder / "scenarios.json")
         (folder / f"episodes/{way.id}/demonstration.npz").write_bytes(demonstrations[0].encoded())
     (tmp_path / "many/about.json").write_text(json.dumps(ABOUT))
     (part,) = pack_raw([tmp_path / "many"], tmp_path / "m.npz")
@@ -347,12 +347,12 @@ def test_incompatible_data_sets_are_not_packed_together(data_set: Path, tmp_path
         packed_sets([other])
 
 
-def _rows_moved(one: Demonstration) -> Demonstration:
-    return replace(one, command=np.roll(one.command, 1, axis=0))
+def _rows_moved(demonstration: Demonstration) -> Demonstration:
+    return replace(demonstration, command=np.roll(demonstration.command, 1, axis=0))
 
 
-def _pictures_moved(one: Demonstration) -> Demonstration:
-    return replace(one, glimpses=np.roll(one.glimpses, 4, axis=0))
+def _pictures_moved(demonstration: Demonstration) -> Demonstration:
+    return replace(demonstration, glimpses=np.roll(demonstration.glimpses, 4, axis=0))
 
 
 @pytest.mark.parametrize(
@@ -444,7 +444,7 @@ def _each(collecting: DemoOptions) -> list[_Bursts]:
 
 
 @pytest.mark.parametrize(
-    ("asked", "words"),
+    ("options", "words"),
     [
         ({"rate_hz": 3.0}, "1, 2, 4, 5, 10, 20 pictures a second, not 3"),
         ({"noise": 1.5}, r"noise must be in \[0, 0\.9\]"),
@@ -469,10 +469,12 @@ def _each(collecting: DemoOptions) -> list[_Bursts]:
         "odd picture",
     ],
 )
-def test_invalid_options_of_a_collection_are_refused(asked: dict[str, object], words: str) -> None:
+def test_invalid_options_of_a_collection_are_refused(
+    options: dict[str, object], words: str
+) -> None:
     """An invalid rate, share of noise, waypoints or size is refused with the valid range."""
     with pytest.raises(SpecError, match=words):
-        DemoOptions(**asked)  # type: ignore[arg-type]
+        DemoOptions(**options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -529,11 +531,11 @@ def test_options_that_contradict_each_other_are_refused(
 def test_raw_demonstrations_name_the_robot_of_their_scenarios(tmp_path: Path) -> None:
     """The robot is that of the suite's scenarios, unless another one is requested."""
     way = short_way("s").driven_by("scout")
-    whole = Suite(name="ways", version="1", scenarios=(way,))
+    suite = Suite(name="ways", version="1", scenarios=(way,))
     demonstrator = Demonstrator(load_policy("orca"), DemoOptions(format="raw"), "route_point")
     for requested, robot in (("", "scout"), ("courier", "courier")):
         options = EpisodeOptions(robot=requested)
-        rounds = _Rounds(whole, tmp_path, "orca", demonstrator, options, 1, math.inf, ignore)
+        rounds = _Rounds(suite, tmp_path, "orca", demonstrator, options, 1, math.inf, ignore)
         assert rounds.robot == robot
 
 

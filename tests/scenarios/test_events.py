@@ -35,7 +35,7 @@ def event(kind: str, **fields: object) -> Event:
 
 
 def reply_to_robot(
-    one: Event,
+    planned: Event,
     tick: int,
     x_m: float,
     y_m: float = 0.0,
@@ -55,21 +55,21 @@ def reply_to_robot(
         route_s_m=x_m,
         robot_length_m=0.7,
         robot_width_m=0.55,
-        events=(one,),
+        events=(planned,),
         states=states,
     )
     return react(query)
 
 
 def drive(
-    one: Event, ticks: int, speed_mps: float, start_m: float = 0.0
+    planned: Event, ticks: int, speed_mps: float, start_m: float = 0.0
 ) -> list[tuple[float, EventState, Actor | None]]:
     """Return (robot x, state, actor) at every tick of a robot that drives along the x axis."""
     states: tuple[EventState, ...] = ()
     out = []
     for tick in range(ticks):
         x_m = start_m + speed_mps * tick * TICK_MS / 1000
-        reply = reply_to_robot(one, tick, x_m, states=states, v_mps=speed_mps)
+        reply = reply_to_robot(planned, tick, x_m, states=states, v_mps=speed_mps)
         states = reply.states
         out.append((x_m, reply.states[0], reply.actors[0] if reply.actors else None))
     return out
@@ -119,7 +119,7 @@ def test_an_obstructing_pedestrian_waits_aside_then_stands_in_the_middle_and_lea
 def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() -> None:
     """It aims ahead of the robot according to their distance, keeps its speed, and keeps its line
     within the commitment distance."""
-    one = event("frontal")
+    planned = event("frontal")
     states: tuple[EventState, ...] = ()
     headings = []
     gaps = []
@@ -128,7 +128,7 @@ def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() ->
         y_m = 0.004 * tick
         acted = bool(states) and states[0].phase == "acting"
         before = states[0].walkers[0] if states else None
-        reply = reply_to_robot(one, tick, x_m, y_m, states)
+        reply = reply_to_robot(planned, tick, x_m, y_m, states)
         states = reply.states
         now = states[0].walkers[0]
         if before is not None and acted and not now.blocked_ticks:
@@ -159,12 +159,12 @@ def test_event_pedestrians_keep_their_speed_limit_and_never_jump() -> None:
 def test_the_director_is_stateless() -> None:
     """The same query gives the same reply, and the returned states are all that the next tick
     needs."""
-    one = event("frontal")
-    first = reply_to_robot(one, 0, 32.0)
-    assert msgspec.json.encode(reply_to_robot(one, 0, 32.0)) == msgspec.json.encode(first)
-    again = reply_to_robot(one, 1, 32.1, states=first.states)
+    planned = event("frontal")
+    first = reply_to_robot(planned, 0, 32.0)
+    assert msgspec.json.encode(reply_to_robot(planned, 0, 32.0)) == msgspec.json.encode(first)
+    again = reply_to_robot(planned, 1, 32.1, states=first.states)
     restarted = reply_to_robot(
-        one,
+        planned,
         1,
         32.1,
         states=msgspec.json.decode(msgspec.json.encode(first.states), type=tuple[EventState, ...]),
@@ -183,11 +183,11 @@ def test_an_event_with_an_invalid_id_is_refused() -> None:
 def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
     """It stops at a robot that does not move, and after its patience walks round it, never inside
     its outline."""
-    one = event("frontal")
+    planned = event("frontal")
     states: tuple[EventState, ...] = ()
     gaps = []
     for tick in range(900):
-        reply = reply_to_robot(one, tick, 35.0, states=states)
+        reply = reply_to_robot(planned, tick, 35.0, states=states)
         states = reply.states
         away = np.abs([states[0].walkers[0].x_m - 35.0, states[0].walkers[0].y_m]) - (0.35, 0.275)
         gaps.append(float(np.hypot(*np.maximum(away, 0.0))) - 0.3)
@@ -199,10 +199,10 @@ def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
 def test_an_obstructing_pedestrian_does_not_step_into_the_robot() -> None:
     """When the robot already stands in the middle, the pedestrian comes near without touching
     it."""
-    one = event("obstructing")
+    planned = event("obstructing")
     states: tuple[EventState, ...] = ()
     for tick in range(200):
-        states = reply_to_robot(one, tick, 50.0, states=states).states
+        states = reply_to_robot(planned, tick, 50.0, states=states).states
         away = np.abs([states[0].walkers[0].x_m - 50.0, states[0].walkers[0].y_m]) - (0.35, 0.275)
         assert float(np.hypot(*np.maximum(away, 0.0))) - 0.3 > 0.0
     assert states[0].phase == "acting"
@@ -245,8 +245,8 @@ def test_a_lateral_pedestrian_meets_a_robot_that_keeps_its_velocity(
 ) -> None:
     """It walks evenly at a right angle to the robot's path, and without contact would meet its
     centre."""
-    one = event("lateral", side=side)
-    track = drive(one, int(60 / speed_mps * 20), speed_mps)
+    planned = event("lateral", side=side)
+    track = drive(planned, int(60 / speed_mps * 20), speed_mps)
     acting = [(x, state.walkers[0]) for x, state, _ in track if state.phase == "acting"]
     assert all(w.x_m == pytest.approx(50.0) for _, w in acting)
     _, first = acting[0]
@@ -291,8 +291,8 @@ def test_people_cross_from_both_ends_of_the_crosswalk() -> None:
 
 def test_a_gesturing_pedestrian_faces_the_robot_throughout() -> None:
     """It holds up the hand in its place, and turns with a robot that drives past."""
-    one = event("gesturing")
-    track = drive(one, 700, 0.5, start_m=39.0)
+    planned = event("gesturing")
+    track = drive(planned, 700, 0.5, start_m=39.0)
     shown = [(x, s.walkers[0], a) for x, s, a in track if s.phase == "acting"][80:]
     assert {a.doing for _, _, a in shown if a is not None} == {"stop"}
     for x, w, _ in shown:

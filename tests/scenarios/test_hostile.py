@@ -39,7 +39,7 @@ from tests.support.hostile import ANSWER_S, BEHAVIOURS, DONE, FLOOD_BYTES, FORGE
 MODULE = "hostile_policy"
 SEED = 5
 MARK = "LC_HOSTILE_MARK"
-"""A variable that the sandbox passes on."""
+"""Environment variable that the sandbox passes on."""
 _WRITES = """
 import os, stat
 for i in range(3, 1024):
@@ -60,7 +60,7 @@ environment_slot.TICK_S = {tick_s}
 from cosim.__main__ import main
 main()
 """
-"""The command line with timeouts of ticks and, short, of the end of processes."""
+"""The command line with a timeout of ticks and a short timeout of ending processes."""
 
 
 class HostileRun(NamedTuple):

@@ -202,9 +202,9 @@ class ManualWorker:
         return self.report(said=(Progress(self.scenario, 1.0, 4.5, 0),))
 
     def result(
-        self, *, of: str = "", ticks: int = 40, record: Record | None = None
+        self, *, scenario_id: str = "", ticks: int = 40, record: Record | None = None
     ) -> dict[str, object]:
-        name = of or self.scenario
+        name = scenario_id or self.scenario
         scenario = next(one for one in SUITE.scenarios if one.id == name)
         record = record or msgspec.structs.replace(
             Record.begun(scenario, DRIVER.manifest, SPEC.setup),
@@ -404,7 +404,7 @@ def test_malformed_and_foreign_messages_are_refused(tmp_path: Path) -> None:
         foreign_record = changed(
             Record.begun(scenario, DRIVER.manifest, SPEC.setup), suite_hash="another suite"
         )
-        reply = hostile.deliver(of=name, record=foreign_record)
+        reply = hostile.deliver(scenario_id=name, record=foreign_record)
         assert (
             isinstance(reply, Reply) and reply.kind == "turned_away" and "another run" in reply.why
         )

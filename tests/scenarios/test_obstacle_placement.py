@@ -203,12 +203,12 @@ def test_people_walk_round_obstacles() -> None:
     """People who walk over a place without obstacles walk round bins at that place."""
     from scenarios.episodes.wiring import crowd_of
 
-    def tracks(one: Scenario) -> dict[str, list[tuple[float, float]]]:
+    def tracks(scenario: Scenario) -> dict[str, list[tuple[float, float]]]:
         found: dict[str, list[tuple[float, float]]] = {}
         reply = EventReply(episode="t", tick=0, states=(), actors=())
-        with crowd_of(one) as crowd:
+        with crowd_of(scenario) as crowd:
             for _ in range(40):
-                people = crowd.step(RobotState(one.start_pose), reply).people
+                people = crowd.step(RobotState(scenario.start_pose), reply).people
                 for name, (x_m, y_m) in zip(people.ids, people.xy.tolist(), strict=True):
                     found.setdefault(name, []).append((x_m, y_m))
         return found

@@ -29,7 +29,7 @@ from tests.support.graphs import bundle, tiny_graph
 NO_FILE = {"ENOENT", "EACCES"}
 NO_WRITE = {"ENOENT", "EACCES", "EROFS", "EPERM"}
 OWN_FILE = {"done", None}
-"""Where the same user has made the folder: a file of that name in the sandbox's own /tmp."""
+"""If the same user has made the folder: a file of that name in the sandbox's own /tmp."""
 NO_PROCESS = {"ESRCH", "EPERM"}
 NO_SOCKET = {"EPERM"}
 DENIED = {"EPERM"}
@@ -94,8 +94,8 @@ OUTCOMES: dict[str, object] = {
     "core": 0,
     "signal all": {"done", "ESRCH"},
 }
-"""What comes of each attempt of `tests/support/sandbox_probe.py`: a value, or a set of
-those that either kind may give."""
+"""Expected result of each attempt of `tests/support/sandbox_probe.py`: a value, or the set of
+results that either kind of sandbox may give."""
 
 _FILLS = """
 from cosim.core.state import Command

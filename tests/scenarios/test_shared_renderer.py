@@ -286,15 +286,15 @@ def separate_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def same_runs(one: Path, other: Path) -> bool:
+def same_runs(first: Path, second: Path) -> bool:
     """Return whether two runs have the same hashes, and the same frames to the byte."""
     hashes = [
         {record.scenario.id: record.state_hash for record in read_records(folder)}
-        for folder in (one, other)
+        for folder in (first, second)
     ]
     frames = [
         {p.relative_to(f): p.read_bytes() for p in f.glob("episodes/*/frames/*.png")}
-        for f in (one, other)
+        for f in (first, second)
     ]
     assert len(set(hashes[0].values())) == 2 and len(frames[0]) == 4
     return hashes[0] == hashes[1] and frames[0] == frames[1]

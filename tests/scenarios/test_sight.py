@@ -70,7 +70,7 @@ def query_at(
 
 
 def drive(
-    one: Event, ticks: int, speed_mps: float, start_m: float, *crowd: NearbyPerson
+    planned: Event, ticks: int, speed_mps: float, start_m: float, *crowd: NearbyPerson
 ) -> list[tuple[float, EventReply]]:
     """Return (robot x, reply) at every tick of a robot that drives along the x axis, among people
     who walk straight ahead."""
@@ -84,7 +84,9 @@ def drive(
             )
             for c in crowd
         )
-        reply = react(query_at(tick, start_m + speed_mps * t_s, speed_mps, nearby, (one,), *states))
+        reply = react(
+            query_at(tick, start_m + speed_mps * t_s, speed_mps, nearby, (planned,), *states)
+        )
         states = reply.states
         out.append((start_m + speed_mps * t_s, reply))
     return out
@@ -92,9 +94,14 @@ def drive(
 
 def nearby_person(person: InjectedPerson) -> NearbyPerson:
     """Return a person as others of its kind see it."""
-    one = person.walker
+    walker = person.walker
     return NearbyPerson(
-        actor_id(person.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED
+        actor_id(person.injection),
+        walker.x_m,
+        walker.y_m,
+        walker.vx_mps,
+        walker.vy_mps,
+        PersonKind.INJECTED,
     )
 
 

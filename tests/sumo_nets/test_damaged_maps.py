@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 
 SAMPLE = 19
 WHOLE = 300
-"""So many damaged maps are imported: one of each kind by default, all of them with --whole."""
+"""Number of damaged maps with --whole; by default SAMPLE, one of each kind."""
 
 TOWN = """<?xml version="1.0" encoding="UTF-8"?>
 <osm version="0.6">

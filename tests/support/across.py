@@ -26,7 +26,7 @@ from scenarios.tools.verify.doctor import small_scenario
 from tests.support.namespaces import Network, network
 
 _OUTAGE_S: Final = 6.0
-"""Longer than a session's lease (2 s), so that it is lost, and shorter than a job's."""
+"""Longer than a session's lease (2 s), which expires, and shorter than a job's lease."""
 FAULTS: dict[str, Callable[[Network], None]] = {
     "link of worker one down": lambda net: net.cut("one"),
     "what worker two sends is lost": lambda net: net.lose("two", sent=True),

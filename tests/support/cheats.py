@@ -151,10 +151,10 @@ CHEATS: Mapping[str, Callable[[], Crawl]] = {
     "EarlyLeaver": EarlyLeaver,
     "Quitter": Quitter,
 }
-"""By the names that `tests.support.cheats` has them."""
+"""By their names in `tests.support.cheats`."""
 
 _SHORT_M = 2.0
-"""So far before an event's people the name reader stands."""
+"""Distance at which the name reader stands before an event's people."""
 _PACE_MPS = 1.0
 
 

@@ -47,7 +47,7 @@ from scenarios.runs.zenoh_transport import workers_of_run
 _MODULE: Final = "tests.support.coordinating"
 _POLICY: Final = f"{_MODULE}:Unseeing"
 _LOG_BYTES: Final = 30_000
-"""Of the log of a short episode."""
+"""Size of the log of a short episode."""
 _WORKERS: Final = 200
 _JOBS: Final = 3000
 

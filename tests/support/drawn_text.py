@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.text import Text
 
 _SLACK_PX = 1.0
-"""Boxes of letters are so much larger than their ink."""
+"""Margin by which boxes of letters are larger than their ink."""
 
 
 def clipped_texts(monkeypatch: pytest.MonkeyPatch, draw: Callable[[], object]) -> list[str]:

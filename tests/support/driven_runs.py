@@ -26,7 +26,7 @@ from tests.run_specs import record_of, spec_of
 
 SPEED_MPS = 1.0
 HIT = "hit"
-"""Of an episode: it ends half-way, by a collision with a wall."""
+"""Kind of episode that ends half-way by a collision with a wall."""
 
 
 def short_way(name: str, **fields: object) -> Scenario:
@@ -99,8 +99,8 @@ def episode_of(
     record = record_of(scenario, Manifest(policy, camera=None), suite_hash=suite_hash)
     if how in ("crashed", "invalid"):
         return msgspec.structs.replace(record, status=how, reason="it said so"), None
-    whole = driven(scenario, [SPEED_MPS] * 161)
-    ticks = int(np.argmax(whole.pose[:, 0] >= 8.0)) + 1 if how == "goal" else 80
+    complete_log = driven(scenario, [SPEED_MPS] * 161)
+    ticks = int(np.argmax(complete_log.pose[:, 0] >= 8.0)) + 1 if how == "goal" else 80
     log = driven(scenario, [SPEED_MPS] * ticks)
     failures = (failure_at(log, ticks - 1),) if how == HIT else ()
     ended = "goal" if how == "goal" else "failure"

@@ -23,7 +23,7 @@ from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.suites.catalog import load_suite
 
 _EACH: Final = {"unit": 4, "reactive": 2, "long-horizon": 2}
-"""Number of scenarios of each structure or event of a suite, the shortest first."""
+"""Number of scenarios of each structure or event of a suite; the shortest are taken."""
 _SEED: Final = 7
 _SHARDS = 3
 _WORKERS = 3
@@ -46,13 +46,13 @@ def thirty_scenarios() -> Suite:
     return Suite(name="thirty", version="1", scenarios=chosen)
 
 
-def _kind(one: Scenario) -> str:
-    of = {"long-horizon": one.suite, "unit": one.structure}
-    return of.get(one.suite, one.id.rpartition("-")[0])
+def _kind(scenario: Scenario) -> str:
+    of = {"long-horizon": scenario.suite, "unit": scenario.structure}
+    return of.get(scenario.suite, scenario.id.rpartition("-")[0])
 
 
-def _kind_and_length(one: Scenario) -> tuple[str, float]:
-    return _kind(one), one.route_line.length_m
+def _kind_and_length(scenario: Scenario) -> tuple[str, float]:
+    return _kind(scenario), scenario.route_line.length_m
 
 
 def _cosim(*words: str) -> subprocess.Popen[bytes]:
@@ -122,11 +122,11 @@ class _Mechanisms:
         return out
 
 
-def _at_each(times: int, done: Callable[[], int], of: int) -> Iterator[int | None]:
+def _at_each(times: int, done: Callable[[], int], total: int) -> Iterator[int | None]:
     """Yield numbers from 0 on, spread over the run, as it reaches each share; else None."""
     number = 0
     while True:
-        if number < times and done() > (number + 0.5) * of / times:
+        if number < times and done() > (number + 0.5) * total / times:
             yield number
             number += 1
         else:

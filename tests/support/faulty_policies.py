@@ -257,6 +257,6 @@ FAULTS = {
     "goal_mirrored": (YToTheRight, DrivesOtherwiseThanPlanned),
     "goal_ignored": (GoalIgnored,),
 }
-"""By the check that is to fail."""
+"""Faulty policies by the check that must fail."""
 DOUBTS = {"put_back": GoesOnAfterReset, "person": SeesNobody, "people_ignored": TracksIgnored}
-"""What may be right."""
+"""Questionable policies by the check that must warn."""

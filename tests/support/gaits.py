@@ -39,7 +39,7 @@ MANIFEST: dict[str, Any] = {
     "joints": JOINTS,
     "observation": OBSERVATION,
 }
-"""Of a dog that hardly moves its joints."""
+"""Joints of a dog gait with small movements."""
 
 
 def layers_graph(seed: int = 0, sizes: tuple[int, ...] = (45, 16, 12), scale: float = 0.1) -> bytes:

@@ -21,7 +21,7 @@ MANIFEST: Mapping[str, Any] = {
     "inputs": {"obs": PICTURE, "goal": POINT},
     "output": {"what": "waypoints", "name": "action", "index": 2},
 }
-"""Of the graph `tiny_graph`."""
+"""Manifest of the graph `tiny_graph`."""
 
 
 def port(name: str, *shape: int | str, kind: int = TensorProto.FLOAT) -> ValueInfoProto:

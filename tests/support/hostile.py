@@ -34,7 +34,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest, WaypointRule
 
 ANSWER_S = 4.0
-"""Timeout of answers and of ticks in the runs of those that hang."""
+"""Timeout of answers and of ticks in runs of hanging behaviours."""
 START_S = 12.0
 """Timeout of loading and of reset in the runs of those that hang: a slow machine loads a policy in it."""
 FLOOD_BYTES = 16 << 20
@@ -470,14 +470,14 @@ def _slower(self: Hostile, seen: Any) -> None:
     time.sleep(0.02 * self.count)
 
 
-def _calls(what: Callable[[], object]) -> Callable[[Hostile, Any], Any]:
-    return lambda self, seen: what()
+def _calls(function: Callable[[], object]) -> Callable[[Hostile, Any], Any]:
+    return lambda self, seen: function()
 
 
 DONE = "done"
-"""The episode is to the bit that of `honest`."""
+"""The episode equals that of `honest` to the bit."""
 FORGED = "forged"
-"""Not preventable in the simulator's process: the record is what the policy has made of it. Only
+"""Not preventable in the simulator's process: the policy forges its record. Only
 `--isolated` prevents it (docs/hosting.md)."""
 BLAMED = "the policy is at fault, because the simulator survives its commands without it"
 

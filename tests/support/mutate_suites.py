@@ -73,7 +73,7 @@ NUMBERS: Final = (
     50_000,
     2**32 - 1,
 )
-"""What no field may be, and the ends of the ranges of those that there are."""
+"""Invalid numbers, and the ends of the valid ranges of fields."""
 WORDS: Final = (
     "",
     "../../x",

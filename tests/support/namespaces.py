@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 _NOBODY = "02:00:00:00:00:99"
-"""An address of no network card: what is sent there arrives nowhere, and nobody is told."""
+"""An address of no network card: packets to it are lost silently."""
 
 
 class NotPermitted(Exception):

@@ -14,16 +14,16 @@ def off_edges(*labels: np.ndarray) -> np.ndarray:
     return np.logical_and.reduce([cv2.dilate(a, window) == cv2.erode(a, window) for a in labels])
 
 
-def agreement(one: Frame, other: Frame) -> tuple[float, float]:
+def agreement(first: Frame, second: Frame) -> tuple[float, float]:
     """Return the share of the pixels off edges whose labels agree, and the median difference of
     depths in metres."""
     assert (
-        one.labels is not None
-        and other.labels is not None
-        and one.depth is not None
-        and other.depth is not None
+        first.labels is not None
+        and second.labels is not None
+        and first.depth is not None
+        and second.depth is not None
     )
-    clear = off_edges(one.labels, other.labels)
-    near = clear & (one.depth < 100.0) & (other.depth < 100.0)
-    label_share = (one.labels == other.labels)[clear].mean()
-    return float(label_share), float(np.median(np.abs(one.depth - other.depth)[near]))
+    clear = off_edges(first.labels, second.labels)
+    near = clear & (first.depth < 100.0) & (second.depth < 100.0)
+    label_share = (first.labels == second.labels)[clear].mean()
+    return float(label_share), float(np.median(np.abs(first.depth - second.depth)[near]))

@@ -109,8 +109,8 @@ def _kills(process: int, number: int) -> str:
 
 
 def _vm_reads(process: int) -> str:
-    there = ctypes.create_string_buffer(struct.pack("PN", 0x400000, 8))
-    return called("process_vm_readv", process, ctypes.addressof(there), 1, 1, 1)
+    remote = ctypes.create_string_buffer(struct.pack("PN", 0x400000, 8))
+    return called("process_vm_readv", process, ctypes.addressof(remote), 1, 1, 1)
 
 
 def _descriptors(_: object) -> list[str]:

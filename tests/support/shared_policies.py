@@ -22,7 +22,7 @@ from cosim.spec.goal import ImageGoal
 from cosim.spec.manifest import Manifest
 
 NOTES = "SHARED_NOTES"
-"""In the environment: a file that is told who is asked together, and by which process."""
+"""Environment variable with the path of a file for notes: queried episodes and the process."""
 
 
 class Seeing:

@@ -100,13 +100,13 @@ def _weights(one: Any, shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
     )
     gain *= 4.0 if isinstance(one, RoutePatchInput) else 2.0
     across = np.linspace(-0.5, 0.5, sides[1])
-    whole = np.einsum("t,c,x->tcx", newer / newer.sum(), tint / tint.sum(), across / sides[1])
-    whole = np.repeat(whole[:, :, None], sides[0], axis=2) / sides[0] * gain
+    weights = np.einsum("t,c,x->tcx", newer / newer.sum(), tint / tint.sum(), across / sides[1])
+    weights = np.repeat(weights[:, :, None], sides[0], axis=2) / sides[0] * gain
     order = {"N": 1, "T": one.frames, "C": channels, "H": sides[0], "W": sides[1]}
     letters = "".join(axes_of(one.layout))
     missing = [letter for letter in "TCHW" if letter not in letters]
     laid = np.einsum(
-        f"TCHW->{''.join(letter for letter in letters if letter != 'N')}{''.join(missing)}", whole
+        f"TCHW->{''.join(letter for letter in letters if letter != 'N')}{''.join(missing)}", weights
     )
     assert all(order[letter] == 1 for letter in missing)
     return laid.reshape(shape)

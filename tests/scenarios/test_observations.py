@@ -82,10 +82,10 @@ def test_an_observation_holds_no_secret_and_a_goal_picture_has_no_people(
         z_m, _, _ = episode._open.engines.world.surface.lean(place, seen.robot.drive.span_m)  # type: ignore[attr-defined]
         robot = RobotState(place, z_m=z_m)
         ahead = place.xy + 3.0 * np.array([np.cos(place.heading_rad), np.sin(place.heading_rad)])
-        somebody = People.of(("a",), [ahead], [0.0], [0.0], ("stand",))
+        person = People.of(("a",), [ahead], [0.0], [0.0], ("stand",))
         empty, met = (
             camera.render(robot, Street(0, people)).rgb
-            for people in (People.of((), [], [], [], ()), somebody)
+            for people in (People.of((), [], [], [], ()), person)
         )
     assert isinstance(first.goal, ImageGoal) and np.array_equal(first.goal.rgb, empty)
     assert (first.goal.rgb != met).any(axis=-1).mean() > 0.02
@@ -177,7 +177,9 @@ def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
     assert len(rows) > 50 and abs(z_m) < 1.0
     assert np.abs(np.median(points[2])) < 0.03 and np.percentile(np.abs(points[2]), 90) < 0.06
     cos, sin = np.cos(robot.pose.heading_rad), np.sin(robot.pose.heading_rad)
-    there = points[:2].T @ [[cos, sin], [-sin, cos]] + robot.pose.xy
-    drawn = way_in_picture(shot, SPEC.lens, np.column_stack([there, surface.heights(there)])).points
+    ground_points = points[:2].T @ [[cos, sin], [-sin, cos]] + robot.pose.xy
+    drawn = way_in_picture(
+        shot, SPEC.lens, np.column_stack([ground_points, surface.heights(ground_points)])
+    ).points
     off_px = np.hypot(*(drawn - np.column_stack([columns, rows]) - 0.5).T)
     assert np.median(off_px) < 0.3 and np.percentile(off_px, 90) < 1.0
