@@ -273,8 +273,8 @@ def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
 
 
 def test_the_results_of_the_readme_are_those_of_the_baselines() -> None:
-    """Each figure with an interval of twelve policies is in a row of the same policy on the page of
-    all results, or in the row of D below it."""
+    """Each figure with an interval is in a row of the same policy on the page of all results. It
+    may be in the row of D below it."""
     rows = [
         line.strip("| ").split(" | ")
         for line in text_of("README.md").splitlines()

@@ -66,7 +66,7 @@ def test_layers_equal_single_cameras(
     worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool, staged: bool
 ) -> None:
     """Pictures that are drawn as layers of a texture equal those of single cameras, also when
-    staged as on a graphics card, and do not change when later ones are drawn."""
+    staged as on a graphics card. Later drawings do not change them."""
     from physics.cameras.gl import atlas as module
     from physics.cameras.gl.atlas import Atlas
     from physics.cameras.gl.readback import Readback

@@ -63,8 +63,8 @@ SUN = ScanSun(azimuth_deg=90.0, elevation_deg=45.0)
 
 
 def test_splats_agree_with_a_reference_in_float64() -> None:
-    """Over blobs, needles, huge, transparent and opaque splats, and some behind the eye, 99.9 % of
-    pixels agree within 1/255 and 99 % of the depths within 1 mm."""
+    """99.9 % of pixels agree within 1/255, and 99 % of the depths within 1 mm. Splats are blobs,
+    needles, huge, transparent, opaque, or behind the eye."""
     near, same_m = [], []
     for seed in range(4):
         splats = random_splats(seed)
@@ -287,8 +287,8 @@ def _shares(x_m: float) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("x_m", [1.0, 4.0, WALL_X_M - 0.4, WALL_X_M + 1.5])
 def test_splats_cover_people_where_the_mesh_does(x_m: float) -> None:
-    """In front of and behind a wall, 95 % of their visible pixels are shown, also of the lowest 0.3
-    m, and 95 % of the hidden ones are not."""
+    """95 % of the visible pixels of people in front of and behind a wall are shown, also of the
+    lowest 0.3 m. 95 % of the hidden ones are not."""
     assert min(_shares(x_m)) >= 0.95
 
 

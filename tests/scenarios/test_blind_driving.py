@@ -115,8 +115,8 @@ def drive(
 def test_a_blind_robot_at_any_constant_speed_meets_people_of_every_event(
     kind: str, v_mps: float
 ) -> None:
-    """On sidewalks of three widths, with few and many people, from either side, with slow and fast
-    people, the robot is touched after the trigger or passes between two people of a group."""
+    """It is touched after the trigger, or passes between two people of a group. Sidewalks, numbers,
+    sides and speeds of people vary."""
     for people in PEOPLE.get(kind, (1,)):
         for half_m in (1.45, 1.9, 2.9):
             half_width_m = HALF_WIDTHS_M.get(kind, {}).get(people, half_m)
@@ -261,7 +261,7 @@ def test_a_robot_that_drives_on_after_a_distant_stop_is_approached_again() -> No
 @pytest.mark.parametrize("v_mps", [0.3, 0.8, 1.4, 2.0])
 def test_a_robot_that_does_not_give_way_is_hit_within_the_window_of_the_rule(v_mps: float) -> None:
     """At up to 2 m/s and any offset, a robot that drives straight on hits the person who cuts in
-    where the rule of the event requires it to give way."""
+    before the window ends."""
     kind = EVENT_KINDS["overtaking"]
     for half_m, side, left_m, speed_mps in itertools.product(
         (1.45, 2.9), (-1, 1), (-0.9, 0.0, 0.9), (1.1, 1.65)

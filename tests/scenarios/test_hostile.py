@@ -250,8 +250,8 @@ def test_the_table_has_59_behaviours() -> None:
 
 @pytest.mark.engine
 def test_a_run_of_hostile_policies_ends_in_order(hosting: str, hosting_runs: HostingRuns) -> None:
-    """The run has a row for every episode, the right exit code, no traceback, small logs with the
-    begin and the end of floods, and leaves no process."""
+    """The run has a row for every episode, the right exit code and no traceback, and leaves no
+    process. Its logs are small, with begin and end of floods."""
     for run in hosting_runs.all:
         crashed = [one for one in run.records.values() if one.status == "crashed"]
         assert run.output.returncode == bool(crashed) and "Traceback" not in run.output.stderr, (

@@ -86,8 +86,8 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[
 def test_a_run_on_ray_equals_that_of_one_process_when_a_node_dies(
     tmp_path: Path, nodes: tuple[Any, list[Any], Path], cosim: Cosim
 ) -> None:
-    """A policy that only this machine has is sent to the nodes, the lost episode of a killed node
-    is run again, and the tables are equal to the byte. Nodes with other versions are refused."""
+    """The lost episode of a killed node is run again, and the tables are equal to the byte. The
+    policy is on this machine alone; nodes with other versions are refused."""
     cluster, (first, _), go = nodes
     (tmp_path / "only_here.py").write_text(POLICY)
     one = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)

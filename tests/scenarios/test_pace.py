@@ -62,8 +62,8 @@ def estimate_of(
 
 
 def test_an_estimate_covers_the_measured_time_of_the_same_policy() -> None:
-    """12 episodes of 4.8 km at 0.125 s a metre and 4 s each take 653 s, which lies in a span of
-    less than a factor of three."""
+    """12 episodes of 4.8 km at 0.125 s a metre and 4 s each take 653 s. This lies in a span of less
+    than a factor of three."""
     true_s = 12 * 4.0 + 0.125 * sum(s.route_line.length_m for s in long_ways()[:12])
     found = estimate_of(episodes(5))
     assert found.low_s < true_s < found.high_s and found.high_s < 3.0 * found.low_s

@@ -220,8 +220,8 @@ def test_no_path_crosses_a_fence() -> None:
 
 
 def test_residents_face_their_activity_and_leave_the_middle_free() -> None:
-    """A resident sits with its back to a bench, looks into a window and waits facing a road, and
-    leaves 0.6 m on both sides of the middle of the sidewalk free."""
+    """Residents sit with the back to a bench, look into a window, and wait facing a road. They
+    leave 0.6 m on both sides of the sidewalk's middle free."""
     seen = set()
     for one in towns():
         area = LineString(one.route).buffer(90.0)

@@ -64,7 +64,7 @@ def capacities(corridors: dict[float, StreetMap]) -> dict[float, Capacity]:
 
 def test_a_wider_corridor_never_has_fewer_places(capacities: dict[float, Capacity]) -> None:
     """The number of places of each event and of straight ways grows with the width, in spite of
-    slight bends and of obstacles that only wide corridors contain."""
+    bends and of obstacles in wide corridors."""
     for name in (*EVENT_KINDS, "straight"):
         counts = [
             {**capacity.events, **capacity.structures}[name].found

@@ -176,8 +176,8 @@ class Mine:
 
 @pytest.mark.engine
 def test_an_isolated_policy_gets_the_same_readings(tmp_path: Path, cosim: Cosim) -> None:
-    """A policy that drives by scan, tracks and inertial readings reaches the same state hash here
-    and in a sandbox, and its row has its sensors and track."""
+    """A policy that drives by its sensors reaches the same state hash here and in a sandbox, and
+    its row has its sensors and track."""
     scenario = msgspec.structs.replace(crowded(), time_limit_s=3.0)
     write_suite(Suite(name="brief", version="1", scenarios=(scenario,)), tmp_path / "brief.json")
     (tmp_path / "mine.py").write_text(MINE)

@@ -39,7 +39,7 @@ MANIFEST: dict[str, Any] = {
     "joints": JOINTS,
     "observation": OBSERVATION,
 }
-"""Joints of a dog gait with small movements."""
+"""Manifest of a gait of the dog with small movements."""
 
 
 def layers_graph(seed: int = 0, sizes: tuple[int, ...] = (45, 16, 12), scale: float = 0.1) -> bytes:
