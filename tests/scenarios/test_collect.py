@@ -67,7 +67,7 @@ ASKED = (
 )
 
 
-class Desk(NamedTuple):
+class Collection(NamedTuple):
     """A folder with ways.json and three demonstrations collected from it. ways: 3 to 4 m straight
     ahead; the second of the four has too little time."""
 
@@ -79,13 +79,13 @@ class Desk(NamedTuple):
     def solved(self) -> tuple[Scenario, ...]:
         return self.ways[0], *self.ways[2:]
 
-    def kept(self, way: Scenario) -> Path:
+    def episode_folder(self, way: Scenario) -> Path:
         (folder,) = self.folder.glob(f"demos/runs/*/episodes/{way.id}")
         return folder
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Desk:
+def collection(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Collection:
     """Return a collection that two processes began, that was killed after one episode, and that one
     process resumed."""
     folder = tmp_path_factory.mktemp("desk")
@@ -113,14 +113,14 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Desk:
     assert not (folder / "demos/meta").exists()
     result = cosim(*ASKED, "--resume", cwd=folder)
     assert result.returncode == 0, result.stderr
-    return Desk(folder, ways, result.stdout)
+    return Collection(folder, ways, result.stdout)
 
 
 @pytest.fixture(scope="module")
-def packed(desk: Desk, cosim: Cosim) -> Packed:
-    result = cosim("dataset", "pack", "demos", "-o", "demos.npz", cwd=desk.folder)
+def packed(collection: Collection, cosim: Cosim) -> Packed:
+    result = cosim("dataset", "pack", "demos", "-o", "demos.npz", cwd=collection.folder)
     assert result.returncode == 0, result.stderr
-    return read_packed(desk.folder / "demos.npz")
+    return read_packed(collection.folder / "demos.npz")
 
 
 def demonstration_here(
@@ -139,35 +139,39 @@ def demonstration_here(
     )
 
 
-def test_a_resumed_collection_equals_that_of_one_process(desk: Desk, packed: Packed) -> None:
+def test_a_resumed_collection_equals_that_of_one_process(
+    collection: Collection, packed: Packed
+) -> None:
     """Each demonstration has the bytes of one that is driven here, and the data set has its rows in
     the order of the suite. Unsolved scenarios are reported and left out, and a further scenario
     replaces each."""
-    shown = [demonstration_here(way, load_policy("orca")) for way in desk.solved]
-    kept = [(desk.kept(way) / DEMONSTRATION).read_bytes() for way in desk.solved]
+    shown = [demonstration_here(way, load_policy("orca")) for way in collection.solved]
+    kept = [
+        (collection.episode_folder(way) / DEMONSTRATION).read_bytes() for way in collection.solved
+    ]
     assert not [
         way.id
-        for way, file, one in zip(desk.solved, kept, shown, strict=True)
+        for way, file, one in zip(collection.solved, kept, shown, strict=True)
         if file != one.encoded()
     ]
     for name in ("state", "goal", "command", "waypoints", "driven", "disturbed"):
         np.testing.assert_array_equal(
             getattr(packed, name), np.concatenate([getattr(one, name) for one in shown])
         )
-    assert packed.meta["scenarios"] == [way.id for way in desk.solved]
-    assert "(3 episodes, " in desk.output
-    assert "Dropped 1 that were not solved: ended by timeout: 1" in desk.output
-    assert not (desk.kept(desk.ways[1]) / DEMONSTRATION).exists()
+    assert packed.meta["scenarios"] == [way.id for way in collection.solved]
+    assert "(3 episodes, " in collection.output
+    assert "Dropped 1 that were not solved: ended by timeout: 1" in collection.output
+    assert not (collection.episode_folder(collection.ways[1]) / DEMONSTRATION).exists()
 
 
 def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
-    desk: Desk, packed: Packed
+    collection: Collection, packed: Packed
 ) -> None:
     """Row k of an episode is of tick 4 k: its speeds are those of the trajectory, its command is
     the driven one unless it was disturbed, and its next waypoint is the position 4 ticks later."""
     assert packed.disturbed.any()
-    for number, way in enumerate(desk.solved):
-        log = Log.load(desk.kept(way) / "trajectory.npz")
+    for number, way in enumerate(collection.solved):
+        log = Log.load(collection.episode_folder(way) / "trajectory.npz")
         rows = packed.episode == number
         speed, pose = (
             np.vstack([first, all_]) for first, all_ in (((0, 0), log.speed), (way.start, log.pose))
@@ -219,22 +223,26 @@ def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
     ],
 )
 def test_a_folder_with_another_data_set_is_refused(
-    desk: Desk, cosim: Cosim, more: tuple[str, ...], words: str
+    collection: Collection, cosim: Cosim, more: tuple[str, ...], words: str
 ) -> None:
     """Other settings, a used folder and contradictory options are refused in one line, and no file
     changes."""
-    before = sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
-    result = cosim(*ASKED, *more, cwd=desk.folder)
+    before = sorted((path, path.stat().st_mtime_ns) for path in collection.folder.rglob("*"))
+    result = cosim(*ASKED, *more, cwd=collection.folder)
     assert result.returncode == 2
     assert words in result.stderr
     assert "Traceback" not in result.stderr
-    assert before == sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
+    assert before == sorted(
+        (path, path.stat().st_mtime_ns) for path in collection.folder.rglob("*")
+    )
 
 
-def test_recorded_sensors_are_columns_of_the_data_set(desk: Desk, packed: Packed) -> None:
+def test_recorded_sensors_are_columns_of_the_data_set(
+    collection: Collection, packed: Packed
+) -> None:
     """Each row has the lidar's distances (its range without a return), the inertial reading and 32
     people, and so have packed rows."""
-    held = read_data_set(desk.folder / "demos")
+    held = read_data_set(collection.folder / "demos")
     scans, readings = held.rows["observation.scan"], held.rows["observation.imu"]
     assert scans.shape == (len(held), 60) and scans.min() > 0.0 and scans.max() == 20.0
     assert readings.shape == (len(held), 6) and abs(readings[:, 5].mean() - 9.81) < 0.2
@@ -244,10 +252,10 @@ def test_recorded_sensors_are_columns_of_the_data_set(desk: Desk, packed: Packed
     assert packed.people.shape == (len(held), 32, 5)
 
 
-def test_an_incomplete_data_set_is_written_again(desk: Desk, cosim: Cosim) -> None:
+def test_an_incomplete_data_set_is_written_again(collection: Collection, cosim: Cosim) -> None:
     """Without meta/ a data set is incomplete: --resume drives nothing again and writes the same
     bytes."""
-    made = desk.folder / "demos"
+    made = collection.folder / "demos"
     files_written = [
         path
         for name in ("meta", "data", "videos")
@@ -258,7 +266,7 @@ def test_an_incomplete_data_set_is_written_again(desk: Desk, cosim: Cosim) -> No
     shutil.rmtree(made / "meta")
     (made / "writing").mkdir()
     (made / "writing/half").write_bytes(b"")
-    result = cosim(*ASKED, "--resume", cwd=desk.folder)
+    result = cosim(*ASKED, "--resume", cwd=collection.folder)
     assert result.returncode == 0, result.stderr
     assert "done, " not in result.stderr
     assert files == {path: path.read_bytes() for path in files}
@@ -297,12 +305,12 @@ class SeeingExpert:
         return Command(1.4, 0.0)
 
 
-def test_an_expert_that_sees_keeps_its_own_camera(desk: Desk) -> None:
+def test_an_expert_that_sees_keeps_its_own_camera(collection: Collection) -> None:
     """The expert gets pictures of its own size, and the data set has those of the collecting
     camera."""
     expert = SeeingExpert()
     kept = DemoOptions(camera=CameraSpec(width=64, height=48), rate_hz=4.0, unsolved=True)
-    shown = demonstration_here(desk.ways[0], PolicyCaller.of(expert), kept)
+    shown = demonstration_here(collection.ways[0], PolicyCaller.of(expert), kept)
     assert set(expert.shapes) == {(32, 32, 3)}
     assert len(expert.shapes) == len(shown) > 5
     assert shown.colours.sum() == len(shown) * 64 * 48 * 3
@@ -337,13 +345,13 @@ class Learner(StandingExpert):
         return Command(0.7, 0.1)
 
 
-def test_a_learner_drives_and_the_expert_labels_each_row(desk: Desk) -> None:
+def test_a_learner_drives_and_the_expert_labels_each_row(collection: Collection) -> None:
     """The expert is queried at every picture, and the learner drives its share of the time in
     stretches of seconds. The same seed gives the same bytes."""
     kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), noise=0.6, learner="learner", unsolved=True
     )
-    way = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0)
+    way = msgspec.structs.replace(collection.ways[0], time_limit_s=20.0)
     learner = Learner()
     shown = demonstration_here(way, PolicyCaller.of(StandingExpert()), kept, learner)
     assert learner.asked == sorted(set(learner.asked)) and len(learner.asked) == len(shown) > 20
@@ -362,12 +370,14 @@ def test_a_learner_drives_and_the_expert_labels_each_row(desk: Desk) -> None:
     )
 
 
-def test_an_exploring_learner_drives_alone_and_its_commands_have_rewards(desk: Desk) -> None:
+def test_an_exploring_learner_drives_alone_and_its_commands_have_rewards(
+    collection: Collection,
+) -> None:
     """Rows have the driven commands; rewards cover its progress, the time and its end."""
     kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), explore=0.3, learner="learner", unsolved=True
     )
-    way = msgspec.structs.replace(desk.ways[0], time_limit_s=6.0)
+    way = msgspec.structs.replace(collection.ways[0], time_limit_s=6.0)
     demonstrator = Demonstrator(
         PolicyCaller.of(StandingExpert()), kept, "route_point", PolicyCaller.of(Learner())
     )
@@ -412,11 +422,11 @@ class Dies(Learner):
 
 
 def test_a_learner_drives_the_same_in_every_process(
-    desk: Desk, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+    collection: Collection, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two processes with a user's learner write the bytes of one process. The data set names the
     learner, and is not resumed with another one or with an edited one."""
-    (desk.folder / "beside.py").write_text(BESIDE)
+    (collection.folder / "beside.py").write_text(BESIDE)
     some = ("--scenario", "way-0", "--scenario", "way-2")
     asked = (
         "collect",
@@ -430,29 +440,29 @@ def test_a_learner_drives_the_same_in_every_process(
         "--out",
         "taught",
     )
-    result = cosim(*asked, "--learner", "beside:Learner", "--jobs", "2", cwd=desk.folder)
+    result = cosim(*asked, "--learner", "beside:Learner", "--jobs", "2", cwd=collection.folder)
     assert result.returncode == 0, result.stderr
-    monkeypatch.syspath_prepend(desk.folder)
+    monkeypatch.syspath_prepend(collection.folder)
     learner = load_policy("beside:Learner")
     kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), noise=0.6, learner="beside:Learner", unsolved=True
     )
-    for way in (desk.ways[0], desk.ways[2]):
+    for way in (collection.ways[0], collection.ways[2]):
         shown = demonstration_here(way, load_policy("orca"), kept, learner)
         assert shown.disturbed.any()
         assert (
-            desk.folder / f"taught/runs/00/episodes/{way.id}" / DEMONSTRATION
+            collection.folder / f"taught/runs/00/episodes/{way.id}" / DEMONSTRATION
         ).read_bytes() == shown.encoded()
-    about = json.loads((desk.folder / "taught/meta/cosim.json").read_bytes())
+    about = json.loads((collection.folder / "taught/meta/cosim.json").read_bytes())
     assert (about["learner"], about["learner_source"]) == ("learner", learner.source_hash)
 
-    result = cosim(*asked, "--learner", "beside:Another", "--resume", cwd=desk.folder)
+    result = cosim(*asked, "--learner", "beside:Another", "--resume", cwd=collection.folder)
     assert (
         result.returncode == 2
         and "its learner is beside:Learner, and this command has beside:Another" in result.stderr
     )
-    (desk.folder / "beside.py").write_text(BESIDE.replace("0.7", "0.6"))
-    result = cosim(*asked, "--learner", "beside:Learner", "--resume", cwd=desk.folder)
+    (collection.folder / "beside.py").write_text(BESIDE.replace("0.7", "0.6"))
+    result = cosim(*asked, "--learner", "beside:Learner", "--resume", cwd=collection.folder)
     assert (
         result.returncode == 2 and "is of another data set: its learner_source is" in result.stderr
     )
@@ -495,13 +505,13 @@ def test_a_learner_with_another_camera_is_refused() -> None:
         msgspec.structs.replace(asked, noise=0.0)
 
 
-def test_the_lerobot_package_reads_a_data_set(desk: Desk, packed: Packed) -> None:
+def test_the_lerobot_package_reads_a_data_set(collection: Collection, packed: Packed) -> None:
     """The package's LeRobotDataset has the rows and pictures that are packed. Skipped where lerobot
     is not installed."""
     datasets = pytest.importorskip(
         "lerobot.datasets.lerobot_dataset", reason="lerobot is not installed"
     )
-    read = datasets.LeRobotDataset("cosim/demos", root=desk.folder / "demos")
+    read = datasets.LeRobotDataset("cosim/demos", root=collection.folder / "demos")
     assert len(read) == len(packed)
     for row, one in ((row, read[row]) for row in range(len(read))):
         np.testing.assert_array_equal(one["action"].numpy(), packed.command[row])

@@ -91,7 +91,7 @@ class HostingRuns(NamedTuple):
     def all(self) -> list[HostileRun]:
         return [run for run in self if run is not None]
 
-    def of(self, name: str) -> HostileRun:
+    def run_with(self, name: str) -> HostileRun:
         """Return the run of a behaviour."""
         return next(run for run in self.all if name in run.names)
 
@@ -215,7 +215,7 @@ def test_each_behaviour_has_its_outcome(hosting: str, hosting_runs: HostingRuns,
     """Each episode either crashes with the expected reason or equals that of an honest policy to
     the bit."""
     behaviour = BEHAVIOURS[name]
-    run = hosting_runs.of(name)
+    run = hosting_runs.run_with(name)
     record = run.records[name]
     expected = behaviour.in_process if hosting == "in-process" else behaviour.isolated
     if expected == FORGED:

@@ -44,7 +44,7 @@ replace = msgspec.structs.replace
 
 
 @cache
-def drawn(kind: str, seed: int = 0) -> Scenario:
+def reactive_scenario(kind: str, seed: int = 0) -> Scenario:
     """Return a scenario of a kind with the wanted length, position and sides."""
     _, street_map = place(SMALL)
     graph = WalkGraph(street_map)
@@ -56,7 +56,7 @@ def test_a_reactive_scenario_is_as_wanted_and_no_straight_lane_is_free(kind: str
     """Length, position and sides are those of its slot; 2 to 4 obstacles block nine lanes, leave
     the gap, and are clear of start and goal."""
     _, street_map = place(SMALL)
-    scenario = drawn(kind)
+    scenario = reactive_scenario(kind)
     (event,) = scenario.events
     assert scenario.route_line.length_m == pytest.approx(WANTED.length_m, abs=0.01)
     assert event_share(scenario, EVENT_KINDS[kind]) == pytest.approx(WANTED.share, abs=0.03)
@@ -75,7 +75,7 @@ def test_a_reactive_scenario_is_as_wanted_and_no_straight_lane_is_free(kind: str
 def test_a_free_lane_is_found() -> None:
     """A lane is free without one of the obstacles."""
     _, street_map = place(SMALL)
-    scenario = drawn("lateral")
+    scenario = reactive_scenario("lateral")
     fewer = replace(scenario, obstacles=scenario.obstacles[:1])
     (words,) = straight_lanes(fewer, street_map)
     assert "straight lanes are free" in words
@@ -85,7 +85,7 @@ def test_a_free_lane_is_found() -> None:
 def test_a_path_that_solves_event_and_decoy_is_found() -> None:
     """Without the fences of the gate one path passes the people on both sides."""
     _, street_map = place(SMALL)
-    found = [drawn("obstructing", seed) for seed in range(4)]
+    found = [reactive_scenario("obstructing", seed) for seed in range(4)]
     scenario = next(s for s in found if any(one.kind == "fence" for one in s.obstacles))
     assert list(common_ways(scenario, street_map)) == []
     (event,) = scenario.events
@@ -120,7 +120,7 @@ def test_fences_close_a_sidewalk_to_the_gate(sidewalk_half_m: float) -> None:
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_a_decoy_equals_its_scenario_but_for_the_response(kind: str) -> None:
     """A decoy ends at the goal, and its free side is the other one or its people do not act."""
-    scenario = drawn(kind)
+    scenario = reactive_scenario(kind)
     decoy = decoy_of(scenario)
     (event,), (other,) = scenario.events, decoy.events
     mirrored = EVENT_KINDS[kind].decoy is None
@@ -133,7 +133,7 @@ def test_a_decoy_equals_its_scenario_but_for_the_response(kind: str) -> None:
 
 def test_a_decoy_with_a_person_inside_an_obstacle_is_refused() -> None:
     """It is refused before the expert drives, and the claim finds the person in the decoy alone."""
-    event = drawn("ped_crossing")
+    event = reactive_scenario("ped_crossing")
     decoy = decoy_of(event)
     ((x_m, y_m),) = EVENT_KINDS["ped_crossing"].stays_of(decoy.events[0], 0)
     thing = Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)
@@ -149,11 +149,11 @@ def test_a_decoy_with_a_person_inside_an_obstacle_is_refused() -> None:
 def test_limits_follow_from_the_experts_time_and_the_robots_speed() -> None:
     """Limits are 1.5 times and 3 s for events and 1.3 times for decoys, in whole ticks. A faster
     robot has less time, and a long route keeps its limit."""
-    scenario, decoy = drawn("lateral"), decoy_of(drawn("lateral"))
+    scenario, decoy = reactive_scenario("lateral"), decoy_of(reactive_scenario("lateral"))
     assert limited(scenario, 10.01, None).time_limit_s == 18.05
     quick = limited(decoy, 10.0, 1.25)
     assert (quick.time_limit_s, quick.go_on_mps) == (16.0, 0.75)
-    assert limited(decoy_of(drawn("queueing")), 10.0, 1.25).go_on_mps == 0.0
+    assert limited(decoy_of(reactive_scenario("queueing")), 10.0, 1.25).go_on_mps == 0.0
     faster = SCOUT.cruise_mps / COURIER.cruise_mps
     scout = quick.driven_by("scout")
     assert (scout.time_limit_s, scout.go_on_mps) == (12.0, 0.75 * faster)

@@ -117,7 +117,7 @@ class MastCamera:
 EVERY = pytest.mark.parametrize("robot", [*ROBOTS.values(), BARROW], ids=[*ROBOTS, "barrow"])
 
 
-def seen(
+def observation_on_route(
     robot: Robot, others: People = NO_PEOPLE, heading_rad: float = 0.0, v_mps: float = 0.0
 ) -> Observation:
     """Return an observation of a robot on a straight route along the x axis; the walkway is free
@@ -161,10 +161,12 @@ def test_policies_use_the_pace_and_turning_rate_of_their_robot(robot: Robot) -> 
     for name, share in paces.items():
         policy = POLICIES[name]()
         policy.reset("t", 0)
-        command = command_of(policy.act(seen(robot)), rule=WaypointRule(), robot=robot)
+        command = command_of(
+            policy.act(observation_on_route(robot)), rule=WaypointRule(), robot=robot
+        )
         assert command.v_mps == pytest.approx(share * robot.cruise_mps, rel=1e-3), name
         policy.reset("t", 0)
-        turned = policy.act(seen(robot, heading_rad=-1.0))
+        turned = policy.act(observation_on_route(robot, heading_rad=-1.0))
         assert isinstance(turned, Command) and (
             name == "straight" or turned.w_radps == robot.w_max_radps
         ), name
@@ -175,7 +177,7 @@ def test_larger_robots_keep_larger_distances() -> None:
     people and red signals."""
     for small, large in itertools.pairwise((SCOUT, COURIER, BARROW)):
         beside = standing(8.0, 0.62 + BodyDisks.of(small).radius_m)
-        known = seen(small, beside).privileged
+        known = observation_on_route(small, beside).privileged
         assert known is not None
         here = PathState(
             SampledPath(known.route), known.route_s_m, DistanceField(known.free, known.route)

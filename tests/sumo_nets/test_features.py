@@ -101,7 +101,7 @@ class Drawing:
         path.write_text('<osm version="0.6">\n' + "\n".join(rows) + "\n</osm>\n", encoding="utf-8")
         return path
 
-    def found(self, path: Path) -> tuple[list[MappedFeature], Counter[str]]:
+    def read_features(self, path: Path) -> tuple[list[MappedFeature], Counter[str]]:
         self.write(path)
         found = osm_features(MapFile(path, path, "osm", ""))
         return list(found.things), Counter(found.skipped)
@@ -330,7 +330,7 @@ def test_land_use_is_read_from_osm_tags(tmp_path: Path) -> None:
     drawing.way([a, 99_999, b, a], {"leisure": "park"})
     drawing.way([a, c, b, d], {"leisure": "park"})
     drawing.relation([(99_998, "outer")], {"type": "multipolygon", "natural": "wood"})
-    things, skipped = drawing.found(tmp_path / "land.osm")
+    things, skipped = drawing.read_features(tmp_path / "land.osm")
     lands = [thing for thing in things if thing.kind in LAND_KINDS]
     assert [thing.kind for thing in lands] == ["lawn", "soil", "yard", "yard", "water", "planting"]
     assert len(lands[-1].rings) == 2
@@ -487,7 +487,7 @@ def test_invalid_building_outlines_are_dropped_and_counted(tmp_path: Path) -> No
     drawing.relation(
         [(half, "outer"), (99_999, "outer")], {"type": "multipolygon", "building": "yes"}
     )
-    things, skipped = drawing.found(tmp_path / "broken.osm")
+    things, skipped = drawing.read_features(tmp_path / "broken.osm")
     assert [thing.kind for thing in things] == ["building"]
     assert skipped == {
         "buildings whose outline crosses itself": 1,

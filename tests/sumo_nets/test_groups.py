@@ -56,7 +56,7 @@ class FakeSumo:
             getShape=lambda lane: LINE.tolist(), getLength=lambda lane: 50.0
         )
 
-    def seen(self) -> dict[str, Any]:
+    def positions(self) -> dict[str, Any]:
         return {name: Spot(x, y) for name, (_, x, y) in self.at.items()}
 
     def advance(self, distance_m: float) -> None:
@@ -68,7 +68,7 @@ def given_speeds(walkers: FakeSumo, updates: int = 2) -> dict[str, float]:
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)
     cohesion.form(tuple(walkers.at), 1.3, ("s",))
     for _ in range(updates):
-        cohesion.update(walkers.seen())
+        cohesion.update(walkers.positions())
         walkers.advance(0.65)
     return walkers.told
 
@@ -141,11 +141,11 @@ def test_a_member_far_ahead_waits() -> None:
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)
     cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(2):
-        cohesion.update(walkers.seen())
+        cohesion.update(walkers.positions())
         walkers.advance(0.65)
     assert walkers.told["c0"] == 0.0 and walkers.told["c1"] > 1.3
     walkers.at["c1"] = ("s", walkers.at["c0"][1] - 1.0, 0.64)
-    cohesion.update(walkers.seen())
+    cohesion.update(walkers.positions())
     assert walkers.told["c0"] > 1.0
 
     parted = FakeSumo(c0=("t", 11.0, 0.0), c1=("s", 10.0, 0.64))
@@ -153,7 +153,7 @@ def test_a_member_far_ahead_waits() -> None:
     cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(6):
         parted.at["c0"] = ("t", parted.at["c0"][1] + 0.65, 0.0)
-        cohesion.update(parted.seen())
+        cohesion.update(parted.positions())
     assert parted.told["c0"] == 0.0 and parted.told["c1"] > 1.3
 
 
@@ -167,7 +167,7 @@ def test_a_member_walking_aside_steps_nearer_unless_blocked() -> None:
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)
     cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(3):
-        cohesion.update({**walkers.seen(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
+        cohesion.update({**walkers.positions(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
         walkers.advance(0.65)
     assert [y for _, _, y in walkers.at.values()] == [0.0, 1.92]
 
@@ -180,7 +180,7 @@ def test_members_who_leave_are_removed() -> None:
     cohesion.form(("c0", "c1", "c2"), 1.3, ("s",))
     cohesion.form(("c3", "c4"), 1.2, ("s",))
     for _ in range(2):
-        cohesion.update(walkers.seen())
+        cohesion.update(walkers.positions())
         walkers.advance(0.65)
     assert walkers.told["c0"] < 1.3
     cohesion.remove_absent(["c0", "c1"])
