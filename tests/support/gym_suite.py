@@ -81,19 +81,19 @@ def _differences(envs: AsyncVectorEnv) -> list[int]:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    asked = sys.argv[1]
-    count = COUNT if sys.argv[1] == "alike" else 2
+    mode = sys.argv[1]
+    count = COUNT if mode == "differences" else 2
     multiprocessing.set_forkserver_preload(
         ["tests.support.gym_suite", "scenarios.episodes.episode"]
     )
     envs = AsyncVectorEnv([partial(one_env)] * count, context="forkserver")
     try:
-        if asked == "alike":
+        if mode == "differences":
             print(_differences(envs))
         else:
             envs.reset(seed=1)
             print(*(process.pid for process in envs.processes), flush=True)
-            if asked == "killed":
+            if mode == "killed":
                 sys.stdin.read()
             envs.step(np.float32([[1.0, 0.0], [np.nan, 0.0]]))
     except cosim.CosimError as error:
