@@ -1,5 +1,4 @@
-"""What all tests share: how long anything is waited for, which examples are drawn, places, and the
-command line."""
+"""Shared parts of all tests: waiting, example generation, places, and the command line."""
 
 from __future__ import annotations
 
@@ -31,11 +30,11 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 PATIENCE_S = 600.0
-"""How long a test waits for what must happen: far beyond what a slow and busy machine needs. A test
-never waits for it to be over, so that it costs nothing where all is well."""
+"""Longest time that a test waits for a condition, far beyond what a slow and busy machine needs. A
+test never waits for it to pass, so it costs nothing if the test passes."""
 
 WIDE = {"COLUMNS": "200", "NO_COLOR": "1"}
-"""So that what the command line prints can be read by a test."""
+"""Environment in which a test can read the output of the command line."""
 
 settings.register_profile(
     "tests", deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
@@ -62,11 +61,11 @@ LONGEST = (
     "sumo_nets/test_crowd.py",
     "scenarios/test_verify.py",
 )
-"""Files of engine tests that take longest. They are the first of these, so that no worker of
-pytest-xdist is left alone with one of them in the end."""
+"""Files of engine tests that take longest. They run before the other engine tests, so that no worker
+of pytest-xdist is left with one of them at the end."""
 
 COLLECTED = pytest.StashKey[list[str]]()
-"""The ids of all tests of a session, those that it leaves out included."""
+"""The ids of all tests of a session, including those that it deselects."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -91,7 +90,7 @@ def collected_by(worker: str) -> Path:
 
 
 def still_runs(pid: int) -> bool:
-    """Whether a process goes on; one that nobody has buried does not."""
+    """Return whether a process is running; a zombie is not."""
     try:
         return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
@@ -99,14 +98,15 @@ def still_runs(pid: int) -> bool:
 
 
 def seed_in_order(scenarios: Sequence[Scenario]) -> int:
-    """The least seed of a run that goes through scenarios in the order in which they are given
-    here."""
+    """Return the least seed of a run that takes these scenarios in the given order."""
     from cosim.spec.episode_id import episode_id_of
 
-    def told(seed: int) -> list[EpisodeId]:
+    def ids_in_order(seed: int) -> list[EpisodeId]:
         return [episode_id_of(seed, scenario) for scenario in scenarios]
 
-    return next(seed for seed in itertools.count() if told(seed) == sorted(told(seed)))
+    return next(
+        seed for seed in itertools.count() if ids_in_order(seed) == sorted(ids_in_order(seed))
+    )
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -114,13 +114,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Nets are kept between runs, for all processes, beside no user's: a folder for each state of
-    what makes them.
-
-    Ctrl-C is heard, here and in what the tests start, also where a shell in the background has it
-    ignored. Modules are compiled once, not in each of hundreds of processes, also where that is
-    turned off.
-    """
+    """Store nets between runs in a folder for each version of their sources, separate from the
+    user's. Let Ctrl-C interrupt the tests and their child processes, also from a background shell.
+    Compile modules once instead of in each of hundreds of processes."""
     sys.dont_write_bytecode = False
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -136,32 +132,32 @@ def pytest_configure(config: pytest.Config) -> None:
         )  # consoles look at the environment once, when they are made
 
 
-class Said(NamedTuple):
-    """What a command printed, and its exit code."""
+class CliResult(NamedTuple):
+    """Output and exit code of a command."""
 
     returncode: int
     stdout: str
     stderr: str
 
 
-Cosim = Callable[..., Said]
+Cosim = Callable[..., CliResult]
 """cosim(*words, cwd=folder)."""
 
 
 @pytest.fixture(scope="session")
 def cosim() -> Cosim:
-    """The command line by its own entry point, in this process: nothing is loaded anew, the rest is
-    as for a user."""
-    return _here
+    """Run the command line by its entry point in this process; modules stay loaded, the rest is as
+    for a user."""
+    return _in_this_process
 
 
 @pytest.fixture(scope="session")
 def fresh_cosim() -> Cosim:
-    """The command line in a process of its own."""
-    return _in_a_process
+    """Run the command line in a new process."""
+    return _in_new_process
 
 
-def _in_a_process(*words: str, cwd: Path | None = None) -> Said:
+def _in_new_process(*words: str, cwd: Path | None = None) -> CliResult:
     command = [sys.executable, "-m", "cosim", *words]
     done = subprocess.run(
         command,
@@ -172,10 +168,10 @@ def _in_a_process(*words: str, cwd: Path | None = None) -> Said:
         timeout=PATIENCE_S,
         check=False,
     )
-    return Said(done.returncode, done.stdout, done.stderr)
+    return CliResult(done.returncode, done.stdout, done.stderr)
 
 
-def _here(*words: str, cwd: Path | None = None) -> Said:
+def _in_this_process(*words: str, cwd: Path | None = None) -> CliResult:
     from cosim.__main__ import main
 
     out, err = io.StringIO(), io.StringIO()
@@ -185,13 +181,13 @@ def _here(*words: str, cwd: Path | None = None) -> Said:
             code = 0
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
-    return Said(code, out.getvalue(), err.getvalue())
+    return CliResult(code, out.getvalue(), err.getvalue())
 
 
 @contextmanager
 def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
-    """In a folder, with arguments; afterwards nothing is left of the program: no module of the
-    folder, no signal."""
+    """Run in a folder with arguments; afterwards remove modules of the folder and restore
+    signals."""
     before = Path.cwd(), sys.argv, [*sys.path], {*sys.modules}, signal.getsignal(signal.SIGTERM)
     os.chdir(folder)
     sys.argv = ["cosim", *words]
@@ -211,7 +207,7 @@ def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
 
 
 def wait_until(holds: Callable[[], object]) -> None:
-    """Wait until something holds, as long as a test waits at most."""
+    """Wait until a condition holds, for at most PATIENCE_S."""
     deadline = time.monotonic() + PATIENCE_S
     while not holds():
         assert time.monotonic() < deadline
@@ -219,14 +215,14 @@ def wait_until(holds: Callable[[], object]) -> None:
 
 
 def without_lines(text: str) -> str:
-    """Remove the file and line that a policy's crash names."""
+    """Return text without the file and line that a policy's crash names."""
     return re.sub(r" in \w+\.py:\d+", "", text)
 
 
 @pytest.fixture(scope="session")
 def walker_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the humanoid's network, converted from the published file; where that is
-    missing, the test is skipped."""
+    """Return a folder with the humanoid's network, converted from the published file; skip the test
+    if that is missing."""
     from physics.dynamics.legs.walker import WALKER_NETWORK
 
     shared = Path(os.environ.get("COSIM_WEIGHTS") or ROOT.parent / "shared" / "weights")
@@ -240,6 +236,6 @@ def walker_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def walker_weights(walker_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The humanoid's network in $COSIM_WEIGHTS."""
+    """Set $COSIM_WEIGHTS to a folder with the humanoid's network."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(walker_folder))
     return walker_folder

@@ -1,4 +1,5 @@
-"""RunSpecs of made-up runs; and records and specs with other values, by the keys of their files."""
+"""RunSpecs of made-up runs, and records and specs with changed values, by the keys of their
+files."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ _T = TypeVar("_T", Record, RunSpec)
 
 
 def spec_of(suite: Suite, policy: str = "p", **of_setup: Any) -> RunSpec:
-    """A run of all scenarios of a suite by a blind policy. of_setup: fields of its set-up."""
+    """Return a run of all scenarios of a suite by a blind policy. of_setup: fields of its
+    set-up."""
     given: dict[str, Any] = {
         "suite_hash": suite.content_hash,
         "versions": {"numpy": "2"},
@@ -36,22 +38,24 @@ def spec_of(suite: Suite, policy: str = "p", **of_setup: Any) -> RunSpec:
 
 
 def record_of(scenario: Scenario, manifest: Manifest, **of_setup: Any) -> Record:
-    """The record of an episode that has begun. of_setup: fields of its set-up."""
+    """Return the record of an episode that has begun. of_setup: fields of its set-up."""
     setup = RunSetup.of(EpisodeOptions(), suite_hash="h")
     return Record.begun(scenario, manifest, msgspec.structs.replace(setup, **of_setup))
 
 
-def changed(whole: _T, **keys: Any) -> _T:
-    """A record or spec with other values at keys of its file."""
-    file = RECORD_FILE if isinstance(whole, Record) else RUN_FILE
+def changed(value_object: _T, **keys: Any) -> _T:
+    """Return a record or spec with other values at keys of its file."""
+    file = RECORD_FILE if isinstance(value_object, Record) else RUN_FILE
     for name, value in keys.items():
         part, _, field = file.keys[name].rpartition(".")
         if part:
-            inner = getattr(whole, part)
+            inner = getattr(value_object, part)
             replace = (
                 dataclasses.replace if isinstance(inner, Manifest) else msgspec.structs.replace
             )
-            whole = msgspec.structs.replace(whole, **{part: replace(inner, **{field: value})})
+            value_object = msgspec.structs.replace(
+                value_object, **{part: replace(inner, **{field: value})}
+            )
         else:
-            whole = msgspec.structs.replace(whole, **{field: value})
-    return whole
+            value_object = msgspec.structs.replace(value_object, **{field: value})
+    return value_object

@@ -1,5 +1,4 @@
-"""The list of tests itself: the same in every process and at any time, and names that can be
-read."""
+"""The collected tests: equal in every process and at any time, with readable ids."""
 
 from __future__ import annotations
 
@@ -34,9 +33,9 @@ def runs_all(config: pytest.Config) -> bool:
 
 
 @pytest.fixture(scope="module")
-def elsewhere(request: pytest.FixtureRequest) -> list[str]:
-    """The ids of all tests, engine tests too, as another process collects them with other hashes:
-    another worker of this run, or one of its own."""
+def ids_of_another_process(request: pytest.FixtureRequest) -> list[str]:
+    """Return the ids of all tests, including engine tests, as a process with other hashes collects
+    them: another worker of this run, or a new one."""
     here = os.environ.get("PYTEST_XDIST_WORKER")
     if here and runs_all(request.config) and "PYTHONHASHSEED" not in os.environ:
         count = int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
@@ -53,47 +52,46 @@ def elsewhere(request: pytest.FixtureRequest) -> list[str]:
 
 
 def unreadable(test_id: str) -> bool:
-    """Whether the parameters in an id are too long to read, or hold bytes that stand for no
-    letter."""
+    """Return whether the parameters in an id are too long to read, or hold bytes that are no
+    letters."""
     parameters = test_id.partition("[")[2]
     escaped = "\\" in parameters.replace(r"\\", "")
     return len(parameters) > LONGEST_PARAMETERS or escaped or not test_id.isprintable()
 
 
 def by_function(test_ids: list[str]) -> list[str]:
-    """One function after the other, each with its parameters in their order: pytest joins those
-    that share a place."""
+    """Return ids sorted by function, with each function's parameters in their order, as pytest
+    groups those that share a fixture."""
     return sorted(test_ids, key=lambda test_id: test_id.partition("[")[0])
 
 
 def test_two_processes_collect_the_same_tests(
-    elsewhere: list[str], request: pytest.FixtureRequest
+    ids_of_another_process: list[str], request: pytest.FixtureRequest
 ) -> None:
-    """Ids depend neither on the clock nor on the order of sets: processes that share the tests out
-    must agree. Of a part of the tests those that were asked for are compared."""
-    here = request.config.stash[COLLECTED]
-    assert len(elsewhere) == len(set(elsewhere)) > 900
-    there = (
-        elsewhere
+    """Ids depend neither on the clock nor on the order of sets, as processes that divide the tests
+    must agree. In a partial run the requested ids are compared."""
+    collected_here = request.config.stash[COLLECTED]
+    assert len(ids_of_another_process) == len(set(ids_of_another_process)) > 900
+    collected_there = (
+        ids_of_another_process
         if runs_all(request.config)
-        else [test_id for test_id in elsewhere if test_id in set(here)]
+        else [test_id for test_id in ids_of_another_process if test_id in set(collected_here)]
     )
-    assert by_function(here) == by_function(there)
+    assert by_function(collected_here) == by_function(collected_there)
 
 
-def test_every_id_can_be_read(elsewhere: list[str]) -> None:
-    """No id is made of bytes or of a whole message: it can be typed, and stands in one line."""
-    assert [test_id for test_id in elsewhere if unreadable(test_id)] == []
+def test_every_id_can_be_read(ids_of_another_process: list[str]) -> None:
+    """No id has bytes or a complete message: it can be typed, and fits on one line."""
+    assert [test_id for test_id in ids_of_another_process if unreadable(test_id)] == []
 
 
-def test_the_longest_files_are_files_with_tests() -> None:
-    """A file that was renamed would lose its place at the beginning."""
+def test_the_longest_files_exist() -> None:
+    """A renamed file would lose its place at the beginning."""
     assert [name for name in LONGEST if not (ROOT / "tests" / name).exists()] == []
 
 
-def test_no_test_waits_for_a_time_of_its_own() -> None:
-    """Who waits for something to happen waits PATIENCE_S: a number of seconds is too short on some
-    machine."""
+def test_no_test_has_a_constant_timeout() -> None:
+    """Timeouts are PATIENCE_S, as any constant is too short on some machine."""
     found = []
     for path in sorted((ROOT / "tests").rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text())):
@@ -119,6 +117,6 @@ def test_no_test_waits_for_a_time_of_its_own() -> None:
     ],
     ids=["words", "an escaped dot", "bytes", "two lines", "long"],
 )
-def test_ids_of_bytes_and_long_ones_are_refused(test_id: str, refused: bool) -> None:
-    """What the check above refuses, by example."""
+def test_unreadable_ids_are_found(test_id: str, refused: bool) -> None:
+    """Bytes, several lines and long parameters count as unreadable."""
     assert unreadable(test_id) is refused

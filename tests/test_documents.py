@@ -1,5 +1,5 @@
-"""README and docs/: every example in them is accepted or run as it is written, and every link leads
-somewhere."""
+"""README and docs/: every example is accepted or runs as written, and every link leads to a file or
+heading."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ RUN_ELSEWHERE = {
     "from policy_server import serve": "scenarios/test_remote.py",
     "import json, zenoh": "bridge/test_live_examples.py",
 }
-"""Beginnings of Python blocks that need a run at the other end, and the tests that run them as
-written."""
+"""Beginnings of Python blocks that need a run to connect to, and the tests that run them as written."""
 COMMANDS: Any = get_command(app)
 CHEAP = (
     "list ",
@@ -48,14 +47,13 @@ CHEAP = (
     "scenario draw ",
     "look night.toml ",
 )
-"""Commands that are run for real, as they take a second or two; the others are parsed."""
+"""Commands that are run, as they take a second or two; the others are parsed."""
 PYTHON = [block for block in blocks("python") if not block.text.startswith(tuple(RUN_ELSEWHERE))]
 POLICY = re.compile(r"^class (\w+):\n    manifest = ", re.MULTILINE)
 
 
-def accepted(words: list[str]) -> dict[str, Any]:
-    """The parameters of a command line without `cosim`, parsed as the command line does and not
-    run."""
+def parsed(words: list[str]) -> dict[str, Any]:
+    """Return the parameters of a command line without `cosim`, parsed and not run."""
     command = COMMANDS
     words = list(words)
     while hasattr(command, "commands"):
@@ -66,13 +64,13 @@ def accepted(words: list[str]) -> dict[str, Any]:
 
 @lru_cache
 def ids_of(suite: str) -> set[str]:
-    """The ids of the scenarios of a suite."""
+    """Return the ids of the scenarios of a suite."""
     return {scenario.id for scenario in cosim.load_suite(suite).scenarios}
 
 
 def unknown_names(parameters: dict[str, Any]) -> list[object]:
-    """Names in parameters that are none: of policies, suites, scenarios, events, robots, goals,
-    endpoints."""
+    """Return unknown names in parameters: of policies, suites, scenarios, events, robots, goals.
+    Raises an error for an invalid endpoint."""
     policies = {*POLICIES, *shipped_bundles(), *WEIGHTED_POLICIES}
     named: dict[str, set[str]] = {
         "policy": policies,
@@ -104,15 +102,15 @@ def unknown_names(parameters: dict[str, Any]) -> list[object]:
 @pytest.mark.parametrize("page", PAGES)
 def test_the_command_line_accepts_every_command(page: str) -> None:
     """Each `cosim` line of a page has existing commands, options, values of their types, policies,
-    suites, events."""
+    suites and events."""
     for where, words in shell_lines(page):
         if words[0] in ("cosim", "taskset"):
-            assert not unknown_names(accepted(words[words.index("cosim") + 1 :])), where
+            assert not unknown_names(parsed(words[words.index("cosim") + 1 :])), where
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_other_commands_name_what_there_is(page: str) -> None:
-    """Make targets, extras, modules and scripts in shell blocks exist; no other program is
+def test_other_commands_name_existing_targets_and_files(page: str) -> None:
+    """Make targets, extras, modules and scripts in shell blocks exist, and no other program is
     called."""
     makefile = (ROOT / "Makefile").read_text()
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
@@ -135,7 +133,7 @@ def test_other_commands_name_what_there_is(page: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_in_the_text_exist(page: str) -> None:
-    """Commands in backticks, such as `cosim score`, are commands, and their options exist."""
+    """Commands in backticks, such as `cosim score`, and their options exist."""
     for words in (found.split() for found in re.findall(r"`cosim ([a-z][^`]*)`", text_of(page))):
         command: Any = COMMANDS
         while hasattr(command, "commands") and words:
@@ -146,8 +144,8 @@ def test_commands_in_the_text_exist(page: str) -> None:
 
 @pytest.mark.engine
 def test_cheap_commands_run_as_written(tmp_path: Path, cosim: Cosim) -> None:
-    """Lists, certificates, scenarios of one's own, one at night: each command ends well, in the
-    order of the pages."""
+    """Lists, certificates and scenario files, one at night: each command succeeds, in the order of
+    the pages."""
     (night,) = (block for block in blocks("toml", "docs/scenarios.md") if "[light]" in block.text)
     (tmp_path / "night.toml").write_text(night.text)
     ran = 0
@@ -171,8 +169,8 @@ def test_python_runs_as_written(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Each Python block ends well as a script. What it prints holds the comment behind `print`; a
-    policy drives."""
+    """Each Python block runs as a script, prints what its comments behind `print` promise, and its
+    policies drive."""
     monkeypatch.chdir(tmp_path)
     script = tmp_path / f"example_{block.line}_{Path(block.page).stem}.py"
     script.write_text(block.text)
@@ -181,11 +179,11 @@ def test_python_runs_as_written(
     for promised in re.findall(r"^ *print\(.*\)  # (.*)$", block.text, re.MULTILINE):
         assert promised in printed
     for name in POLICY.findall(block.text):
-        drives(f"{script}:{name}")
+        assert_drives(f"{script}:{name}")
 
 
-def drives(policy: str) -> None:
-    """Asserts that a policy answers throughout a short episode."""
+def assert_drives(policy: str) -> None:
+    """Assert that a policy answers throughout a short episode."""
     loaded = cosim.load_policy(policy)
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
     with cosim.Episode(scenario, loaded.manifest) as episode:
@@ -197,8 +195,7 @@ def drives(policy: str) -> None:
 
 
 def test_python_that_needs_a_run_is_run_elsewhere() -> None:
-    """Blocks that are not run here are those of the table, and the test that is named reads the
-    page."""
+    """The other blocks are those of the table, and the named test reads their page."""
     others = [block for block in blocks("python") if block not in PYTHON]
     assert len(others) == len(RUN_ELSEWHERE)
     for block in others:
@@ -208,13 +205,13 @@ def test_python_that_needs_a_run_is_run_elsewhere() -> None:
 
 @pytest.mark.parametrize("block", blocks("toml"), ids=lambda block: block.name)
 def test_scenario_files_can_be_read(block: Block, tmp_path: Path) -> None:
-    """Each TOML block is a scenario of one's own."""
+    """Each TOML block is a valid scenario file."""
     (tmp_path / "mine.toml").write_text(block.text)
     assert read_own(tmp_path / "mine.toml").variants
 
 
 def test_every_block_has_a_language_that_is_tested() -> None:
-    """Pages have no other blocks than those that a test reads, and output and citations as text."""
+    """Pages have only blocks that a test reads, and output and citations as text."""
     for page in PAGES:
         languages = re.findall(r"^```(.*)\n(?:.*\n)*?```$", text_of(page), re.MULTILINE)
         assert {*languages} <= {
@@ -232,7 +229,7 @@ def test_every_block_has_a_language_that_is_tested() -> None:
 
 
 def anchors(text: str) -> set[str]:
-    """The anchors of a page's headings, as MyST and GitHub make them."""
+    """Return the anchors of a page's headings, as MyST and GitHub make them."""
     headings = re.findall(
         r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S), re.MULTILINE
     )
@@ -240,8 +237,8 @@ def anchors(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("page", [*PAGES, "ARCHITECTURE.md", "CONTRIBUTING.md"])
-def test_links_lead_somewhere(page: str) -> None:
-    """Relative links of documents name files that exist, and headings in them."""
+def test_links_lead_to_files_and_headings(page: str) -> None:
+    """Relative links of documents name existing files, and headings in them."""
     path = ROOT / page
     for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
         if not target.startswith("https://"):
@@ -251,8 +248,9 @@ def test_links_lead_somewhere(page: str) -> None:
             assert not heading or heading in anchors(linked.read_text()), target
 
 
-def test_the_readme_is_a_page_and_names_every_other() -> None:
-    """At most 150 lines; it links each page of docs/, and so does the site's table of contents."""
+def test_the_readme_is_short_and_links_every_page() -> None:
+    """It has at most 150 lines and links each page of docs/, as does the site's table of
+    contents."""
     assert len(text_of("README.md").splitlines()) <= 150
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
     assert len(pages) <= 20
@@ -275,8 +273,8 @@ def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
 
 
 def test_the_results_of_the_readme_are_those_of_the_baselines() -> None:
-    """Twelve policies; each figure with an interval is in a row of the same policy on the page of
-    all results, or in the row of D below it."""
+    """Each figure with an interval is in a row of the same policy on the page of all results. It
+    may be in the row of D below it."""
     rows = [
         line.strip("| ").split(" | ")
         for line in text_of("README.md").splitlines()

@@ -1,4 +1,4 @@
-"""The house itself: names, floors of the wheel, exports, documents."""
+"""The packages themselves: names, layers, exports and documents."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ ROOT = Path(__file__).parents[1]
 ROOMS = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
-def test_every_top_level_name_is_ours() -> None:
-    """No other installed distribution owns one of our package names, and the console script is
-    there."""
+def test_no_other_distribution_owns_our_package_names() -> None:
+    """The console script is the only one of this name."""
     owners = packages_distributions()
     for room in ROOMS:
         assert set(owners.get(room, ["sidewalk-cosim"])) == {"sidewalk-cosim"}
@@ -31,10 +30,9 @@ def test_every_top_level_name_is_ours() -> None:
     ]
 
 
-def test_the_ground_floor_imports_no_engine() -> None:
-    """Everything in cosim/ can be imported without SUMO, PyBullet, Zenoh or any other room, but for
-    the one file that imports nothing of ours; what learns needs PyTorch, and is left out where that
-    is not installed."""
+def test_cosim_imports_no_engine_and_no_other_package() -> None:
+    """Everything in cosim/ can be imported without SUMO, PyBullet, Zenoh and the other packages,
+    except bridge.policy_server. Modules that need PyTorch are left out if it is missing."""
     modules = [
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for path in sorted((ROOT / "cosim").rglob("*.py"))
@@ -47,15 +45,15 @@ def test_the_ground_floor_imports_no_engine() -> None:
         "'scenarios'}\nalone = {'bridge', 'bridge.policy_server'}\nprint(sorted({name for "
         "name in sys.modules if name.partition('.')[0] in rooms} - alone))"
     )
-    said = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
     )
-    assert said.stdout.strip() == "[]"
+    assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.engine
 def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
-    """The built wheel carries every module, each room's type marker, the robot and the suites, and
+    """The built wheel has every module, each package's type marker, the robots and the suites, and
     nothing else."""
     command = [
         sys.executable,
@@ -87,7 +85,7 @@ def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
 
 
 def test_the_documents_name_files_that_exist() -> None:
-    """Every path and make target in the documents is there."""
+    """Every path and make target in the documents exists."""
     makefile = (ROOT / "Makefile").read_text()
     for name in (*PAGES, "ARCHITECTURE.md", "CONTRIBUTING.md"):
         text = (ROOT / name).read_text()
@@ -102,9 +100,8 @@ def test_the_documents_name_files_that_exist() -> None:
                 assert f"\n{target}:" in makefile
 
 
-def test_modules_have_telling_names_and_at_most_700_lines() -> None:
-    """No module is called utils, common, helpers, manager or misc, and none has more than 700
-    lines."""
+def test_modules_have_specific_names_and_at_most_700_lines() -> None:
+    """No module is called utils, common, helpers, manager or misc."""
     for room in ROOMS:
         for path in (ROOT / room).rglob("*.py"):
             assert path.stem not in ("utils", "common", "helpers", "manager", "misc"), path
@@ -112,7 +109,7 @@ def test_modules_have_telling_names_and_at_most_700_lines() -> None:
 
 
 def test_architecture_shows_the_layers_that_are_enforced() -> None:
-    """The picture of the layers is the contract of `.importlinter`, line by line."""
+    """The list of layers is the contract of `.importlinter`, line by line."""
     contracts = configparser.ConfigParser()
     contracts.read(ROOT / ".importlinter")
     layers = contracts["importlinter:contract:layers"]["layers"].strip()
@@ -121,8 +118,8 @@ def test_architecture_shows_the_layers_that_are_enforced() -> None:
 
 
 def test_each_engine_is_imported_where_architecture_says() -> None:
-    """libsumo in one file, zenoh in two, PyBullet and OpenGL in one room; the document says so in
-    these words."""
+    """libsumo is imported in one file, zenoh in two, and PyBullet and OpenGL in one package, as the
+    document states."""
     where: dict[str, set[str]] = {
         name: set() for name in ("libsumo", "zenoh", "pybullet", "moderngl")
     }
@@ -139,8 +136,9 @@ def test_each_engine_is_imported_where_architecture_says() -> None:
     assert where["zenoh"] == {"bridge/policy_server.py", "bridge/session.py"}
     for name in ("pybullet", "moderngl"):
         assert where[name] and all(path.startswith("physics/") for path in where[name])
-    said = " ".join((ROOT / "ARCHITECTURE.md").read_text().split())
+    text_of_architecture = " ".join((ROOT / "ARCHITECTURE.md").read_text().split())
     assert (
         "Only `sumo_nets/engine.py` imports libsumo, and only `physics` imports PyBullet and "
-        "moderngl. Only `bridge/session.py` imports zenoh, and `bridge/policy_server.py`" in said
+        "moderngl. Only `bridge/session.py` imports zenoh, and `bridge/policy_server.py`"
+        in text_of_architecture
     )

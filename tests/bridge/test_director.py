@@ -28,7 +28,7 @@ from cosim.core.errors import DirectorLost, EngineError, SpecError
 from cosim.core.state import PersonKind
 from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
 from tests.conftest import PATIENCE_S
-from tests.support.ends import connected_to, listening_at
+from tests.support.session_pair import connected_to, listening_at
 
 pytestmark = pytest.mark.engine
 

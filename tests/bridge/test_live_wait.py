@@ -14,7 +14,7 @@ from bridge.security import settings
 from bridge.session import Session
 from cosim.spec.injection import Ack
 from tests.conftest import PATIENCE_S, Cosim
-from tests.support.ends import listening_at
+from tests.support.session_pair import listening_at
 
 pytestmark = pytest.mark.engine
 

@@ -1,4 +1,4 @@
-"""Which camera is taken, and what is said where OpenGL is missing."""
+"""Choice of the camera, and messages where OpenGL is missing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.run_specs import spec_of
 
 @pytest.fixture
 def without_opengl(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A machine whose EGL library is missing."""
+    """Simulate a machine without the EGL library."""
 
     def fails(*_: object, **__: object) -> None:
         raise RuntimeError("libEGL.so not loaded")
@@ -33,14 +33,15 @@ def without_opengl(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-def test_auto_falls_to_bullet_without_opengl(without_opengl: None) -> None:
-    """Where no context can be made, auto is bullet, whose renderer is named as ever."""
+def test_auto_falls_back_to_bullet_without_opengl(without_opengl: None) -> None:
+    """Where no context can be made, auto selects bullet and the name of its renderer is
+    unchanged."""
     assert cameras.camera_of_choice("auto") == "bullet"
     assert cameras.renderer_of("bullet") == "bullet-tiny"
 
 
 def test_gl_without_opengl_names_the_packages(without_opengl: None) -> None:
-    """Asking for gl there fails with the reason, the packages to install, and the way out."""
+    """The error has the reason, the packages to install, and the alternative."""
     with pytest.raises(
         EngineError, match=r"libEGL.so not loaded.*apt-get install libegl1 .*--camera bullet"
     ):
@@ -61,19 +62,19 @@ def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
 
 
 def test_naming_cameras_starts_no_engine() -> None:
-    """The command line can ask for the renderer without PyBullet's greeting."""
+    """The camera can be chosen without importing PyBullet."""
     code = (
         "import sys, physics.cameras.choice as c; c.camera_of_choice('auto'); print('pybullet' "
         "in sys.modules)"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == "False"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 @pytest.mark.engine
 @pytest.mark.skipif(
     not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
 )
-def test_the_renderer_has_a_name() -> None:
-    """Records tell a GPU from llvmpipe, and one version of it from another."""
+def test_the_name_of_the_gl_renderer_has_device_and_version() -> None:
+    """Records distinguish a GPU from llvmpipe, and their versions."""
     assert len(cameras.renderer_of("gl")) > len("gl: , 4.3")

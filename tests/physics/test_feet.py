@@ -1,5 +1,4 @@
-"""Feet of robots with legs on the triangles of a street: dropped by the hundred, none may go
-through."""
+"""Feet of robots with legs on the triangles of a street: none of several hundred falls through."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ THIN_SOLE = Solid("box", (0.17, 0.06, 0.025), touches=True)
 
 
 def foot_of(robot: Robot) -> Solid:
-    """The one shape by which the feet of a robot touch the ground."""
+    """Return the one shape by which the feet of a robot touch the ground."""
     assert isinstance(robot.drive, Legs)
     links = [link for link in MODELS[robot.name].links if link.name in robot.drive.feet]
     shapes = {s for link in links for s in link.solids if s.touches}
@@ -40,8 +39,8 @@ def foot_of(robot: Robot) -> Solid:
 
 
 @contextmanager
-def sidewalk() -> Iterator[int]:
-    """Client with a tile of a street, and its robot far above."""
+def sidewalk_client() -> Iterator[int]:
+    """Yield a client with a tile of a street, and its robot far above."""
     bodies = Bodies(WALKER, SUBSTEP_S)
     bodies.add_chunk(StreetSurface(tiny_map(), seed=1).chunk(tile_at(*MIDDLE_M)))
     p.resetBasePositionAndOrientation(bodies._robot, (0, 0, 50), (0, 0, 0, 1), bodies._client)
@@ -51,11 +50,11 @@ def sidewalk() -> Iterator[int]:
         bodies.close()
 
 
-def sunk(shape: Solid, count: int = 400, at_once: int = 50) -> int:
-    """How many of `count` feet end with their middle below the sidewalk, which they hit at 1.2 m/s,
-    tilted by up to 0.3 rad."""
+def count_sunk(shape: Solid, count: int = 400, at_once: int = 50) -> int:
+    """Return how many of `count` feet end with their middle below the sidewalk, which they hit at
+    1.2 m/s, tilted by up to 0.3 rad."""
     rng, below = np.random.default_rng(1), 0
-    with sidewalk() as client:
+    with sidewalk_client() as client:
         if shape.shape == "box":
             options = {"shapeType": p.GEOM_BOX, "halfExtents": [0.5 * c for c in shape.size_m]}
         else:
@@ -64,7 +63,7 @@ def sunk(shape: Solid, count: int = 400, at_once: int = 50) -> int:
         for _ in range(count // at_once):
             feet: list[int] = []
             for _ in range(at_once):
-                feet.append(dropped(made, shape.size_m[-1], rng, client))
+                feet.append(drop_foot(made, shape.size_m[-1], rng, client))
                 for other in feet[:-1]:
                     p.setCollisionFilterPair(feet[-1], other, -1, -1, 0, physicsClientId=client)
             for substep in range(100):
@@ -79,8 +78,8 @@ def sunk(shape: Solid, count: int = 400, at_once: int = 50) -> int:
     return below
 
 
-def dropped(shape: int, height_m: float, rng: np.random.Generator, client: int) -> int:
-    """A foot that falls just above the sidewalk."""
+def drop_foot(shape: int, height_m: float, rng: np.random.Generator, client: int) -> int:
+    """Make a foot that falls just above the sidewalk, and return its body."""
     x, y = MIDDLE_M + rng.uniform((-8.0, -1.3), (8.0, 1.3))
     roll, pitch, yaw = rng.uniform((-0.3, -0.3, -np.pi), (0.3, 0.3, np.pi))
     z = CURB_M + 0.5 * height_m + 0.04
@@ -102,11 +101,11 @@ def dropped(shape: int, height_m: float, rng: np.random.Generator, client: int) 
 @pytest.mark.parametrize(
     "robot", [r for r in ROBOTS.values() if isinstance(r.drive, Legs)], ids=lambda r: r.name
 )
-def test_no_foot_goes_through_the_ground(robot: Robot) -> None:
-    """Of 400 feet on the triangles of a sidewalk, all stay on it."""
-    assert sunk(foot_of(robot)) == 0
+def test_no_foot_falls_through_the_ground(robot: Robot) -> None:
+    """All of 400 feet stay on the triangles of a sidewalk."""
+    assert count_sunk(foot_of(robot)) == 0
 
 
-def test_a_thin_sole_goes_through_the_ground() -> None:
-    """Some boxes as thin as the visible sole do: so the drops can tell."""
-    assert sunk(THIN_SOLE) > 0
+def test_a_thin_sole_falls_through_the_ground() -> None:
+    """Some boxes as thin as the visible sole fall through, so the drop test can fail."""
+    assert count_sunk(THIN_SOLE) > 0

@@ -1,5 +1,4 @@
-"""Street furniture, paving and relief: what stands where, what stays free, what the ground is
-like."""
+"""Street furniture, paving and relief: places, free widths, and the shape of the ground."""
 
 from __future__ import annotations
 
@@ -78,15 +77,15 @@ def city(seed: int, size_m: float = 600.0) -> StreetMap:
     return read_net(city_net(City(seed=seed, size_m=size_m)))
 
 
-def foreign() -> list[Path]:
+def shared_nets() -> list[Path]:
     names = ("berlin-neukoelln", "taipei", "west-oakland")
     return [net for name in names for net in sorted((SHARED / name).glob("*.net.xml.gz"))[:1]]
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
-def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
-    """Every size has few triangles, reaches the ground, fills its footprint below the heads and
-    bumps within it."""
+def test_props_have_few_triangles_and_stand_on_the_ground(kind: object) -> None:
+    """Every size of a prop reaches the ground, fills its footprint below head height, and has its
+    solids within it."""
     entry = KINDS[kind.name]  # type: ignore[attr-defined]
     looks = range(len(entry.paints) if entry.grown else 1)
     for variant, look in itertools.product(range(PROP_VARIANTS), looks):
@@ -113,9 +112,9 @@ def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
             assert abs(solid.at_m[1]) + 0.5 * solid.size_m[1] <= 0.5 * depth + 1e-9
 
 
-def test_props_keep_off_what_is_not_theirs() -> None:
-    """Over several seeds: no prop on a corner, a road, a crossing, another prop, a house, or near a
-    strip's end."""
+def test_props_overlap_no_other_object() -> None:
+    """Over several seeds no prop is on a corner, a road, a crossing, another prop, a house, or near
+    the end of a strip."""
     street = shapely.union_all(
         [p.polygon for p in (*MAP.corners.values(), *MAP.lanes.values()) if "_0" not in p.id]
     )
@@ -141,7 +140,7 @@ def test_props_keep_off_what_is_not_theirs() -> None:
 
 
 def test_the_middle_of_a_sidewalk_is_free() -> None:
-    """No footprint comes nearer to the middle line than the clear half width, which is at least 0.6
+    """No footprint is nearer to the middle line than the clear half width, which is at least 0.6
     m."""
     for seed in range(6):
         for prop, footprint in zip(props := all_props(MAP, seed), footprints(props), strict=True):
@@ -152,7 +151,7 @@ def test_the_middle_of_a_sidewalk_is_free() -> None:
 
 
 def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
-    """Tiles asked for in any order hold the same props, each in one tile alone; another seed gives
+    """Tiles in any order hold the same props, each prop in one tile, and another seed gives
     others."""
     keys = tiles_within(0.0, 0.0, 100.0)
     one, two, other = (placed(MAP, seed)[0] for seed in (4, 4, 5))
@@ -168,8 +167,7 @@ def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
 
 
 def test_the_checker_finds_a_prop_in_the_way() -> None:
-    """The least free width over the middle is measured at the prop, and is 0 where it stands on the
-    middle line."""
+    """The least free width is measured at the prop, and is 0 where it stands on the middle line."""
     strip = MAP.strips["nw"]
     bench = Prop("prop:nw:0", "bench", 0, -40.0, 6.2, 0.0, 0)
     width, bare = clear_widths([strip], [bench])["nw"]
@@ -180,9 +178,9 @@ def test_the_checker_finds_a_prop_in_the_way() -> None:
 
 @pytest.mark.engine
 @pytest.mark.parametrize("seed", [11, 37, 5])
-def test_generated_cities_leave_a_way(seed: int) -> None:
-    """On every sidewalk of a city at least 1.2 m stay free on the final geometry, and there is
-    furniture."""
+def test_generated_cities_leave_the_clear_width(seed: int) -> None:
+    """Every sidewalk of a city has furniture and at least 1.2 m of free width on the final
+    geometry."""
     street_map = city(seed)
     strips = sidewalks(street_map)
     props = all_props(street_map, seed)
@@ -194,8 +192,7 @@ def test_generated_cities_leave_a_way(seed: int) -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("seed", [11, 37, 5])
 def test_driveways_are_open(seed: int) -> None:
-    """Nothing but parked cars, behind the sidewalk, stands where a driveway or the flares of its
-    ramp are."""
+    """Only parked cars behind the sidewalk stand near a driveway or the flares of its ramp."""
     street_map = city(seed)
     strips = sidewalks(street_map)
     props = all_props(street_map, seed)
@@ -213,10 +210,10 @@ def test_driveways_are_open(seed: int) -> None:
 
 
 @pytest.mark.engine
-@pytest.mark.skipif(not foreign(), reason="the shared maps are not here")
-@pytest.mark.parametrize("path", foreign(), ids=lambda path: path.parent.name)
-def test_foreign_maps_leave_a_way(path: Path) -> None:
-    """Props take nothing from a sidewalk below 1.2 m: what is narrower stays as it is."""
+@pytest.mark.skipif(not shared_nets(), reason="the shared maps are not here")
+@pytest.mark.parametrize("path", shared_nets(), ids=lambda path: path.parent.name)
+def test_imported_maps_leave_the_clear_width(path: Path) -> None:
+    """Props take nothing from a sidewalk below 1.2 m; narrower ones stay as they are."""
     street_map = read_net(path)
     widths = clear_widths(sidewalks(street_map), all_props(street_map, 3))
     assert all(free >= min(1.2, bare) - 1e-6 for free, bare in widths.values())
@@ -224,8 +221,8 @@ def test_foreign_maps_leave_a_way(path: Path) -> None:
 
 @pytest.mark.engine
 def test_a_prop_stops_the_robot_and_is_named() -> None:
-    """Driven at a prop the robot touches it, whatever its kind: an object, by its id; and it does
-    not pass."""
+    """A robot that drives at a prop of any kind touches an object with its id, and does not
+    pass."""
     placement, _ = placed(MAP, 1)
     chosen = {
         prop.kind: prop for strip in sidewalks(MAP) for prop in placement.props_of_strip(strip)
@@ -244,8 +241,8 @@ def test_a_prop_stops_the_robot_and_is_named() -> None:
 
 @pytest.mark.engine
 def test_a_prop_is_seen_where_it_stands() -> None:
-    """A prop ahead is in the middle of the picture with its label, its foot on its zone's ground,
-    at its distance."""
+    """A prop ahead is in the middle of the picture with its label, on the ground of its zone, at
+    its distance."""
     placement, _ = placed(MAP, 1)
     props = [
         prop
@@ -253,6 +250,7 @@ def test_a_prop_is_seen_where_it_stands() -> None:
         for prop in placement.props_of_strip(strip)
         if prop.kind in ("bin", "planter")
     ]
+    assert len(props) >= 4
     with BulletCamera(
         BulletWorld(StreetSurface(MAP, seed=1)), CameraSpec(96, 96), depth=True
     ) as camera:
@@ -272,7 +270,7 @@ def test_a_prop_is_seen_where_it_stands() -> None:
 
 
 def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:
-    """Heights of a tile's own triangles at points on high ground, from the mesh."""
+    """Return heights at points on high ground from the triangles of a tile."""
     found = np.full(len(xy), np.nan)
     for name in tile.parts:
         mesh = tile.parts[name]
@@ -286,9 +284,9 @@ def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:
     return found
 
 
-def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> None:
-    """At 0 nothing changes; above it the mesh follows `height`, tiles meet, ramps stay, roads get
-    potholes."""
+def test_roughness_changes_the_ground_and_zero_does_not() -> None:
+    """With roughness the mesh follows `height`, tiles meet, ramps stay, and roads get potholes; at
+    0 nothing changes."""
     key = (0, 0)
     flat = build_tile(MAP, key)
     zero = build_tile(MAP, key, roughness=0.0, seed=9, roots=[(10.0, 5.0)])
@@ -299,11 +297,11 @@ def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> No
     rough = build_tile(MAP, key, roughness=1.0, seed=9, roots=[(10.0, 5.0)])
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(5.0, 45.0, 400), rng.uniform(3.8, 6.3, 400)])
-    there = rough_height(rough, points)
-    known = np.isfinite(there)
+    mesh_height = rough_height(rough, points)
+    known = np.isfinite(mesh_height)
     assert known.mean() > 0.95
-    assert np.abs(there - rough.height(points))[known].max() < 0.012
-    assert np.ptp(there[known]) > 0.03 and np.abs(there[known] - CURB_M).max() < 0.1
+    assert np.abs(mesh_height - rough.height(points))[known].max() < 0.012
+    assert np.ptp(mesh_height[known]) > 0.03 and np.abs(mesh_height[known] - CURB_M).max() < 0.1
     assert (
         rough.height([[10.0, 5.0]])[0]
         > build_tile(MAP, key, roughness=1.0, seed=9).height([[10.0, 5.0]])[0] + 0.02
@@ -319,9 +317,9 @@ def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> No
 
 
 @pytest.mark.engine
-def test_the_robot_feels_rough_ground() -> None:
-    """On rough pavement it gets along, tilted by a few degrees at most; on flat ground it hardly
-    tilts."""
+def test_rough_ground_tilts_the_robot() -> None:
+    """On rough pavement the robot makes progress with a few degrees of tilt; on flat ground it
+    hardly tilts."""
     tilts = {}
     for roughness in (0.0, 1.0):
         with BulletWorld(StreetSurface(MAP, seed=3, roughness=roughness)) as world:

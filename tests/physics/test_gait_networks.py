@@ -1,4 +1,4 @@
-"""Networks of gaits: their values and bits, their graphs, and the files that are refused."""
+"""Networks of gaits: values and bits, graphs, and refused files."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def normal(seed: int, *shape: int) -> NDArray[np.float32]:
 
 
 def walker_like() -> Network:
-    """A random network of the walker's sizes."""
+    """Return a random network of the walker's sizes."""
     lstm = Lstm(normal(1, 47 + 64, 256), normal(2, 256))
     layers = (
         Dense(normal(3, 64, 32), normal(4, 32), "elu"),
@@ -74,8 +74,8 @@ def answers(network: Network, count: int = 50) -> NDArray[np.float32]:
     return np.array(found)
 
 
-def test_a_network_is_what_its_layers_say() -> None:
-    """The answers of a recurrent network are those of the formulas in float64."""
+def test_a_network_matches_the_formulas_of_its_layers() -> None:
+    """The answers of a recurrent network equal the formulas in float64."""
     network = walker_like()
     lstm, hidden, last = network.layers
     assert isinstance(hidden, Dense) and isinstance(last, Dense)
@@ -125,8 +125,7 @@ def hashed(numbers: NDArray[Any]) -> str:
     ids=["haswell", "nehalem", "no-fma"],
 )
 def test_a_network_has_the_same_bits_on_every_processor(variables: dict[str, str]) -> None:
-    """With other kernels of OpenBLAS, and where numpy uses neither AVX2 nor fused
-    multiply-adds."""
+    """Other kernels of OpenBLAS, and numpy without AVX2 and fused multiply-adds, change no bit."""
     done = subprocess.run(
         [sys.executable, "-c", PROCESS],
         env={**os.environ, **variables},
@@ -137,12 +136,12 @@ def test_a_network_has_the_same_bits_on_every_processor(variables: dict[str, str
     assert done.stdout.strip() == hashed(answers(walker_like()))
 
 
-def test_arrays_of_a_network_make_it_again() -> None:
-    """And arrays that are no network are refused with the reason."""
+def test_a_network_is_restored_from_its_arrays() -> None:
+    """Arrays that form no network are refused with the reason."""
     network = walker_like()
-    again = network_of(network.arrays())
-    assert hashed(answers(again)) == hashed(answers(network))
-    whole = network.arrays()
+    restored = network_of(network.arrays())
+    assert hashed(answers(restored)) == hashed(answers(network))
+    arrays = network.arrays()
     for change, why in (
         ({"2.linear.bias": normal(1, 11)}, r"layer 2 has a weight \(32, 12\) and a bias \(11,\)"),
         ({"1.elu.weight": normal(1, 63, 32)}, "layer 1 takes 63 numbers, and layer 0 has 64"),
@@ -150,13 +149,14 @@ def test_arrays_of_a_network_make_it_again() -> None:
         ({"1.elu.bias": np.zeros(32)}, "layer 1 has float32 and float64; expected float32"),
     ):
         with pytest.raises(ValueError, match=why):
-            network_of(whole | change)
+            network_of(arrays | change)
     with pytest.raises(ValueError, match="has no weight and bias of layer 1"):
-        network_of({name: one for name, one in whole.items() if not name.startswith("1.")})
+        network_of({name: one for name, one in arrays.items() if not name.startswith("1.")})
 
 
 def normalised_graph() -> tuple[bytes, int]:
-    """Layers with a normalised input, one as a product and a sum, in several activations."""
+    """Return a graph with a normalised input, a layer as a product and a sum, and several
+    activations, and the number of its inputs."""
     weights = {
         "mean": normal(1, 8),
         "std": np.abs(normal(2, 8)) + np.float32(0.5),
@@ -181,7 +181,8 @@ def normalised_graph() -> tuple[bytes, int]:
 
 
 def test_a_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
-    """Layers of all kinds, a normalised input, products and sums."""
+    """Layers of all kinds, a normalised input, products and sums give the answers of
+    onnxruntime."""
     for data, inputs in ((layers_graph(scale=0.3), 45), normalised_graph()):
         (tmp_path / "g.onnx").write_bytes(data)
         graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
@@ -192,7 +193,7 @@ def test_a_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
 
 
 def recurrent_graph() -> bytes:
-    """An LSTM and a layer, with the memory as further inputs and outputs."""
+    """Return a graph of an LSTM and a layer, with the memory as further inputs and outputs."""
     weights = {
         "w": normal(1, 1, 32, 5),
         "r": normal(2, 1, 32, 8),
@@ -218,7 +219,8 @@ def recurrent_graph() -> bytes:
 
 
 def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
-    """With its memory as further inputs and outputs, over several steps."""
+    """With its memory as further inputs and outputs, the answers of several steps are those of
+    onnxruntime."""
     data = recurrent_graph()
     (tmp_path / "g.onnx").write_bytes(data)
     graph, network = Graph(tmp_path / "g.onnx"), network_of_graph(data)
@@ -233,7 +235,7 @@ def test_a_recurrent_graph_answers_as_in_its_runtime(tmp_path: Path) -> None:
 
 
 def test_graphs_of_another_form_are_refused() -> None:
-    """Each with its reason: operators, branches, ends, and what is no graph."""
+    """Unsupported operators, branches, ends and damaged files are refused with the reason."""
     ends = [port("obs", 1, 4)], [port("out", 1, 4)]
     held = {"w": normal(1, 4, 4), "v": normal(2, 4)}
     make = helper.make_node
@@ -260,7 +262,8 @@ def test_graphs_of_another_form_are_refused() -> None:
 
 
 def test_malformed_graphs_are_refused() -> None:
-    """Operators without inputs, constants of too few dimensions, and random changes of a file."""
+    """Operators without inputs, constants with too few dimensions, and random changes of a file
+    raise no other error."""
     ends = [port("obs", 1, 4)], [port("out", 1, 4)]
     held = {"w": normal(1, 4, 4), "v": normal(2, 4), "s": np.float32(1.0)}
     make = helper.make_node
@@ -336,7 +339,7 @@ def test_malformed_graphs_are_refused() -> None:
 def test_a_gait_that_does_not_fit_its_robot_is_refused(
     changes: dict[str, Any], why: str, tmp_path: Path
 ) -> None:
-    """The message names the file, the field and what is possible."""
+    """The message names the file, the field and the valid values."""
     path = written_gait(tmp_path, **changes)
     with pytest.raises(CosimError, match=why) as caught:
         user_gait(f"onnx:{path}", DOG, SUBSTEP_S)
@@ -363,7 +366,7 @@ FOUND = {
     name: rf"tiny\.onnx: .* bytes, .*; expected tiny\.onnx: .*\. Different: {words}$"
     for name, words in (("bytes", "size"), ("blake2b", "BLAKE2b"), ("sha256", "SHA-256"))
 }
-"""Messages for another file."""
+"""Error messages for a file with another size or hash."""
 
 
 @pytest.mark.parametrize("wrong", ["bytes", "blake2b", "sha256"])
@@ -371,7 +374,7 @@ FOUND = {
 def test_each_hash_that_a_manifest_gives_is_checked(
     tmp_path: Path, names: tuple[str, ...], wrong: str
 ) -> None:
-    """The right file loads by either hash; another size or hash is refused."""
+    """The right file loads by either hash, and another size or hash is refused."""
     facts = file_facts(layers_graph())
     given: dict[str, Any] = {"bytes": facts.bytes, **{name: facts.hashes[name] for name in names}}
     path = written_gait(tmp_path, files={"tiny.onnx": given})
@@ -384,7 +387,7 @@ def test_each_hash_that_a_manifest_gives_is_checked(
 
 
 def test_speeds_of_a_gait_are_averaged_over_its_own_cycle(tmp_path: Path) -> None:
-    """That of its manifest, or the longest period of a phase, or the robot's."""
+    """The cycle is that of the manifest, the longest period of a phase, or the robot's."""
     assert isinstance(DOG.drive, Legs)
     phases = [{"what": "phase", "period_s": period_s} for period_s in (0.4, 0.7)]
     for terms, changes, cycle_s in (
@@ -404,7 +407,7 @@ def test_speeds_of_a_gait_are_averaged_over_its_own_cycle(tmp_path: Path) -> Non
 
 
 def still_body(**changes: Any) -> MeasuredBody:
-    """A dog at rest."""
+    """Return a dog at rest."""
     assert isinstance(DOG.drive, Legs)
     rest = DOG.drive.rest_rad
     level = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -412,10 +415,10 @@ def still_body(**changes: Any) -> MeasuredBody:
     return MeasuredBody(zero, level, zero, zero, rest, (0.0,) * 12)._replace(**changes)
 
 
-def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy(
+def test_invalid_answers_of_a_users_gait_are_policy_errors(
     tmp_path: Path,
 ) -> None:
-    """They name the gait or the joint, and the limit."""
+    """NaN answers name the gait, and torques far beyond the limit name joint and limit."""
     path = written_gait(tmp_path, layers_graph(scale=1e30))
     drive = gait_drive(DOG, user_gait(f"onnx:{path}", DOG, SUBSTEP_S))
     with (
@@ -430,7 +433,7 @@ def test_answers_that_are_nan_or_far_beyond_the_torques_are_errors_of_the_policy
         drive.step(Command(1.0, 0.0), still_body())
 
 
-class Fixed:
+class ConstantTorques:
     """A gait of constant torques."""
 
     cycle_s = 0.2
@@ -445,25 +448,25 @@ class Fixed:
         return self._torques_nm
 
 
-def test_a_shipped_gait_is_clamped_and_its_failures_are_errors_of_the_engine() -> None:
-    """A tumbling robot demands far more than the limits; NaN is no fault of a policy."""
+def test_a_shipped_gait_is_clamped_and_its_nan_is_an_engine_error() -> None:
+    """A tumbling robot demands more than the limits, which is clamped; NaN is no fault of a
+    policy."""
     assert isinstance(DOG.drive, Legs)
     tumbles = still_body(speeds_radps=(1e4,) * 12)
     torques = drive_of(DOG, SUBSTEP_S).step(Command(1.0, 0.0), tumbles).values
     assert torques == [-most for most in DOG.drive.torque_nm]
     for torque_nm in (math.inf, -math.inf):
-        strong = LegDrive(DOG, DOG.drive, SUBSTEP_S, Fixed(torque_nm))
+        strong = LegDrive(DOG, DOG.drive, SUBSTEP_S, ConstantTorques(torque_nm))
         assert strong.step(Command(1.0, 0.0), still_body()).values[0] == math.copysign(
             23.7, torque_nm
         )
-    broken = LegDrive(DOG, DOG.drive, SUBSTEP_S, Fixed(math.nan))
+    broken = LegDrive(DOG, DOG.drive, SUBSTEP_S, ConstantTorques(math.nan))
     with pytest.raises(EngineError, match="torque of joint front_left_hip is nan Nm"):
         broken.step(Command(1.0, 0.0), still_body())
 
 
 def test_the_posture_of_the_walker_at_rest_is_balanced() -> None:
-    """Its feet are level, on the ground, and the centre of mass is over the middle of the
-    soles."""
+    """Its feet are level on the ground, and the centre of mass is over the middle of the soles."""
     assert isinstance(WALKER.drive, Legs)
     rest = dict(zip(WALKER.drive.joints, WALKER.drive.rest_rad, strict=True))
     frames = link_tree(urdf_path(WALKER)).frames(rest)
@@ -476,7 +479,7 @@ def test_the_posture_of_the_walker_at_rest_is_balanced() -> None:
 
 
 def test_a_robot_that_is_upside_down_does_not_balance() -> None:
-    """With its centre of mass below the ankles, or level with them."""
+    """It does not balance with its centre of mass below the ankles."""
     assert isinstance(WALKER.drive, Legs)
     stance = Stance(("left_ankle_pitch", "right_ankle_pitch"), 0.035, (0.0,) * 12, (0.0,) * 12)
     balance = Balance(WALKER_MODEL, link_tree(urdf_path(WALKER)), WALKER.drive, stance)
@@ -490,29 +493,28 @@ def test_a_robot_that_is_upside_down_does_not_balance() -> None:
     assert not balance.holds(body)
 
 
-def test_a_walker_without_weights_says_where_they_are_to_be_had(
+def test_a_missing_network_of_the_walker_is_named_with_its_source(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """File, size and hash, source with its own, and the command that makes the one of the
-    other."""
+    """The message has file, size, hash, source and the command that converts it."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     assert isinstance(WALKER.drive, Legs) and WALKER_NETWORK.weights.facts is not None
     with pytest.raises(UsageError) as caught:
         published_gait(WALKER, WALKER.drive, SUBSTEP_S)
-    said = str(caught.value)
-    assert "robot 'walker': walker.npz is missing, 126154 bytes, BLAKE2b 085c4b6c" in said
-    assert "https://github.com/unitreerobotics/unitree_rl_gym/raw/276801e46c5d4335" in said
-    assert f"145745 bytes, SHA-256 {WALKER_NETWORK.weights.facts.sha256}" in said
-    assert "`python -m physics.dynamics.legs.walker motion.pt`" in said and "\n" not in said
+    message = str(caught.value)
+    assert "robot 'walker': walker.npz is missing, 126154 bytes, BLAKE2b 085c4b6c" in message
+    assert "https://github.com/unitreerobotics/unitree_rl_gym/raw/276801e46c5d4335" in message
+    assert f"145745 bytes, SHA-256 {WALKER_NETWORK.weights.facts.sha256}" in message
+    assert "`python -m physics.dynamics.legs.walker motion.pt`" in message and "\n" not in message
     assert weights_in_words(WALKER) == ", weights missing (walker.npz)"
     (tmp_path / "walker.npz").write_bytes(b"another")
     with pytest.raises(UsageError, match=r"walker\.npz: 7 bytes, .*expected walker\.npz"):
         published_gait(WALKER, WALKER.drive, SUBSTEP_S)
 
 
-def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> None:
-    """Byte for byte the file that the manifest names, from the published file."""
+def test_the_converter_writes_the_file_that_runs_use(walker_folder: Path) -> None:
+    """The converted file has the size that the manifest states."""
     facts = WALKER_NETWORK.graph().facts
     assert facts is not None
     assert (walker_folder / "walker.npz").stat().st_size == facts.bytes
@@ -521,7 +523,7 @@ def test_the_command_makes_the_arrays_that_runs_take(walker_folder: Path) -> Non
 def test_a_converter_writes_into_the_folder_of_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """$COSIM_WEIGHTS, where a run looks for it, or the folder of -o."""
+    """It writes to $COSIM_WEIGHTS, where a run looks, or to the folder of -o."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path / "weights"))
     (tmp_path / "a.pt").write_bytes(b"a")
     files = [NetworkFile(name, "", None) for name in ("a.pt", "a.npz")]
@@ -531,8 +533,8 @@ def test_a_converter_writes_into_the_folder_of_weights(
     assert [(tmp_path / name / "a.npz").is_file() for name in ("weights", "other")] == [True] * 2
 
 
-def test_another_file_makes_no_arrays(tmp_path: Path) -> None:
-    """Neither another file, nor arrays of another network."""
+def test_the_converter_refuses_another_file(tmp_path: Path) -> None:
+    """Neither another file nor arrays of another network are converted."""
     (tmp_path / "motion.pt").write_bytes(b"no weights")
     with pytest.raises(UsageError, match=r"motion\.pt: 10 bytes, .*expected motion\.pt of https:"):
         WALKER_NETWORK.write(tmp_path / "motion.pt", tmp_path)

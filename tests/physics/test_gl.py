@@ -1,5 +1,5 @@
-"""The gl camera: it agrees with the bullet camera, depends on its moment alone, and refuses what
-nobody can mean."""
+"""The gl camera: it agrees with the bullet camera, depends only on the current state, and refuses
+invalid pictures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CITIES = [City(seed=1, size_m=500.0)]
 
 
 def street_at(street_map: StreetMap, spot: np.ndarray, rng: np.random.Generator) -> Street:
-    """Thirty people, some vehicles on the lanes, and known signals around a point."""
+    """Return thirty people, some vehicles on the lanes, and known signals around a point."""
     xy = spot + rng.uniform(-25.0, 25.0, (30, 2))
     doing = tuple(str(d) for d in rng.choice(["walk", "stop", "talk", "queue", "look"], 30))
     speed = rng.uniform(0.0, 1.5, 30)
@@ -70,7 +70,7 @@ def stand_at(world: BulletWorld, strip: Strip, share: float, heading_rad: float)
 
 
 @pytest.mark.parametrize("city", CITIES, ids=lambda city: city.name)
-def test_both_cameras_see_the_same(city: City) -> None:
+def test_both_cameras_agree(city: City) -> None:
     """In 25 views from five places of a city labels agree on 97 % of the pixels off edges, and
     depth to 2 cm."""
     _, street_map = place(city)
@@ -93,8 +93,8 @@ def test_both_cameras_see_the_same(city: City) -> None:
                 world, strip, float(rng.uniform(0.1, 0.9)), float(rng.uniform(-math.pi, math.pi))
             )
             street = street_at(street_map, robot.pose.xy, rng)
-            alike, gap_m = agreement(one.render(robot, street), other.render(robot, street))
-            agree.append(alike)
+            label_share, gap_m = agreement(one.render(robot, street), other.render(robot, street))
+            agree.append(label_share)
             depths.append(gap_m)
     assert min(agree) >= 0.97
     assert max(depths) <= 0.02
@@ -114,16 +114,15 @@ def moment(world: BulletWorld, n: int = 0) -> tuple[RobotState, Street]:
     return robot, street_at(place(CITIES[0])[1], robot.pose.xy, np.random.default_rng(n))
 
 
-def same(one: Frame, other: Frame) -> bool:
-    assert one.labels is not None and other.labels is not None
-    return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
+def same(first: Frame, second: Frame) -> bool:
+    assert first.labels is not None and second.labels is not None
+    return np.array_equal(first.rgb, second.rgb) and np.array_equal(first.labels, second.labels)
 
 
-def test_a_camera_frees_what_it_makes_but_for_programs_which_are_made_once(
+def test_a_closed_camera_frees_its_graphics_memory(
     world: BulletWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the second camera of a process on nothing is left of one in the graphics card's
-    memory."""
+    """From the second camera of a process on, a closed camera leaves no further object."""
     alive: Counter[str] = Counter()
     touched: Counter[str] = Counter()
 
@@ -152,8 +151,8 @@ def test_a_camera_frees_what_it_makes_but_for_programs_which_are_made_once(
     assert left[2] == left[1] and left[3] == left[1]
 
 
-def test_cameras_of_two_lights_at_once_draw_each_its_own(world: BulletWorld) -> None:
-    """They share programs, not what a light sets in them."""
+def test_two_cameras_with_different_lights_do_not_interfere(world: BulletWorld) -> None:
+    """They share programs, but not the values that a light sets."""
     robot, street = moment(world)
     lights = (Light(), Light(hour=20.5, fog_m=60.0))
     alone = []
@@ -176,7 +175,7 @@ def test_people_of_the_same_ids_look_different_in_other_places(
     monkeypatch: pytest.MonkeyPatch,
     camera: type[GlCamera] | type[BulletCamera],
 ) -> None:
-    """Otherwise the person of every event had the same clothes, and could be recognized by them."""
+    """Otherwise the person of every event would have the same clothes and be recognizable."""
     robot, street = moment(world)
     cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
     row = np.column_stack([np.full(6, 3.0), np.linspace(-1.5, 1.5, 6)])
@@ -199,9 +198,8 @@ def test_people_of_the_same_ids_look_different_in_other_places(
     assert np.mean(shares) > 0.3
 
 
-def test_a_picture_depends_on_its_moment_alone(world: BulletWorld) -> None:
-    """The same state is the same picture, whatever was drawn before, far off or a step away, and in
-    whatever camera."""
+def test_a_picture_depends_only_on_the_current_state(world: BulletWorld) -> None:
+    """The same state gives the same picture, whatever was drawn before and in any camera."""
     robot, street = moment(world)
     with GlCamera(world, SPEC) as camera:
         first = camera.render(robot, street)
@@ -219,7 +217,7 @@ def test_a_picture_depends_on_its_moment_alone(world: BulletWorld) -> None:
 
 
 def test_the_robot_is_seen_from_outside_only(world: BulletWorld) -> None:
-    """Its body is in a picture for humans, standing on the ground, and not in its own."""
+    """Its body is in a picture for humans, on the ground, and not in its own."""
     robot, street = moment(world)
     x = robot.pose.x_m
     y = robot.pose.y_m
@@ -237,8 +235,8 @@ def test_the_robot_is_seen_from_outside_only(world: BulletWorld) -> None:
 
 
 def test_light_changes_colours_and_nothing_else(world: BulletWorld) -> None:
-    """Noon, noon without shadows, overcast, fog and night show the same labels and depths in other
-    colours."""
+    """Noon, noon without shadows, overcast, fog and night have equal labels and depths and
+    different colours."""
     robot, street = moment(world)
     lights = [
         Light(),
@@ -262,8 +260,7 @@ def test_light_changes_colours_and_nothing_else(world: BulletWorld) -> None:
 def test_a_lens_bends_what_a_camera_draws(
     make: type[GlCamera | BulletCamera], world: BulletWorld
 ) -> None:
-    """Behind a lens the picture has the camera's size, and what was at its edge has moved
-    inwards."""
+    """With a lens the picture has the camera's size, the same middle, and other pixels off it."""
     robot, street = moment(world)
     barrel = dataclasses.replace(SPEC, fov_deg=50.0, lens=Lens(k1=-0.1))
     with make(world, dataclasses.replace(SPEC, fov_deg=50.0)) as plain, make(world, barrel) as bent:
@@ -275,8 +272,8 @@ def test_a_lens_bends_what_a_camera_draws(
     assert np.abs(curved.rgb.astype(int) - straight.rgb).mean() > 1.0
 
 
-def test_absurd_pictures_are_refused(world: BulletWorld) -> None:
-    """Both cameras name the limit before they start anything."""
+def test_invalid_sizes_and_fields_of_view_are_refused(world: BulletWorld) -> None:
+    """Both cameras name the limits before they start."""
     for make in (GlCamera, BulletCamera):
         with pytest.raises(UsageError, match="1 to 4096"):
             make(world, CameraSpec(100_000, 96))
@@ -286,8 +283,8 @@ def test_absurd_pictures_are_refused(world: BulletWorld) -> None:
             camera.picture((0.0, 0.0, 5.0), (9.0, 0.0, 0.0), Street(0), size=(0, 10))
 
 
-def test_a_camera_outside_its_with_block_says_so(world: BulletWorld) -> None:
-    """The message names the remedy, and closing twice is fine."""
+def test_a_camera_outside_its_with_block_is_refused(world: BulletWorld) -> None:
+    """The message names the remedy, and closing twice is allowed."""
     camera = GlCamera(world, SPEC)
     with pytest.raises(EngineError, match="'with' block"):
         camera.render(*moment(world))
@@ -297,9 +294,11 @@ def test_a_camera_outside_its_with_block_says_so(world: BulletWorld) -> None:
 
 
 @pytest.mark.parametrize("size", [(96, 96), (37, 21)], ids=["even", "odd"])
-def test_a_card_parts_colours_and_labels_as_the_processor_does(size: tuple[int, int]) -> None:
-    """What is parted by drawing it once more, as on a graphics card, is byte for byte what is
-    parted after reading."""
+def test_colours_and_labels_are_separated_equally_on_card_and_processor(
+    size: tuple[int, int],
+) -> None:
+    """Separation by another draw call, as on a graphics card, gives the bytes of separation after
+    reading."""
     rng = np.random.default_rng(size[0])
     rgba = rng.integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
     with context.context() as gl:

@@ -1,4 +1,4 @@
-"""Many environments in one atlas: the same pictures, read back together."""
+"""Many environments in one atlas: equal pictures, read back together."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def worlds() -> list[BulletWorld]:
     return [BulletWorld(StreetSurface(camera_city(300.0), seed)) for seed in (1, 2, 3)]
 
 
-def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -> None:
-    """Three environments drawn at once, with a second batch under way before the first is read: bit
-    for bit what three cameras draw one by one."""
+def test_an_atlas_equals_single_cameras(worlds: list[BulletWorld]) -> None:
+    """Three environments that are drawn together, with a second batch before the first is read,
+    equal three single cameras bit for bit."""
     from physics.cameras.gl.atlas import Atlas
 
     busy = busy_street(camera_city(300.0), 8, 5)
     ticks = [[busy.streets[i + k] for k in range(3)] for i in range(2)]
     single = [
-        _alone(world, NOON, [(busy.robot, streets[k]) for streets in ticks])
+        _single_camera(world, NOON, [(busy.robot, streets[k]) for streets in ticks])
         for k, world in enumerate(worlds)
     ]
     with Atlas(SPEC) as atlas:
@@ -62,11 +62,11 @@ def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -
 
 @pytest.mark.parametrize("staged", [False, True])
 @pytest.mark.parametrize("layers", [False, True])
-def test_layers_hold_the_pictures_of_single_cameras(
+def test_layers_equal_single_cameras(
     worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool, staged: bool
 ) -> None:
-    """Pictures drawn as layers of one texture, among pictures that are not, are those of single
-    cameras, also when staged as on a graphics card; and they stay when later ones are drawn."""
+    """Pictures that are drawn as layers of a texture equal those of single cameras, also when
+    staged as on a graphics card. Later drawings do not change them."""
     from physics.cameras.gl import atlas as module
     from physics.cameras.gl.atlas import Atlas
     from physics.cameras.gl.readback import Readback
@@ -75,7 +75,7 @@ def test_layers_hold_the_pictures_of_single_cameras(
     busy = busy_street(camera_city(300.0), 8, 9)
     lights = [NOON, Light(hour=19.0), Light(hour=0.0), Light(shadows=False)]
     asked = [(busy.robot, street) for street in busy.streets]
-    single = [_alone(worlds[k % 3], light, asked) for k, light in enumerate(lights)]
+    single = [_single_camera(worlds[k % 3], light, asked) for k, light in enumerate(lights)]
     monkeypatch.setattr(context, "LAYERS", layers)
     monkeypatch.setattr(module, "Readback", partial(Readback, staged=staged))
     with Atlas(SPEC) as atlas:
@@ -93,8 +93,8 @@ def test_layers_hold_the_pictures_of_single_cameras(
 def test_environments_join_and_leave_an_atlas(
     worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch, layers: bool
 ) -> None:
-    """An environment in an atlas gets the pictures of its own camera, whichever environments join,
-    leave or fail."""
+    """An environment gets the pictures of its own camera, whichever environments join, leave or
+    fail."""
     from physics.cameras.gl.atlas import Atlas
     from physics.cameras.gl.crowd import CrowdDrawing
     from physics.cameras.gl.street import StreetDrawing
@@ -109,7 +109,7 @@ def test_environments_join_and_leave_an_atlas(
     lights = [NOON, Light(hour=22.0), Light(shadows=False, fog_m=40.0)]
     asked = [(busy.robot, street) for street in busy.streets]
     seats = list(zip((worlds[0], other, worlds[2]), lights, strict=True))
-    a, b, c = (_alone(world, light, asked) for world, light in seats)
+    a, b, c = (_single_camera(world, light, asked) for world, light in seats)
     monkeypatch.setattr(context, "LAYERS", layers)
     with Atlas(SPEC) as atlas:
         first, second = (atlas.join(*seat) for seat in seats[:2])
@@ -139,8 +139,8 @@ def test_environments_join_and_leave_an_atlas(
         assert atlas.render([]) == []
 
 
-def test_a_driver_without_what_layers_need_draws_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Layers that are forced fail with the names of the extensions and limits that are missing."""
+def test_forced_layers_fail_on_a_driver_without_support(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error has the missing extensions and limits."""
     limits = (("GL_MAX_UNIFORM_BLOCK_SIZE", 1 << 30), ("GL_MAX_VERTEX_SHADER_STORAGE_BLOCKS", 1))
     monkeypatch.setattr(context, "LAYERS", True)
     with context.context() as gl, monkeypatch.context() as lacking:
@@ -156,7 +156,7 @@ def test_a_driver_without_what_layers_need_draws_none(monkeypatch: pytest.Monkey
 def test_a_picture_whose_drawing_or_wait_failed_is_not_returned(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """After an error in a drawing, or in waiting for the driver, `end` returns later pictures."""
+    """After an error while drawing or waiting, `end` returns later pictures."""
     from physics.cameras.gl import readback
     from physics.cameras.gl.crowd import CrowdDrawing
     from physics.cameras.gl.people_only import PeopleAlone
@@ -191,20 +191,22 @@ def test_a_picture_whose_drawing_or_wait_failed_is_not_returned(
         eyes.begin(pose, streets[0])  # is pending when the drawing ends
 
 
-def _alone(world: BulletWorld, light: Light, asked: list[tuple[RobotState, Street]]) -> list[Frame]:
+def _single_camera(
+    world: BulletWorld, light: Light, queries: list[tuple[RobotState, Street]]
+) -> list[Frame]:
     from physics.cameras.gl.camera import GlCamera
 
     with GlCamera(world, SPEC, light=light) as camera:
-        return [camera.render(robot, street) for robot, street in asked]
+        return [camera.render(robot, street) for robot, street in queries]
 
 
-def _same(one: Frame, other: Frame) -> bool:
-    assert one.labels is not None and other.labels is not None
-    return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
+def _same(first: Frame, second: Frame) -> bool:
+    assert first.labels is not None and second.labels is not None
+    return np.array_equal(first.rgb, second.rgb) and np.array_equal(first.labels, second.labels)
 
 
-def test_an_atlas_too_large_is_refused_with_the_limit(worlds: list[BulletWorld]) -> None:
-    """More pixels than may be under way; and an atlas that is not running says so."""
+def test_an_atlas_refuses_too_many_pixels_and_closed_use(worlds: list[BulletWorld]) -> None:
+    """The errors have the limit, and the missing 'with' block."""
     from physics.cameras.gl.atlas import Atlas
 
     atlas = Atlas(CameraSpec(64, 1024))

@@ -1,5 +1,4 @@
-"""People as the gl camera draws them: levels of detail keep the silhouettes, poses are those of the
-joints."""
+"""People as the gl camera draws them: silhouettes at each level of detail, shading, and objects."""
 
 from __future__ import annotations
 
@@ -34,12 +33,12 @@ WIDE = 512, 288
 
 
 def street(seed: int, count: int = 50, reach_m: float = 35.0) -> People:
-    """A busy street before an eye at the origin that looks along x: from 3 m away."""
+    """Return a busy street before an eye at the origin that looks along x, from 3 m away."""
     rng = np.random.default_rng(seed)
     far = 3.0 + (reach_m - 3.0) * np.sqrt(rng.uniform(0.0, 1.0, count))
     way = rng.uniform(-0.85, 0.85, count)
     doing = rng.choice(["walk", "walk", "walk", "stand", "talk", "stop"], count).tolist()
-    pace = np.where([what == "walk" for what in doing], rng.uniform(0.5, 1.8, count), 0.0)
+    pace = np.where([action == "walk" for action in doing], rng.uniform(0.5, 1.8, count), 0.0)
     names = tuple(sorted(f"c{seed * count + i}" for i in range(count)))
     xy = np.column_stack([far * np.cos(way), far * np.sin(way)])
     return People.of(
@@ -82,7 +81,7 @@ def mask(crowd: CrowdDrawing, people: People, taken: Shot) -> NDArray[np.bool_]:
 
 
 def near_people(doing: str = "walk") -> People:
-    """Twelve people in two rows, 5 and 8 m away."""
+    """Return twelve people in two rows, 5 and 8 m away."""
     names = tuple(sorted(f"c{i}" for i in range(12)))
     rows = np.arange(12)
     xy = np.column_stack([5.0 + 3.0 * (rows % 2), 0.75 * (rows - 5.5)])
@@ -102,8 +101,8 @@ def crowd() -> Iterator[CrowdDrawing]:
 def test_levels_of_detail_keep_the_silhouettes(
     crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, count: int, reach_m: float, share: float
 ) -> None:
-    """In pictures of busy streets levels of detail change less than 3 % of the silhouettes' pixels
-    of people taller than 27 pixels, and less than 5 % of all."""
+    """On busy streets levels of detail change less than 3 % of the silhouette pixels of near
+    people, and less than 5 % of all."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     scenes = [street(seed, count, reach_m) for seed in range(4)]
     levelled = [mask(crowd, people, taken) for people in scenes]
@@ -118,8 +117,8 @@ def test_levels_of_detail_keep_the_silhouettes(
 
 
 def test_people_are_neither_black_nor_flat(crowd: CrowdDrawing) -> None:
-    """At noon people reflect 0.12 to 0.6 of white on average, and their pixels vary as those of
-    cloth in light and shade."""
+    """At noon people reflect 0.12 to 0.6 of white on average, and their pixels vary like cloth in
+    light and shade."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     with drawing(crowd, near_people(), taken) as (rgb, labels):
         light = rgb[labels == LABELS["person"]] @ (0.2126, 0.7152, 0.0722) / 255.0
@@ -128,18 +127,18 @@ def test_people_are_neither_black_nor_flat(crowd: CrowdDrawing) -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "higher"), [("umbrella", 1.06), ("wheelchair", 0.5), ("pram", 0.9), ("dog", 0.9)]
+    ("companion", "higher"), [("umbrella", 1.06), ("wheelchair", 0.5), ("pram", 0.9), ("dog", 0.9)]
 )
 def test_objects_are_drawn_and_labelled(
-    crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, what: str, higher: float
+    crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, companion: str, higher: float
 ) -> None:
-    """What people push, lead or hold has their label; umbrellas rise over heads, and people in
-    wheelchairs sit while they move."""
+    """Objects that people push, lead or hold have the label of people. Umbrellas rise over heads,
+    and people in wheelchairs sit."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     plain = mask(crowd, near_people(), taken)
     crowds._worn.cache_clear()
     look = crowds.look_of
-    variants = {o.family: k for k, o in enumerate(ALL) if o.companion == what}
+    variants = {o.family: k for k, o in enumerate(ALL) if o.companion == companion}
 
     def with_companion(name: str, age: int, *more: Any) -> Look:
         own = look(name, age, *more)
@@ -154,4 +153,4 @@ def test_objects_are_drawn_and_labelled(
     assert changed.sum() > 0.03 * plain.sum()
     rows = [np.flatnonzero(one.any(axis=1)) for one in (plain, shown)]
     tall = [288 // 2 - int(row.min()) for row in rows]
-    assert tall[1] > higher * tall[0] if what != "wheelchair" else tall[1] < 0.85 * tall[0]
+    assert tall[1] > higher * tall[0] if companion != "wheelchair" else tall[1] < 0.85 * tall[0]

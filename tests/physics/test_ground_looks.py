@@ -1,5 +1,5 @@
-"""Labels against looks: on every map but generated cities open ground is no sidewalk, and no
-sidewalk is a road."""
+"""Labels against looks: except in generated cities, open ground does not look like a sidewalk, nor
+a sidewalk like a road."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from physics.textures.ground import SURFACE_LAYERS, layer_of
 from tests.support.tiny_street import KEYS, tiny_map
 
 MIN_DISTANCE = 15.0
-"""Between two mean colours in CIELAB: 2.3 can just be told apart side by side."""
+"""Minimum distance of two mean colours in CIELAB; 2.3 is just noticeable side by side."""
 HOUSE = shapely.box(-60.0, 8.0, -4.0, 16.0)
 LOT = shapely.box(5.0, 9.0, 40.0, 30.0)
 PARK = shapely.box(-200.0, -100.0, 200.0, -8.0)
 
 
 def shown_map() -> StreetMap:
-    """The tiny street with a house at the north-western sidewalk, a parking lot in the north-east,
-    a wood with a pond in the south."""
+    """Return the tiny street with a house at the north-western sidewalk, a parking lot in the
+    north-east, and a wood with a pond in the south."""
     features = (
         Feature("building", -32.0, 12.0, 0.0, 6.0, HOUSE),
         Feature("planting", 0.0, -50.0, polygon=PARK),
@@ -52,31 +52,30 @@ MAP = shown_map()
 
 
 def lab(rgb: np.ndarray | tuple[float, float, float]) -> np.ndarray:
-    """(N, 3) CIELAB of (N, 3) sRGB from 0 to 1."""
+    """Return (N, 3) CIELAB of (N, 3) sRGB from 0 to 1."""
     flat = np.asarray(rgb, dtype=np.float32).reshape(-1, 1, 3)
     return np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2LAB)).reshape(-1, 3)
 
 
-def walked_on(layer: str) -> bool:
-    """Whether a layer of ground is one that sidewalks have."""
-    return layer in {one for name in walked() for one in layers_of(name)}
+def is_sidewalk_layer(layer: str) -> bool:
+    """Return whether sidewalks have this layer of ground."""
+    return layer in {one for name in sidewalk_surfaces() for one in layers_of(name)}
 
 
-def walked() -> list[str]:
-    """Names of all surfaces that sidewalks have."""
+def sidewalk_surfaces() -> list[str]:
+    """Return the names of all surfaces that sidewalks have."""
     return [name for name in (*SURFACES, *PAVINGS) if surface_look(name)[0] == "sidewalk"]
 
 
 def layers_of(name: str) -> set[str]:
-    """Every layer that a surface may show on a map that is no generated city."""
+    """Return every layer that a surface may show on a map that is no generated city."""
     shown = APPEARANCE_OVERRIDES.get(name, (name,))[0]
     return {layer_of(shown, seed) for seed in range(60)}
 
 
 def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> None:
-    """Whatever a sidewalk is paved with, its layers are none of a carriageway's, a verge's or open
-    ground's, and its colour is far from theirs; each look of open ground is in the tables of
-    cameras and of maps."""
+    """No layer of a sidewalk is one of a road, verge or open ground, and its colour is far from
+    theirs. Each look of open ground is in the tables of cameras and of maps."""
     others = [
         "road",
         "crossing",
@@ -85,15 +84,15 @@ def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> No
         *(name for name in PAVINGS if name.startswith("verge:")),
     ]
     others += [f"ground:{kind}" for kind in LAND_KINDS if kind != PLAIN_GROUND]
-    layers = {name: layers_of(name) for name in (*walked(), *others)}
-    colours = {name: surface_look(name)[1] for name in (*walked(), *others)}
+    layers = {name: layers_of(name) for name in (*sidewalk_surfaces(), *others)}
+    colours = {name: surface_look(name)[1] for name in (*sidewalk_surfaces(), *others)}
     colours |= {name: colour for name, (_, colour) in APPEARANCE_OVERRIDES.items()}
     colours |= {
         f"ground:{kind}": GROUND_LOOKS[kind].seen for kind in LAND_KINDS if kind != PLAIN_GROUND
     }
     assert set(GROUND_LOOKS) == set(LAND_KINDS)
     assert all(kind in SURFACE_LAYERS for kind in LAND_KINDS if kind != PLAIN_GROUND)
-    for one in walked():
+    for one in sidewalk_surfaces():
         for other in others:
             assert not layers[one] & layers[other], (one, other)
             assert np.linalg.norm(lab(colours[one]) - lab(colours[other])) >= MIN_DISTANCE, (
@@ -104,10 +103,9 @@ def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> No
     assert len(set(drawn)) == len(drawn)
 
 
-def test_what_covers_open_ground_hangs_on_land_use_then_on_neighbours() -> None:
-    """A parking lot is a yard and a pond in a wood is water; between a sidewalk and the house
-    behind it lies a bed; nothing overlaps, and the rest is lawn. Generated cities have none of
-    it."""
+def test_open_ground_follows_land_use_then_neighbours() -> None:
+    """A parking lot is a yard, a pond in a wood is water, a bed lies between a sidewalk and its
+    house, and the rest is lawn. Generated cities have none."""
     found = dict(open_ground(MAP, shapely.box(-70.0, -40.0, 70.0, 40.0)))
     assert found["yard"].contains(shapely.Point(20.0, 20.0))
     pond, wood, bed, lawn = (
@@ -125,8 +123,8 @@ def test_what_covers_open_ground_hangs_on_land_use_then_on_neighbours() -> None:
 
 
 def test_maps_from_above_show_the_same_ground_as_cameras() -> None:
-    """Where a camera sees a yard, water or a bed, pictures from above have the colour of that look,
-    not the lawn's."""
+    """Where a camera sees a yard, water or a bed, a picture from above has the colour of that
+    look."""
     bounds = (-70.0, -40.0, 70.0, 40.0)
     sheet = Sheet(bounds)
     draw_streets(sheet, MAP, shapely.box(*bounds))
@@ -147,27 +145,26 @@ def test_maps_from_above_show_the_same_ground_as_cameras() -> None:
     assert {"yard", "water", "planting"} <= set(checked)
 
 
-class Looked(StreetSurface):
-    """A street whose labels are what it looks like: "sidewalk" what has a layer of sidewalks, else
-    "road"."""
+class LabelledByLook(StreetSurface):
+    """A street whose labels are its looks: "sidewalk" for layers of sidewalks, else "road"."""
 
     def kept(self, kind: str, key: Key, make: object) -> Arrays:
         return make() if kind == "gl" else super().kept(kind, key, make)  # type: ignore[operator,no-any-return,arg-type]
 
     def chunk(self, key: Key) -> Chunk:
-        whole = super().chunk(key)
-        return dataclasses.replace(whole, ground=tuple(map(relabelled, whole.ground)))
+        chunk = super().chunk(key)
+        return dataclasses.replace(chunk, ground=tuple(map(relabelled, chunk.ground)))
 
     def covers(self, key: Key) -> tuple[Patch, ...]:
         return tuple(map(relabelled, super().covers(key)))
 
     def finish(self, key: Key) -> TexturedDetails:
-        whole = super().finish(key)
-        return dataclasses.replace(whole, laid=tuple(map(relabelled, whole.laid)))
+        details = super().finish(key)
+        return dataclasses.replace(details, laid=tuple(map(relabelled, details.laid)))
 
 
 def relabelled(patch: Patch) -> Patch:
-    return patch._replace(label="sidewalk" if walked_on(patch.layer) else "road")
+    return patch._replace(label="sidewalk" if is_sidewalk_layer(patch.layer) else "road")
 
 
 CAMERAS = [
@@ -184,13 +181,13 @@ CAMERAS = [
 
 @pytest.mark.engine
 @pytest.mark.parametrize("make", CAMERAS)
-def test_a_camera_shows_walkable_ground_apart_from_all_other(
+def test_walkable_ground_looks_different_from_all_other_ground(
     make: type[GlCamera | BulletCamera],
 ) -> None:
-    """In pictures from a sidewalk of asphalt no pixel of open ground looks like a sidewalk, every
-    one of the sidewalk does, and their mean colours are far apart."""
+    """In pictures from an asphalt sidewalk only pixels of sidewalk have its look, and mean colours
+    are far apart."""
     spec = CameraSpec(96, 72)
-    labels, looks = BulletWorld(StreetSurface(MAP, 4)), BulletWorld(Looked(MAP, 4))
+    labels, looks = BulletWorld(StreetSurface(MAP, 4)), BulletWorld(LabelledByLook(MAP, 4))
     poses = [
         Pose(x, y, turn)
         for x, y in ((-40.0, 5.0), (8.0, 5.0), (40.0, -6.5))

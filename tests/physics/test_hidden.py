@@ -1,4 +1,4 @@
-"""What a picture shows and what is hidden in it."""
+"""Visible and hidden places of a picture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from physics.street.street_surface import StreetSurface
 from tests.support.tiny_street import tiny_map
 
 LOW = Barrier(x_m=-16.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end=0, height_m=0.6)
-"""Across the northern sidewalk."""
+"""A low fence across the northern sidewalk."""
 
 
 @pytest.mark.engine
@@ -44,11 +44,10 @@ LOW = Barrier(x_m=-16.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end
         "behind a house",
     ],
 )
-def test_who_is_seen_has_pixels_and_who_is_hidden_has_none(
+def test_visible_people_have_pixels_and_hidden_ones_have_none(
     at: tuple[float, float], heading_deg: float, fences: Sequence[Barrier], shown: bool
 ) -> None:
-    """A tenth of the body unhidden by rays where the standard camera shows it; no ray where it
-    shows nothing."""
+    """Rays reach a tenth of a body exactly where the standard camera shows it."""
     people = People.of(("e0",), np.array([at]), [math.pi], [0.0], ("stand",), kind=PersonKind.EVENT)
     street = Street(0, people)
     with BulletWorld(StreetSurface(tiny_map(), seed=0), fences) as world:
@@ -74,16 +73,16 @@ SHOTS = {
 
 
 def on_picture(taken: Shot, xy: Floats) -> NDArray[np.bool_]:
-    """Whether each of (N, 2) places on the ground lies in the picture."""
+    """Return whether each of (N, 2) places on the ground lies in the picture."""
     right, up, ahead = taken.axes @ (np.column_stack([xy, np.zeros(len(xy))]) - taken.eye_m).T
     wide, tall = taken.half_picture
     return np.asarray((ahead > 0.0) & (np.abs(right) < wide * ahead) & (np.abs(up) < tall * ahead))
 
 
 @pytest.mark.parametrize("name", SHOTS)
-def test_nothing_that_a_picture_shows_is_left_out(name: str) -> None:
-    """Of ten thousand places around the eye, all that lie in the picture are taken for seen, and
-    most others are not where the picture is level."""
+def test_all_places_of_a_picture_count_as_visible(name: str) -> None:
+    """Of ten thousand places around the eye, all in the picture count as visible, and of a level
+    picture most others do not."""
     taken = SHOTS[name]
     xy = taken.eye_m[:2] + np.random.default_rng(3).uniform(-30.0, 30.0, (10_000, 2))
     shown = on_picture(taken, xy)

@@ -1,5 +1,5 @@
-"""The robot on hilly streets: a net with elevations, built by netconvert, under its wheels and
-through an episode."""
+"""The robot on hilly streets: a net with elevations by netconvert, driving on it, and an
+episode."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ pytestmark = pytest.mark.engine
 GRADE = 0.1
 
 
-class Unseeing(Route):
-    """Needs no pictures to drive."""
+class BlindRoute(Route):
+    """A route policy without pictures."""
 
     manifest = dataclasses.replace(Route.manifest, camera=None)
 
@@ -41,8 +41,8 @@ EMPTY = Street(0)
 
 
 def hill_net(folder: Path) -> Path:
-    """A hill of 10 %: three streets of 200 m up its side, joined by streets along it, from 0 m to
-    13 m and level on."""
+    """Build a hill of 10 %: three streets of 200 m up its side, joined by streets along it, from 0
+    m to 13 m and level beyond."""
     nodes = []
     edges = []
     for i in range(3):
@@ -81,12 +81,12 @@ def world(hill: StreetMap) -> Iterator[BulletWorld]:
 
 
 def uphill(hill: StreetMap) -> Polyline:
-    """The middle line of a sidewalk that rises from 0 m to 6.4 m."""
+    """Return the middle line of a sidewalk that rises from 0 m to 6.4 m."""
     return Polyline(hill.strips["10-11"].line)
 
 
-def test_the_hill_is_as_steep_as_it_was_drawn(hill: StreetMap) -> None:
-    """The land under a sidewalk rises by a tenth along it and not across it; every strip may be
+def test_the_land_has_the_grade_of_the_net(hill: StreetMap) -> None:
+    """The land under a sidewalk rises by a tenth along it and not across it, and every strip may be
     driven."""
     assert hill.terrain is not None and hill.elevation is not None
     line = uphill(hill)
@@ -102,8 +102,8 @@ def test_the_hill_is_as_steep_as_it_was_drawn(hill: StreetMap) -> None:
 def test_the_robot_holds_its_speed_up_and_down(
     hill: StreetMap, world: BulletWorld, up: bool
 ) -> None:
-    """At 1.5 m/s on 10 % it is within 5 % of the command, leans as the street does, and its wheels
-    stay on it."""
+    """At 1.5 m/s on 10 % it is within 5 % of the command, leans like the street, and keeps its
+    wheels on it."""
     line = uphill(hill) if up else Polyline(uphill(hill).points[::-1])
     state = world.place(Pose(*line.at(12.0)))
     start_m = state.z_m
@@ -141,18 +141,20 @@ def test_vehicles_are_on_the_slope(hill: StreetMap, world: BulletWorld) -> None:
     assert 7.0 < motion.robot.z_m < 14.0
 
 
-def test_an_episode_on_the_hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The net is imported and told of, and the expert reaches a goal on it, uphill and down,
-    without a failure."""
+def test_an_episode_on_the_hill_reaches_its_goal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The import reports the elevation, and the expert reaches a goal uphill and downhill without a
+    failure."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     import_map(hill_net(tmp_path), "hill")
     street_map, check, _ = checked_map("hill")
     assert any(note.startswith("elevation 0 to 13 m is kept") for note in check.notes)
     assert street_map.terrain is not None
-    (whole,) = suite_on_map("long-horizon", "hill", 3, 1).scenarios
-    way = whole.route[:66]
+    (drawn,) = suite_on_map("long-horizon", "hill", 3, 1).scenarios
+    way = drawn.route[:66]
     scenario = msgspec.structs.replace(
-        whole,
+        drawn,
         route=way,
         goal=way[-1],
         events=(),
@@ -162,5 +164,5 @@ def test_an_episode_on_the_hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     heights = street_map.terrain.height(np.array(way))
     top = int(heights.argmax())
     assert heights[top] - heights[0] > 3.0 and heights[top] - heights[-1] > 1.5
-    done = run_episode(scenario, Unseeing())
+    done = run_episode(scenario, BlindRoute())
     assert (done.record.ended, done.record.failures) == ("goal", ())

@@ -1,4 +1,4 @@
-"""Tiles that are kept: those that are read are those that would be made."""
+"""Stored tiles: tiles that are read equal tiles that are made."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from physics.street import tile_cache as kept_tiles
 from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place, surface_of_place
 from tests.conftest import ROOT
-from tests.support import in_turn
+from tests.support import episode_order
 
 CITY = City(seed=1, size_m=500.0)
 
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache with all that the tests' own has, but for tiles."""
+    """Return a cache with all entries of the tests' own, except tiles."""
     place(CITY)
     folder = tmp_path / "cache"
     folder.mkdir()
@@ -42,8 +42,8 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From now on no tile can be made."""
+def forbid_making_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every attempt to make a tile fail."""
 
     def fails(*_: object, **__: object) -> None:
         raise EngineError("a tile was made")
@@ -60,43 +60,43 @@ def hilly(street_map: StreetMap) -> StreetMap:
     ).with_input_hash("hilly")
 
 
-def equal(one: object, other: object) -> bool:
-    """Whether two values are the same to the bit, arrays and shapes in them too."""
-    if type(one) is not type(other):
+def equal(first: object, second: object) -> bool:
+    """Return whether two values are the same to the bit, with their arrays and shapes."""
+    if type(first) is not type(second):
         return False
-    if isinstance(one, np.ndarray):
-        assert isinstance(other, np.ndarray)
-        alike = (one.dtype, one.shape, one.flags.c_contiguous) == (
-            other.dtype,
-            other.shape,
-            other.flags.c_contiguous,
+    if isinstance(first, np.ndarray):
+        assert isinstance(second, np.ndarray)
+        same_layout = (first.dtype, first.shape, first.flags.c_contiguous) == (
+            second.dtype,
+            second.shape,
+            second.flags.c_contiguous,
         )
-        return alike and one.tobytes() == other.tobytes()
-    if isinstance(one, shapely.Geometry):
-        return shapely.to_wkb(one) == shapely.to_wkb(other)
-    if isinstance(one, dict):
-        return [*one] == [*other] and all(map(equal, one.values(), other.values()))  # type: ignore[call-overload,attr-defined]
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(equal, one, other))  # type: ignore[arg-type]
-    if dataclasses.is_dataclass(one):
-        names = [field.name for field in dataclasses.fields(one)]
-        return all(equal(getattr(one, name), getattr(other, name)) for name in names)
-    return repr(one) == repr(other)
+        return same_layout and first.tobytes() == second.tobytes()
+    if isinstance(first, shapely.Geometry):
+        return shapely.to_wkb(first) == shapely.to_wkb(second)
+    if isinstance(first, dict):
+        return [*first] == [*second] and all(map(equal, first.values(), second.values()))  # type: ignore[call-overload,attr-defined]
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(equal, first, second))  # type: ignore[arg-type]
+    if dataclasses.is_dataclass(first):
+        names = [field.name for field in dataclasses.fields(first)]
+        return all(equal(getattr(first, name), getattr(second, name)) for name in names)
+    return repr(first) == repr(second)
 
 
 @pytest.mark.parametrize("ground", ["flat", "rough", "hilly"])
-def test_a_tile_that_is_read_is_the_one_that_is_made(
+def test_stored_tiles_equal_made_ones(
     cache: Path, monkeypatch: pytest.MonkeyPatch, ground: str
 ) -> None:
-    """Meshes, heights, houses, props and covers: equal to the bit to those of a map of which
-    nothing is kept."""
+    """Meshes, heights, houses, props and covers equal those of a map without stored tiles to the
+    bit."""
     street_map = place(CITY)[1]
     street_map = hilly(street_map) if ground == "hilly" else street_map
     roughness = 0.6 if ground == "rough" else 0.0
-    unkept = dataclasses.replace(street_map)
-    assert street_map.input_hash and not unkept.input_hash
+    unstored = dataclasses.replace(street_map)
+    assert street_map.input_hash and not unstored.input_hash
     keys = tiles_within(250.0, 250.0, 15.0)
-    made = StreetSurface(unkept, 3, roughness)
+    made = StreetSurface(unstored, 3, roughness)
     tiles = [made._built(key) for key in keys]
     wanted = [(tile.parts, tile.low, tile.crossings, tile.relief) for tile in tiles]
     chunks, finishes = [made.chunk(key) for key in keys], [made.finish(key) for key in keys]
@@ -113,17 +113,17 @@ def test_a_tile_that_is_read_is_the_one_that_is_made(
     for key in keys:
         first.chunk(key)
     with monkeypatch.context() as patch:
-        no_more(patch)
-        again = StreetSurface(street_map, 3, roughness)
-        read = [again.tile(key) for key in keys]
+        forbid_making_tiles(patch)
+        stored = StreetSurface(street_map, 3, roughness)
+        read = [stored.tile(key) for key in keys]
         assert equal([(tile.parts, tile.low, tile.crossings, tile.relief) for tile in read], wanted)
-        assert equal([again.chunk(key) for key in keys], chunks)
-        assert equal([again.heights(xy) for xy in points], heights)
-    assert equal([again.finish(key) for key in keys], finishes)
+        assert equal([stored.chunk(key) for key in keys], chunks)
+        assert equal([stored.heights(xy) for xy in points], heights)
+    assert equal([stored.finish(key) for key in keys], finishes)
 
 
-def test_what_is_kept_of_a_place_is_of_that_place_alone(cache: Path) -> None:
-    """Another seed, another roughness and a map that was changed do not get what is kept."""
+def test_stored_tiles_belong_to_one_place_seed_and_roughness(cache: Path) -> None:
+    """Another seed, another roughness and a changed map do not use them."""
     street_map = place(CITY)[1]
     key = tile_at(250.0, 250.0)
     for surface in (
@@ -136,8 +136,8 @@ def test_what_is_kept_of_a_place_is_of_that_place_alone(cache: Path) -> None:
     assert len([*(cache / "tiles").iterdir()]) == 3
 
 
-def test_a_name_tells_all_that_a_tile_stands_on() -> None:
-    """What the sources of tiles import is in their rooms, or in the list of packages."""
+def test_the_key_of_a_tile_covers_all_its_sources() -> None:
+    """Modules that tiles import are in the hashed folders, or in the list of packages."""
     files = [path for room in kept_tiles._SOURCE_FOLDERS[2:5] for path in room.rglob("*.py")]
     bodies = {"bodies.py", "bullet.py", "drive.py", "gltf.py", "movers.py", "world.py"}
     trees = [ast.parse(path.read_text()) for path in files if path.name not in bodies]
@@ -170,23 +170,23 @@ def test_a_name_tells_all_that_a_tile_stands_on() -> None:
 
 @pytest.mark.engine
 @pytest.mark.skipif(not available(), reason="no OpenGL through EGL here (see `cosim doctor`)")
-def test_an_episode_is_the_same_with_tiles_made_and_with_tiles_read(
+def test_an_episode_is_the_same_with_stored_tiles(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """State hash and pictures; the second time no tile is made, and the third time some are, as
-    files are missing."""
-    scenario, manifest = next(iter(in_turn.drawn()))
+    """State hash and pictures are equal when no tile is made, and when some are made again after
+    files are lost."""
+    scenario, manifest = next(iter(episode_order.drawn()))
     assert manifest.camera is not None
 
     def driven() -> str:
         surface_of_place.cache_clear()
-        return in_turn.hash_of(scenario, manifest)
+        return episode_order.hash_of(scenario, manifest)
 
     made = driven()
     files = sorted(path for path in (cache / "tiles").rglob("*") if path.is_file())
     assert {path.name.partition("_")[0] for path in files} == {"ground", "things", "gl"}
     with monkeypatch.context() as patch:
-        no_more(patch)
+        forbid_making_tiles(patch)
         assert driven() == made
     for path in files[::2]:
         path.unlink()

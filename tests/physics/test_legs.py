@@ -1,4 +1,4 @@
-"""Robots with legs in the engine: how they walk, stand and fall, and what the cameras draw."""
+"""Robots with legs in the engine: walking, standing, falling, and their pictures."""
 
 from __future__ import annotations
 
@@ -85,14 +85,14 @@ def walk(robot: Robot) -> Iterator[Walk]:
 
 
 def engine_of(walk: Walk) -> tuple[int, int]:
-    """Body of the robot, and PyBullet client."""
+    """Return the body of the robot, and the PyBullet client."""
     bodies = walk.world._engine
     return bodies._robot, bodies._client
 
 
-def test_a_urdf_is_as_its_table_says(robot: Robot) -> None:
-    """The file is what the table writes; Bullet has the table's masses and inertias, none of them
-    0, and the drawn body at rest fills the outline with its feet on the ground."""
+def test_a_urdf_matches_its_table(robot: Robot) -> None:
+    """The file is what the table writes, Bullet has its positive masses and inertias, and the drawn
+    body at rest fills the outline."""
     model, legs = MODELS[robot.name], legs_of(robot)
     assert urdf_path(robot).read_text() == model.urdf()
     assert model.mass_kg == pytest.approx(MASSES_KG[robot.name], abs=0.05)
@@ -125,8 +125,8 @@ def test_a_urdf_is_as_its_table_says(robot: Robot) -> None:
     assert low == pytest.approx([-half[0], -half[1], -legs.stand_m], abs=0.015)
 
 
-def test_a_leg_reaches_its_foot() -> None:
-    """The angles of the inverse kinematics put the foot where it was wanted, on either side."""
+def test_leg_angles_put_the_foot_at_its_target() -> None:
+    """Inverse kinematics hold on either side."""
     for side in (1.0, -1.0):
         for x, y, z in ((0.0, 0.0955, -0.25), (0.1, 0.12, -0.3), (-0.12, 0.02, -0.2)):
             hip, thigh, calf = leg_angles(x, side * y, z, side)
@@ -137,9 +137,9 @@ def test_a_leg_reaches_its_foot() -> None:
             assert (ahead, left, up) == pytest.approx((x, side * y, z))
 
 
-def test_it_walks_straight_turns_and_stops(robot: Robot) -> None:
-    """10 m in time and on the line; yaw rates within 15 % in walking and on the spot; a stop within
-    half a metre."""
+def test_a_robot_walks_straight_turns_and_stops(robot: Robot) -> None:
+    """It walks 10 m in time and on the line, turns within 15 % of the yaw rate, also in place, and
+    stops within half a metre."""
     v_mps = STRAIGHT_MPS[robot.name]
     with walking(robot, FLAT, START) as walk:
         found = straight(walk, v_mps)
@@ -155,8 +155,8 @@ def test_it_walks_straight_turns_and_stops(robot: Robot) -> None:
 
 
 def test_the_oracle_plans_with_the_outline_of_the_moving_legs(robot: Robot, walk: Walk) -> None:
-    """Walking, turning and stopping, every point of the body is within the disks around the points
-    that the oracle checks."""
+    """While walking, turning and stopping, every point of the body is within the disks that the
+    oracle checks."""
     tree, parts = link_tree(urdf_path(robot)), link_parts(urdf_path(robot))
     axis = np.array([(x, 0.0) for x in axis_points(robot)])
     v, w = robot.cruise_mps, robot.w_max_radps
@@ -171,15 +171,15 @@ def test_the_oracle_plans_with_the_outline_of_the_moving_legs(robot: Robot, walk
                     assert off_m.max() < robot.width_m / 2 + 0.05
 
 
-def test_it_stands_for_a_minute(walk: Walk) -> None:
+def test_a_robot_stands_for_a_minute(walk: Walk) -> None:
     """It drifts less than 5 cm and 3 degrees, and its mean speed counts as standing."""
     drift_m, turned_deg = stand(walk, 60.0)
     assert drift_m < 0.05 and turned_deg < 3.0
     assert abs(walk.robot.v_mps) < 0.05 and abs(walk.robot.w_radps) < 0.05
 
 
-def test_it_follows_random_commands(robot: Robot) -> None:
-    """A minute each on level ground, ramps of 1:12 and steps of 3 cm: no fall; mean errors up to 0.1
+def test_a_robot_follows_random_commands(robot: Robot) -> None:
+    """On level ground, ramps of 1:12 and steps of 3 cm it does not fall, with mean errors up to 0.1
     m/s and 0.1 rad/s. `cosim bench legs` takes an hour of it."""
     found = []
     for seed, course in enumerate((FLAT, RAMPS, STEPS)):
@@ -190,14 +190,16 @@ def test_it_follows_random_commands(robot: Robot) -> None:
     assert np.mean([one.error_radps for one in found]) < 0.1
 
 
-def test_it_walks_down_curbs(robot: Robot) -> None:
-    """12 cm at 0.5 m/s: no fall in 20 phases of the gait."""
+def test_a_robot_walks_down_curbs(robot: Robot) -> None:
+    """At 0.5 m/s it does not fall from 12 cm in 20 phases of the gait."""
     assert sum(down_curb(robot, 0.5, 0.6 + 0.011 * k) for k in range(20)) == 0
 
 
 @pytest.mark.parametrize(("v_mps", "height_m"), [(0.5, 0.12), (1.0, 0.12), (1.0, 0.06)])
-def test_a_walk_up_a_curb_ends_soundly(robot: Robot, v_mps: float, height_m: float) -> None:
-    """It climbs, falls or stands before it; its base is finite and not below the ground."""
+def test_a_walk_up_a_curb_ends_in_a_valid_state(
+    robot: Robot, v_mps: float, height_m: float
+) -> None:
+    """The robot climbs, falls or stops, and its base is finite and not below the ground."""
     state, _ = up_curb(robot, v_mps, height_m)
     assert np.isfinite([*state.pose, state.z_m]).all()
     assert -0.1 < state.z_m < height_m + 0.1
@@ -213,7 +215,7 @@ def digest(motions: list[Motion]) -> str:
 
 
 def wandered(walk: Walk, ticks: int = 100) -> str:
-    """Hash of a walk with changing commands."""
+    """Return the hash of a walk with changing commands."""
     commands = [Command(0.8, 0.3), Command(0.3, -0.6), STILL, Command(1.2, 0.0)]
     return digest([walk.tick(commands[4 * k // ticks]) for k in range(ticks)])
 
@@ -226,11 +228,9 @@ def push(walk: Walk, impulse_ns: float) -> None:
     p.applyExternalForce(body, -1, force, at, p.WORLD_FRAME, physicsClientId=client)
 
 
-def test_a_push_falls_once_and_the_robot_walks_on_as_from_a_fresh_start(
-    robot: Robot, walk: Walk
-) -> None:
-    """After 60 N s it is down for 0.1 s once; put back, it walks within 2 s, and to the bit as a
-    robot that starts there."""
+def test_a_pushed_robot_falls_once_and_restarts_like_a_new_one(robot: Robot, walk: Walk) -> None:
+    """After 60 N s it has fallen once; put back, it walks within 2 s, to the bit like a robot that
+    starts there."""
     walk.drive(Command(0.5, 0.0), 2.0)
     assert walk.fallen == 0
     push(walk, 60.0)
@@ -257,9 +257,9 @@ with walking(robot_called("{name}"), FLAT, START) as walk:
 """
 
 
-def test_a_walk_has_one_hash(robot: Robot, walk: Walk) -> None:
-    """In this process and in another one, with other kernels of OpenBLAS."""
-    here = wandered(walk)
+def test_a_walk_has_the_same_hash_in_every_process(robot: Robot, walk: Walk) -> None:
+    """Other processes and other kernels of OpenBLAS give the same hash."""
+    expected = wandered(walk)
     for kernel in ("Haswell", "Nehalem"):
         done = subprocess.run(
             [sys.executable, "-c", PROCESS.format(name=robot.name)],
@@ -268,12 +268,12 @@ def test_a_walk_has_one_hash(robot: Robot, walk: Walk) -> None:
             text=True,
             check=True,
         )
-        assert done.stdout.split()[-1] == here
+        assert done.stdout.split()[-1] == expected
 
 
-def test_the_legs_of_both_cameras_meet_the_ground(robot: Robot, walk: Walk) -> None:
-    """The lowest point that is drawn is within 1 cm of the ground, standing and walking, and
-    Bullet's own links are where the recorded joint angles put them."""
+def test_drawn_legs_touch_the_ground(robot: Robot, walk: Walk) -> None:
+    """The lowest drawn point is within 1 cm of the ground, and Bullet's links are where the
+    recorded joint angles put them."""
     tree, parts = link_tree(urdf_path(robot)), link_parts(urdf_path(robot))
     body, client = engine_of(walk)
     for command in (STILL, Command(0.8, 0.2), Command(0.8, 0.2)):
@@ -305,8 +305,8 @@ def test_a_camera_moves_with_the_trunk(robot: Robot) -> None:
     assert after.steep_rad - before.steep_rad == pytest.approx(0.2)
 
 
-def test_a_low_fence_is_a_collision_of_the_legs_and_the_ground_is_none(robot: Robot) -> None:
-    """Walking touches nothing; a fence of 10 cm, below the trunk, is touched."""
+def test_legs_collide_with_a_low_fence_and_not_with_the_ground(robot: Robot) -> None:
+    """Walking has no contacts until a fence of 10 cm, below the trunk."""
     fence = Barrier(
         x_m=-38.0, y_m=0.0, heading_rad=0.0, length_m=4.0, strip="s", end=0, height_m=0.1
     )
@@ -319,7 +319,7 @@ def test_a_low_fence_is_a_collision_of_the_legs_and_the_ground_is_none(robot: Ro
 
 
 def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
-    """The error has the engine's values; a robot that lies or stands is sound."""
+    """The error has the engine's values; a robot that lies or stands is valid."""
     legs = legs_of(robot)
     monitor = LegMonitor(legs, legs.cycle_s, 0.005)
     for z_m, sound in ((0.0, True), (-legs.stand_m, True), (-2.0, False), (5.0, False)):
@@ -333,7 +333,7 @@ def test_a_body_that_sinks_or_flies_is_an_engine_error(robot: Robot) -> None:
         monitor.assess(RobotState(Pose(1.0, 2.0, 0.0), z_m=math.nan), 0.0, touches=False)
 
 
-class Broken:
+class NanDrive:
     """A drive whose torques are NaN."""
 
     reads_joints = True
@@ -347,15 +347,16 @@ class Broken:
 
 
 def test_a_pose_that_is_nan_is_an_engine_error() -> None:
-    """Before the ground below it is looked up, on streets too."""
-    with BulletWorld(StreetSurface(tiny_map(), 0), robot=DOG, drive=Broken()) as world:
+    """The error is raised before the ground below the robot is looked up."""
+    with BulletWorld(StreetSurface(tiny_map(), 0), robot=DOG, drive=NanDrive()) as world:
         world.place(Pose(0.0, 0.0, 0.0))
         with pytest.raises(EngineError, match=r"PyBullet: the robot with legs is at \(nan, nan"):
             world.step(STILL, Street(0), Street(0), 1)
 
 
 def test_drawing_needs_no_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A world of a walker without weights has a camera; only placing the robot reports them."""
+    """A world of a walker without weights has a camera, and only placing the robot reports them
+    missing."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with BulletWorld(FLAT, robot=ROBOTS["walker"]) as world:
@@ -368,8 +369,8 @@ def test_drawing_needs_no_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_speeds_are_means_over_a_gait_cycle(walk: Walk) -> None:
-    """A steady walk's speed differs by less than 0.1 m/s from tick to tick, and its mean is the way
-    per time."""
+    """The speed of a steady walk differs by less than 0.1 m/s from tick to tick, and its mean is
+    the distance over time."""
     walk.drive(Command(0.8, 0.0), 3.0)
     motions = walk.drive(Command(0.8, 0.0), 2.0)
     speeds = [motion.robot.v_mps for motion in motions]
@@ -381,10 +382,10 @@ def test_speeds_are_means_over_a_gait_cycle(walk: Walk) -> None:
     assert abs(wrap_angle(motions[-1].robot.pose.heading_rad)) < 0.5
 
 
-def test_the_bench_walks_with_a_gait_of_the_user(
+def test_the_bench_uses_the_gait_of_the_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each walk has a drive of its own with that gait, and the table names it."""
+    """Each walk has a separate drive with that gait, and the table names it."""
     made: list[Drive | None] = []
 
     def measure(robot: Robot, minutes: float, progress: Progress, drive: MakeDrive) -> list[str]:

@@ -1,4 +1,4 @@
-"""The lens: each effect against a case worked out by hand, and nothing at all by default."""
+"""The lens: each effect against a hand-computed case, and no effect by default."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FLAT = Mount((0.0, 0.0, 0.6))
 
 
 def spec(lens: Lens, width: int = 200, height: int = 100) -> CameraSpec:
-    """A camera with a focal length of 100 pixels."""
+    """Return a camera with a focal length of 100 pixels."""
     return CameraSpec(width, height, 2 * math.degrees(math.atan(0.005 * height)), FLAT, lens)
 
 
@@ -28,7 +28,7 @@ def flat(camera: CameraSpec, value: int) -> Frame:
 
 
 def test_a_default_lens_does_nothing() -> None:
-    """The frame itself comes back, and the camera that is drawn is the camera."""
+    """The frame and the camera are returned unchanged."""
     camera = spec(Lens())
     frame = flat(camera, 90)
     assert through(camera, frame, STILL, 1, 2) is frame
@@ -36,9 +36,9 @@ def test_a_default_lens_does_nothing() -> None:
 
 
 @pytest.mark.parametrize("k1", [-0.1, 0.2])
-def test_distortion_moves_a_point_as_brown_says(k1: float) -> None:
-    """A point 0.5 focal lengths off the axis is seen at 0.5 (1 + k1 / 4); labels and depth go with
-    it, unmixed."""
+def test_distortion_follows_the_model_of_brown(k1: float) -> None:
+    """A point 0.5 focal lengths off the axis is seen at 0.5 (1 + k1 / 4), with its label and depth
+    unmixed."""
     camera = spec(Lens(k1=k1))
     source = drawn(camera)
     at = round(0.5 * source.width + 50 - 0.5)
@@ -57,7 +57,8 @@ def test_distortion_moves_a_point_as_brown_says(k1: float) -> None:
 
 
 def test_a_barrel_is_drawn_wider_and_fills_the_picture() -> None:
-    """The camera to draw keeps its focal length and covers the corners; a pincushion needs less."""
+    """The drawn camera keeps its focal length and covers the corners, and a pincushion needs
+    less."""
     camera = spec(Lens(k1=-0.1))
     source = drawn(camera)
     assert source.width > 200 and source.height > 100 and source.lens == Lens()
@@ -70,8 +71,8 @@ def test_a_barrel_is_drawn_wider_and_fills_the_picture() -> None:
 
 
 def test_a_lens_that_folds_is_refused() -> None:
-    """k1 = -0.5 at a wide view has no picture; the message names the terms and the field of
-    view."""
+    """k1 = -0.5 at a wide view has no valid picture, and the message names the terms and the field
+    of view."""
     with pytest.raises(
         SpecError, match=r"lens k1 -0\.5, k2 0\.0 fold the picture .* field of view of 53"
     ):
@@ -79,8 +80,8 @@ def test_a_lens_that_folds_is_refused() -> None:
 
 
 def test_blur_is_as_long_as_the_turn() -> None:
-    """Turning left by 1 rad/s for 0.06 s smears an upright line over 6 pixels around its place; its
-    light stays."""
+    """Turning left by 1 rad/s for 0.06 s smears an upright line over 6 pixels around its place and
+    keeps its light."""
     camera = spec(Lens(shutter_s=0.06))
     frame = flat(camera, 0)
     frame.rgb[:, 99:101] = 255
@@ -95,8 +96,8 @@ def test_blur_is_as_long_as_the_turn() -> None:
 
 
 def test_driving_ahead_blurs_the_ground_and_not_the_horizon() -> None:
-    """At 1 m/s from 0.6 m up, ground seen at y below the axis slides down by y^2 / 0.6 focal
-    lengths a second."""
+    """At 1 m/s from 0.6 m up, ground seen at y below the axis moves down by y^2 / 0.6 focal lengths
+    a second."""
     camera = spec(Lens(readout_s=0.1))
     frame = flat(camera, 0)
     frame.rgb[95] = 255
@@ -121,7 +122,7 @@ def test_a_rolling_shutter_leans_an_upright_line() -> None:
     assert at[2] - at[0] == pytest.approx(10.0, abs=0.4)
 
 
-def test_noise_is_that_of_electrons() -> None:
+def test_noise_has_the_deviation_of_electrons() -> None:
     """A flat grey of 400 of 1000 electrons with 15 of read noise deviates by sqrt(400 + 225) = 25
     electrons."""
     value = 169  # sRGB 169 is 0.397 linear
@@ -139,9 +140,9 @@ def test_noise_is_that_of_electrons() -> None:
     assert not np.array_equal(seen[0], seen[2]) and not np.array_equal(seen[0], seen[3])
 
 
-def test_auto_exposure_reaches_for_grey_within_its_range() -> None:
-    """A picture of 0.09 is doubled to 0.18, one of 0.02 only doubled with a range of one stop, 0.18
-    is left alone."""
+def test_auto_exposure_targets_grey_within_its_range() -> None:
+    """A picture of 0.09 is doubled to 0.18, one of 0.02 only doubled with a range of one stop, and
+    0.18 is unchanged."""
     for mean, gain in ((0.09, 2.0), (0.02, 2.0), (0.18, 1.0), (0.9, 0.5)):
         assert exposure_gain(np.full((4, 4, 3), mean), 1.0) == pytest.approx(gain)
     camera = spec(Lens(auto_exposure_ev=2.0))
@@ -151,8 +152,8 @@ def test_auto_exposure_reaches_for_grey_within_its_range() -> None:
 
 
 def test_a_vignette_falls_with_the_fourth_power() -> None:
-    """One focal length off the axis, cos^4 of 45 degrees leaves a quarter of the light; the middle
-    keeps all."""
+    """One focal length off the axis, cos^4 of 45 degrees leaves a quarter of the light, and the
+    middle keeps all."""
     camera = spec(Lens(vignette=1.0))
     seen = through(camera, flat(camera, 255), STILL, 0, 0).rgb
     assert seen[50, 100, 0] == 255
@@ -160,14 +161,14 @@ def test_a_vignette_falls_with_the_fourth_power() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         ({"k1": -0.6}, r"lens k1 must be in \[-0\.5, 0\.5\], not -0\.6"),
         ({"shutter_s": float("nan")}, r"lens shutter_s must be in \[0, 0\.1\], not nan"),
         ({"read_noise_e": 3.0}, "lens read_noise_e needs full_well_e"),
     ],
 )
-def test_a_wrong_lens_is_told(wrong: dict[str, float], told: str) -> None:
+def test_an_invalid_lens_is_refused(wrong: dict[str, float], message: str) -> None:
     """The message names the field, the valid range and the value."""
-    with pytest.raises(SpecError, match=told):
+    with pytest.raises(SpecError, match=message):
         Lens(**wrong)

@@ -1,4 +1,4 @@
-"""Rays of lidar and tracked people against an exact caster of triangles, and their limits."""
+"""Lidar rays and tracked people against an exact ray caster, and their limits."""
 
 from __future__ import annotations
 
@@ -149,9 +149,9 @@ def poses_in(kind: str, draws: np.random.Generator) -> tuple[Surface, list[Pose]
 
 
 @pytest.mark.parametrize("kind", ["generated", "imported", "scan"])
-def test_a_scan_equals_an_exact_caster_of_triangles(kind: str) -> None:
+def test_a_scan_equals_an_exact_ray_caster(kind: str) -> None:
     """All distances of 3 rings over streets, people and cars are those of all triangles, level and
-    leaning; a person's circle has 360 sides there."""
+    leaning."""
     draws = np.random.default_rng(3)
     surface, poses = poses_in(kind, draws)
     with rays_on(surface) as rays:
@@ -171,8 +171,7 @@ def test_a_scan_equals_an_exact_caster_of_triangles(kind: str) -> None:
 
 
 def test_a_scan_equals_the_rays_of_the_physics() -> None:
-    """Barriers, obstacles, buildings and props are where the physics has them; Bullet's rays end
-    up to 1 cm early at grazing angles."""
+    """Barriers, obstacles, buildings and props are where the physics has them, within 1 cm."""
     surface = StreetSurface(tiny_map(), seed=0)
     fence = Barrier(x_m=-16.0, y_m=5.0, heading_rad=0.3, length_m=3.0, strip="nw", end=0)
     box = Obstacle(kind="planter", x_m=-22.0, y_m=4.0, heading_rad=0.7)
@@ -199,9 +198,9 @@ def test_a_scan_equals_the_rays_of_the_physics() -> None:
     assert near.sum() > 100 and got[near].min() < 3.0
 
 
-def test_rays_of_arrays_have_the_bits_of_the_rays_of_pybullet() -> None:
-    """20,000 rays, more than one call of Bullet takes, against a scan of which a tile was removed
-    and added again."""
+def test_array_rays_equal_pybullet_rays_to_the_bit() -> None:
+    """20,000 rays, more than one call of Bullet takes, are compared after a tile was removed and
+    added again."""
     surface, (at, _) = poses_in("scan", np.random.default_rng(0))
     meshes = [
         mesh
@@ -223,7 +222,7 @@ def test_rays_of_arrays_have_the_bits_of_the_rays_of_pybullet() -> None:
     assert 5_000 < np.isfinite(got).sum() < 19_000
 
 
-def test_neither_the_robot_nor_what_is_out_of_range_has_returns() -> None:
+def test_the_robot_and_distant_objects_have_no_returns() -> None:
     """On an open street the only return is that of a person 18 m away, at the distance of the
     cylinder's face."""
     surface = StreetSurface(tiny_map(), seed=0)
@@ -244,9 +243,9 @@ def test_neither_the_robot_nor_what_is_out_of_range_has_returns() -> None:
     [((-12.0, 5.0), True), ((-12.0, 5.6), True), ((-20.0, 22.0), False), ((-4.0, 5.0), False)],
     ids=["free", "aside", "behind a house", "out of range"],
 )
-def test_people_in_sight_and_in_range_are_seen(at: tuple[float, float], seen: bool) -> None:
-    """In all directions, but not through houses and not beyond 15 m; behind somebody else only if
-    a part shows."""
+def test_visible_people_in_range_are_reported(at: tuple[float, float], seen: bool) -> None:
+    """People are reported in all directions, but not through houses, beyond 15 m, or fully behind
+    another person."""
     surface = StreetSurface(tiny_map(), seed=0)
     with rays_on(surface) as rays:
         robot = leaning(surface, np.random.default_rng(0), Pose(-20.0, 5.0, 2.0), 0.0)
@@ -260,7 +259,7 @@ def test_people_in_sight_and_in_range_are_seen(at: tuple[float, float], seen: bo
 
 def test_no_reported_person_is_fully_occluded_in_pictures() -> None:
     """In 15 frames of a drive through a crowd every reported person in the picture from the same
-    eye has pixels by labels and depth."""
+    eye has pixels."""
     scenario = small_scenario()
     scenario = msgspec.structs.replace(
         scenario, crowd=CrowdSpec(persons=40, radius_m=25.0, vehicles=0), events=()

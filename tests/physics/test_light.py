@@ -1,4 +1,4 @@
-"""Light: its ranges, and that it changes a spec's hash only where it is spoken of."""
+"""Light: valid ranges, and storage in suite files."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def scenario(light: Light) -> Scenario:
 )
 def test_a_light_out_of_range_is_refused(field: str, value: float, valid: str) -> None:
     """The message names the field, the valid range and the value."""
-    with pytest.raises(SpecError) as told:
+    with pytest.raises(SpecError) as refused:
         Light(**{field: value})
-    assert str(told.value) == f"light {field} must be in {valid}, not {value}"
+    assert str(refused.value) == f"light {field} must be in {valid}, not {value}"
 
 
-def test_a_light_with_a_foreign_picture_is_refused() -> None:
-    """Only Radiance files are skies of the user's."""
+def test_a_sky_picture_must_be_a_radiance_file() -> None:
+    """Only Radiance files are skies of users."""
     with pytest.raises(
         SpecError, match=r"light hdri must be a Radiance \.hdr file, not 'sky\.exr'"
     ):
@@ -50,11 +50,11 @@ def test_a_light_with_a_foreign_picture_is_refused() -> None:
 
 
 def test_light_survives_a_suite_file(tmp_path: Path) -> None:
-    """Read again, each scenario has the light it was written with; a bad one is told with the file
-    and the field."""
-    whole = Suite(name="t", version="1", scenarios=(scenario(Light(hour=20.0, fog_m=80.0)),))
-    write_suite(whole, tmp_path / "s.json")
-    assert read_suite(tmp_path / "s.json") == whole
+    """Each scenario is read back with its light, and an invalid light is refused with file and
+    field."""
+    suite = Suite(name="t", version="1", scenarios=(scenario(Light(hour=20.0, fog_m=80.0)),))
+    write_suite(suite, tmp_path / "s.json")
+    assert read_suite(tmp_path / "s.json") == suite
     text = (tmp_path / "s.json").read_text()
     assert '"hour":20.0' in text
     (tmp_path / "bad.json").write_text(text.replace('"fog_m":80.0', '"fog_m":-80.0'))

@@ -1,4 +1,4 @@
-"""Who moves near the robot, and how."""
+"""People and vehicles that move near the robot."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ def people(rng: np.random.Generator, ids: list[str], xy: np.ndarray) -> People:
     )
 
 
-@pytest.mark.parametrize("who_changes", [True, False], ids=["some come and go", "all stay"])
-def test_who_comes_near_is_who_is_near_at_either_end_of_the_tick(who_changes: bool) -> None:
-    """Found as by looking at everybody: who is new, or has jumped, is at the new place all the
-    time."""
+@pytest.mark.parametrize("people_change", [True, False], ids=["some come and go", "all stay"])
+def test_movers_near_the_robot_are_near_at_either_end_of_the_tick(people_change: bool) -> None:
+    """The result equals a search over all people; new or displaced ones are at the new place all
+    the time."""
     rng = np.random.default_rng(3)
     seen = 0
     for _ in range(200):
         names = [f"p{k}" for k in range(40)]
         before = people(rng, names, rng.uniform(-15.0, 15.0, (40, 2)))
-        kept = list(rng.permutation(40)[:30]) if who_changes else range(40)
-        moved = before.xy[kept] + rng.normal(0.0, 1.0, (len(kept), 2)) * rng.choice(
-            [0.1, 8.0], (len(kept), 1)
+        remaining = list(rng.permutation(40)[:30]) if people_change else range(40)
+        moved = before.xy[remaining] + rng.normal(0.0, 1.0, (len(remaining), 2)) * rng.choice(
+            [0.1, 8.0], (len(remaining), 1)
         )
-        new = rng.uniform(-15.0, 15.0, (5, 2)) if who_changes else np.zeros((0, 2))
-        ids = [names[k] for k in kept] + [f"new{k}" for k in range(len(new))]
+        new = rng.uniform(-15.0, 15.0, (5, 2)) if people_change else np.zeros((0, 2))
+        ids = [names[k] for k in remaining] + [f"new{k}" for k in range(len(new))]
         after = people(rng, ids, np.concatenate([moved, new]))
         x, y = rng.uniform(-5.0, 5.0, 2).tolist()
         expected = {}
@@ -49,9 +49,9 @@ def test_who_comes_near_is_who_is_near_at_either_end_of_the_tick(who_changes: bo
         assert [mover.id for mover in found] == list(expected)
         for mover in found:
             start, change = expected[mover.id]
-            ways = np.array(mover.poses(10))
-            assert (ways == start + (np.arange(1, 11) / 10)[:, None] * change).all()
-            nearest_m = np.hypot(*(ways[:, :2] - (x, y)).T).min() - 0.5 * math.hypot(*mover.size_m)
+            paths = np.array(mover.poses(10))
+            assert (paths == start + (np.arange(1, 11) / 10)[:, None] * change).all()
+            nearest_m = np.hypot(*(paths[:, :2] - (x, y)).T).min() - 0.5 * math.hypot(*mover.size_m)
             assert mover.may_come_within(x, y, nearest_m + 1e-6)
             assert not mover.may_come_within(x, y, nearest_m - 2.0 * math.hypot(*change[:2]) - 1e-6)
         seen += len(found)
@@ -59,7 +59,7 @@ def test_who_comes_near_is_who_is_near_at_either_end_of_the_tick(who_changes: bo
 
 
 def test_a_vehicle_has_its_own_size() -> None:
-    """Of its row in the later snapshot, whatever the order was before."""
+    """The size is that of its row in the later snapshot, in any order."""
     before = Vehicles.of(
         ("a", "b"), [[0.0, 0.0], [1.0, 0.0]], [0.0, 0.0], [0.0, 0.0], [[4.0, 1.8], [12.0, 2.5]]
     )

@@ -1,5 +1,4 @@
-"""Obstacles of a scenario in the world and in pictures: what is bumped into, what is seen, what is
-exported."""
+"""Obstacles of a scenario in the physics, in pictures, and in exports."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ START = Pose(-40.0, 5.0, 0.0)
 
 
 def ahead(kind: str, far_m: float = 3.0, form: int = 1) -> Obstacle:
-    """In front of a robot at START, its wider side towards it."""
+    """Return an obstacle in front of a robot at START, with its wider side towards it."""
     turned_rad = 0.0 if kind == "sign" else math.pi / 2
     return Obstacle(
         kind=kind, x_m=START.x_m + far_m, y_m=START.y_m, heading_rad=turned_rad, form=form
@@ -39,9 +38,9 @@ def ahead(kind: str, far_m: float = 3.0, form: int = 1) -> Obstacle:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_outline_is_that_of_the_body(kind: str) -> None:
-    """The ground that the spec says an obstacle covers is the ground that physics gives it, turned
-    as it is."""
+def test_the_footprint_equals_the_body(kind: str) -> None:
+    """The ground that the spec gives an obstacle is the ground of its body in the physics,
+    rotated."""
     for form in range(OBSTACLE_FORMS):
         one = Obstacle(kind=kind, x_m=3.0, y_m=-2.0, heading_rad=0.7, form=form)
         (ground,) = footprints([obstacle_prop(one, 0)])
@@ -54,8 +53,8 @@ def test_the_outline_is_that_of_the_body(kind: str) -> None:
         )
 
 
-def test_what_cannot_be_an_obstacle_is_refused() -> None:
-    """A form or a place out of range is named with what may stand there."""
+def test_an_invalid_obstacle_is_refused() -> None:
+    """A form or a heading out of range is named with the valid range."""
     with pytest.raises(SpecError, match=r"form must be in \[0, 11\], not 12"):
         Obstacle(kind="bin", x_m=0.0, y_m=0.0, heading_rad=0.0, form=12)
     with pytest.raises(SpecError, match="heading_rad"):
@@ -65,7 +64,7 @@ def test_what_cannot_be_an_obstacle_is_refused() -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_robot_that_drives_into_an_obstacle_touches_it(kind: str) -> None:
-    """The contact is with an object of that name, at its outline, and ends the drive there."""
+    """The contact is with an object of that name, at its outline."""
     one = ahead(kind)
     with BulletWorld(StreetSurface(MAP, seed=1), obstacles=[one]) as world:
         world.place(START)
@@ -80,8 +79,8 @@ def test_a_robot_that_drives_into_an_obstacle_touches_it(kind: str) -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("make", [GlCamera, BulletCamera], ids=["gl", "bullet"])
 def test_an_obstacle_is_seen_where_it_stands(make: type[Camera]) -> None:
-    """Each kind covers pixels labelled as a prop in the middle of the picture, and none without
-    it."""
+    """Each kind has pixels labelled as a prop in the middle of the picture, and there are none
+    without it."""
     surface = StreetSurface(MAP, seed=1)
     spec = CameraSpec(96, 96)
     street = Street(0)
@@ -94,15 +93,15 @@ def test_an_obstacle_is_seen_where_it_stands(make: type[Camera]) -> None:
 
 
 def test_obstacles_are_exported_by_their_names(tmp_path: Path) -> None:
-    """A .glb holds each of them where it stands, under a node named by its kind."""
+    """A .glb holds each of them at its place, under a node named by its kind."""
     import trimesh
 
     surface = StreetSurface(MAP, seed=1)
     path = tmp_path / "street.glb"
-    those = [ahead(kind, 3.0 + 3.0 * k) for k, kind in enumerate(KINDS)]
-    path.write_bytes(as_gltf(surface, [tile_at(*START.xy)], obstacles=those))
+    obstacles = [ahead(kind, 3.0 + 3.0 * k) for k, kind in enumerate(KINDS)]
+    path.write_bytes(as_gltf(surface, [tile_at(*START.xy)], obstacles=obstacles))
     scene = trimesh.load_scene(path)
-    for one in those:
+    for one in obstacles:
         parts = [
             mesh for name, mesh in scene.geometry.items() if name.startswith(f"obstacle:{one.kind}")
         ]

@@ -1,4 +1,4 @@
-"""People: skeleton, bodies, looks, gaits, poses, and how strides are counted."""
+"""People: skeleton, bodies, looks, gaits, poses, and strides."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def posed(made: SkinnedBody, row: int) -> Floats:
 
 
 def test_forward_kinematics_of_a_bent_elbow() -> None:
-    """A left elbow bent by a right angle from the T puts the wrist straight ahead of it; all else
-    stays."""
+    """A left elbow bent by a right angle from the T puts the wrist straight ahead of it, and no
+    other joint moves."""
     man = skeleton("man")
     turns = np.tile(np.eye(3), (1, 24, 1, 1))
     turns[0, INDEX["left_elbow"]] = rodrigues([0.0, 0.0, -0.5 * np.pi])
@@ -60,10 +60,10 @@ def test_forward_kinematics_of_a_bent_elbow() -> None:
 
 @pytest.mark.parametrize(("outfit", "level"), FORMS)
 def test_bodies_are_closed_and_weighted(outfit: int, level: int) -> None:
-    """Every edge has two triangles in opposite directions; weights fall and sum to 1; normals are
-    unit vectors."""
+    """Every edge has two triangles in opposite directions, weights fall and sum to 1, and normals
+    are unit vectors."""
     made = body(ALL[outfit], level)
-    assert sewn(made.triangles) == (True, True)
+    assert edges_match(made.triangles) == (True, True)
     assert made.weights.sum(axis=1) == pytest.approx(1.0, abs=1e-6)
     assert (np.diff(made.weights, axis=1) <= 1e-7).all() and (made.weights >= 0.0).all()
     assert np.linalg.norm(made.normals, axis=1) == pytest.approx(1.0, abs=1e-4)
@@ -71,8 +71,8 @@ def test_bodies_are_closed_and_weighted(outfit: int, level: int) -> None:
 
 
 def test_bodies_stand_on_the_ground_at_their_stature() -> None:
-    """As modelled, soles are at 0 and the top of the head within 6 cm of the family's stature, hair
-    and cap apart."""
+    """Soles are at 0 and the top of the head within 6 cm of the family's stature, without hair and
+    cap."""
     for outfit in ALL:
         made = body(outfit, 0)
         skin = made.vertices[made.coat == COATS.index("skin")]
@@ -80,16 +80,16 @@ def test_bodies_stand_on_the_ground_at_their_stature() -> None:
         assert float(skin[:, 2].max()) == pytest.approx(skeleton(outfit.family).height_m, abs=0.06)
 
 
-def sewn(triangles: np.ndarray) -> tuple[bool, bool]:  # type: ignore[type-arg]
-    """Whether triangles have their edges one way each; and whether no edge is a border."""
+def edges_match(triangles: np.ndarray) -> tuple[bool, bool]:  # type: ignore[type-arg]
+    """Return whether each directed edge occurs once, and whether no edge is a border."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    there = set(map(tuple, edges.tolist()))
-    return len(there) == len(edges), all((b, a) in there for a, b in there)
+    directed = set(map(tuple, edges.tolist()))
+    return len(directed) == len(edges), all((b, a) in directed for a, b in directed)
 
 
 def test_soles_touch_the_ground_in_stance() -> None:
-    """In every frame of every walk, and of every gesture, the lowest point of the body is within 2
-    cm of the ground."""
+    """In every frame of every walk and gesture, the lowest point of the body is within 2 cm of the
+    ground."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
         made = body(next(outfit for outfit in ALL if outfit.family == family), 1)
@@ -132,8 +132,8 @@ def test_feet_do_not_slide(pace: float) -> None:
 
 
 def test_the_stopping_hand_is_held_out() -> None:
-    """The right hand is more than half a metre ahead of the shoulder, at least as high, its palm
-    ahead, fingers up."""
+    """The right hand is half a metre ahead of the shoulder, at least as high, with the palm ahead
+    and fingers up."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
         matrix = clips.matrices[clips.gestures["stop"][k]].astype(float)
@@ -150,9 +150,8 @@ def test_the_stopping_hand_is_held_out() -> None:
         assert shown[:, 1].max() < -0.15 * f
 
 
-def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
-    """Of all families but children: hips behind the place on a seat, thighs level, feet at the
-    place and flat."""
+def test_sitting_people_have_hips_on_the_seat_and_feet_in_front() -> None:
+    """In all families but children, thighs are level and feet are flat at the place."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
         if family == "child":
@@ -170,8 +169,8 @@ def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
         assert at["left_ankle"][2] == pytest.approx(rest[INDEX["left_ankle"], 2], abs=0.02)
 
 
-def test_parts_turn_by_the_quaternions_of_scipy() -> None:
-    """Random rotations, half turns and no turn give the same bits; no people give no rows."""
+def test_quaternions_equal_those_of_scipy() -> None:
+    """Random rotations, half turns and no turn have the same bits, and no people give no rows."""
     exact = [np.eye(3), *(np.diag(signs) for signs in np.eye(3) * 2.0 - 1.0)]
     drawn = Rotation.random(2000, random_state=np.random.default_rng(0)).as_matrix()
     turns = np.concatenate([exact, drawn])
@@ -185,18 +184,17 @@ def test_parts_turn_by_the_quaternions_of_scipy() -> None:
     assert _quaternions(np.zeros((0, 13, 3, 3))).shape == (0, 13, 4)
 
 
-def test_looks_hang_on_name_and_age_alone() -> None:
-    """The same name looks the same in another process, another seed dresses it anew at the same
-    stature."""
+def test_looks_depend_on_name_age_and_seed() -> None:
+    """The same name looks the same in another process, and another seed gives other colours."""
     names = [(f"c{i}", i % 3) for i in range(60)]
     code = (
         f"from physics.people.appearance import look_of\n"
         f"for n in {names!r}: w = look_of(*n); print(w.outfit, w.colours.tolist())"
     )
-    said = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
     )
-    assert said.stdout.splitlines() == [
+    assert done.stdout.splitlines() == [
         f"{look_of(*n).outfit} {look_of(*n).colours.tolist()}" for n in names
     ]
     assert len({look_of(*n).outfit for n in names}) > 16
@@ -207,16 +205,16 @@ def test_looks_hang_on_name_and_age_alone() -> None:
 
 
 def test_outfit_colours_patterns_and_girth_are_independent() -> None:
-    """Of 4,000 names, every pair of outfit, colours, beard and girth is spread as if drawn by two
-    dice (chi-squared test): wearers of an outfit have all its colours equally often."""
+    """Over 4,000 names, every pair of outfit, colours, beard and girth passes a chi-squared test of
+    independence."""
     looks = [look_of(f"p{i}", Age.ADULT, 3, crowd=False) for i in range(4000)]
     men = [one for one in looks if ALL[one.outfit].family == "man"]
 
     def classes(values: Sequence[object]) -> np.ndarray:
         return np.unique(np.array([str(one) for one in values]), return_inverse=True)[1]
 
-    def darker(one: Look, coat: str) -> int:
-        return int(one.colours[COATS.index(coat)].astype(int).sum())
+    def darker(look: Look, coat: str) -> int:
+        return int(look.colours[COATS.index(coat)].astype(int).sum())
 
     girth = np.argsort(np.argsort([one.girth_m for one in men])) * 8 // len(men)
     draws = {
@@ -238,8 +236,8 @@ def test_outfit_colours_patterns_and_girth_are_independent() -> None:
 
 
 def test_sixty_outfits_follow_the_season() -> None:
-    """There are at least 60 different outfits. In every season each family and sex wears several of
-    its own, and no other."""
+    """There are at least 60 different outfits, and in every season each age wears several of its
+    own and no others."""
     assert len({(one.body, one.top, one.bottom, one.tops) for one in CLOTHES}) == len(CLOTHES) >= 60
     names = [f"c{i}" for i in range(400)]
     for season in SEASONS:
@@ -261,7 +259,8 @@ def test_sixty_outfits_follow_the_season() -> None:
 
 
 def test_rain_opens_umbrellas() -> None:
-    """In rain most people hold an umbrella, without rain none; the others keep what they push."""
+    """In rain most people hold an umbrella, without rain none, and the others keep what they
+    push."""
     names = [f"c{i}" for i in range(2000)]
     dry, wet = ([companion_of(name, 3, rain) for name in names] for rain in (False, True))
     assert "umbrella" not in dry and 0.5 < wet.count("umbrella") / len(names) < 0.8
@@ -271,7 +270,7 @@ def test_rain_opens_umbrellas() -> None:
 
 
 def test_cloth_shows_folds_at_a_distance() -> None:
-    """Averaged over 4 cm, a pixel of a person 10 m away, the brightness of all tops still varies."""
+    """Averaged over 4 cm, a pixel at 10 m, the brightness of all tops still varies."""
     maps = cloth_maps()
     rows = sorted({int(look_of(f"c{i}", 0).patterns[COATS.index("top")]) for i in range(200)})
     assert len(rows) > 6
@@ -281,9 +280,8 @@ def test_cloth_shows_folds_at_a_distance() -> None:
         assert means.std() > 0.08 * means.mean()
 
 
-def test_statures_are_of_all_ages() -> None:
-    """Of a thousand names each is a child, an adult or an elder, as is asked; adults are 1.4 to 2 m
-    tall."""
+def test_statures_follow_the_age() -> None:
+    """Each name is a child, an adult or an elder as requested, and adults are 1.4 to 2 m tall."""
     names = [f"c{i}" for i in range(1000)]
     children, grown, old = (
         [stature_m(name, age) for name in names] for age in (Age.CHILD, Age.ADULT, Age.ELDERLY)
@@ -295,7 +293,7 @@ def test_statures_are_of_all_ages() -> None:
     assert min(grown) > 1.40 and max(grown) < 2.0 and 1.66 < float(np.mean(grown)) < 1.74
 
 
-def test_strides_of_people_who_come_back_begin_again() -> None:
+def test_strides_of_returning_people_start_again() -> None:
     """After a tick without people, the next ones are new."""
     strides = Strides(0.05)
     one = ("c1",), np.zeros((1, 2)), np.ones(1), [Age.ADULT]
@@ -305,8 +303,8 @@ def test_strides_of_people_who_come_back_begin_again() -> None:
     assert strides.update(*one) == first
 
 
-def test_strides_follow_the_way_walked() -> None:
-    """Strides count the metres walked; standing and jumping count none."""
+def test_strides_count_the_distance_walked() -> None:
+    """Standing and jumping add no strides."""
     strides = Strides(0.05)
     start = first_stride("c1")
     for k in range(201):
@@ -327,7 +325,7 @@ def test_strides_follow_the_way_walked() -> None:
 
 
 def test_broken_captures_are_named(tmp_path: Path) -> None:
-    """A capture that is none is refused with its path; the shipped ones are read."""
+    """An invalid capture is refused with its path, and the shipped ones are read."""
     bad = tmp_path / "walk.txt"
     bad.write_text('{"Frames": [[1, 2, 3]]}')
     with pytest.raises(EngineError, match=r"walk\.txt: not a motion capture: 'Frames' must be"):

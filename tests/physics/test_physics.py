@@ -1,4 +1,4 @@
-"""The robot in the engine: drive, ramps, curbs, contacts, determinism; and what the camera sees."""
+"""The robot in the engine: driving, ramps, curbs, contacts, determinism, and camera pictures."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def person(x_m: float, y_m: float, heading_rad: float = 0.0, name: str = "c1") -
 def test_the_robot_reaches_the_commanded_speeds(
     world: BulletWorld, v_mps: float, w_radps: float
 ) -> None:
-    """Mean speed and yaw rate come within 5 % of the command, and the robot stays upright."""
+    """Mean speed and yaw rate are within 5 % of the command, and the robot stays upright."""
     world.place(OPEN)
     drive(world, v_mps, w_radps, 50)
     robots = [motion.robot for motion in drive(world, v_mps, w_radps, 40)]
@@ -74,7 +74,7 @@ def test_the_robot_reaches_the_commanded_speeds(
 
 @pytest.mark.engine
 def test_speed_follows_the_acceleration_limit(world: BulletWorld) -> None:
-    """From rest to 2 m/s takes 0.8 s at 2.5 m/s2, and the robot stops again in as long."""
+    """2 m/s take 0.8 s from rest at 2.5 m/s2, and as long to stop."""
     world.place(OPEN)
     speeds = [m.robot.v_mps for m in [*drive(world, 2.0, 0.0, 20), *drive(world, 0.0, 0.0, 20)]]
     assert speeds[7] == pytest.approx(1.0, abs=0.1)
@@ -103,8 +103,7 @@ def test_the_robot_climbs_the_curb_ramp(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_the_robot_does_not_climb_a_curb(world: BulletWorld) -> None:
-    """Driven at a full curb it stays on the road, and the curb is ground: no contact is
-    reported."""
+    """A robot that drives at a full curb stays on the road, and the curb counts as ground."""
     world.place(Pose(-20.0, 1.0, math.pi / 2))
     motions = drive(world, 1.0, 0.0, 100)
     assert motions[-1].robot.z_m < 0.02
@@ -114,7 +113,7 @@ def test_the_robot_does_not_climb_a_curb(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_tile_seams_do_not_shake_the_robot(world: BulletWorld) -> None:
-    """Along 30 m of sidewalk across a tile border it goes straight and level."""
+    """Along 30 m of sidewalk across a tile border it drives straight and level."""
     world.place(Pose(-62.0, 5.0, 0.0))
     robots = [m.robot for m in drive(world, 1.5, 0.0, 400)]
     assert max(r.tilt_rad for r in robots) < 0.01
@@ -124,7 +123,7 @@ def test_tile_seams_do_not_shake_the_robot(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_a_person_blocks_the_robot_and_is_named(world: BulletWorld) -> None:
-    """A standing person stops the robot; contacts name the person, once per substep."""
+    """A standing person stops the robot, and contacts name the person once per substep."""
     world.place(Pose(-20.0, 5.0, 0.0))
     motions = drive(world, 1.0, 0.0, 80, person(-18.0, 5.0, name="e7"))
     contacts = [c for m in motions for c in m.contacts]
@@ -145,26 +144,26 @@ def test_a_walking_person_is_met_within_the_tick(world: BulletWorld) -> None:
 
 
 @pytest.mark.engine
-def test_who_cannot_be_touched_changes_nothing() -> None:
-    """With people and a vehicle some two metres beside its way the robot goes, to the bit, as in an
+def test_people_out_of_reach_change_nothing() -> None:
+    """With people and a vehicle some two metres beside its path the robot moves to the bit as in an
     empty street."""
     crowd = People.of(
         ("c1", "c2"), [[-18.0, 7.2], [-16.0, 2.8]], [0.0, 1.0], [0.0, 0.0], ("stand", "stand")
     )
     cars = Vehicles.of(("v1",), [[-17.0, -1.0]], [0.0], [0.0], [[4.5, 1.8]])
-    ways = []
+    traces = []
     for street in (EMPTY, Street(0, people=crowd, vehicles=cars)):
         with BulletWorld(StreetSurface(MAP, seed=1)) as world:
             world.place(Pose(-20.0, 5.0, 0.0))
-            ways.append(
+            traces.append(
                 b"".join(motion.trace.tobytes() for motion in drive(world, 1.0, 0.1, 60, street))
             )
-    assert ways[0] == ways[1]
+    assert traces[0] == traces[1]
 
 
 @pytest.mark.engine
-def test_a_robot_that_is_thrown_meets_who_stands_there(world: BulletWorld) -> None:
-    """Somebody who was out of its reach when the tick began stops it within the tick, and is
+def test_a_robot_that_is_thrown_touches_a_distant_person(world: BulletWorld) -> None:
+    """A person who was out of reach when the tick began stops the robot within the tick, and is
     named."""
     world.place(Pose(-20.0, 5.0, 0.0))
     drive(world, 0.0, 0.0, 5)
@@ -207,7 +206,7 @@ def test_a_building_is_a_wall(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_the_same_commands_give_the_same_trace() -> None:
-    """Two fresh worlds agree bit for bit, with a turn, a ramp and a person in the way."""
+    """Two new worlds agree bit for bit, with a turn, a ramp and a person in the way."""
 
     def traces() -> list[bytes]:
         with BulletWorld(StreetSurface(MAP, seed=3)) as world:
@@ -219,9 +218,8 @@ def test_the_same_commands_give_the_same_trace() -> None:
 
 
 @pytest.mark.engine
-def test_a_world_outside_its_with_block_says_so() -> None:
-    """Before and after the block nothing runs, closing twice is fine, and the message names the
-    remedy."""
+def test_a_world_outside_its_with_block_is_refused() -> None:
+    """Before and after the block the message names the remedy, and closing twice is allowed."""
     world = BulletWorld(StreetSurface(MAP, seed=1))
     with pytest.raises(EngineError, match="'with' block"):
         world.place(OPEN)
@@ -232,7 +230,7 @@ def test_a_world_outside_its_with_block_says_so() -> None:
         world.step(Command(0.0, 0.0), EMPTY, EMPTY, 10)
 
 
-def test_an_unknown_robot_lists_the_known() -> None:
+def test_an_unknown_robot_is_refused_with_the_known_ones() -> None:
     """A wrong name is a usage error with the choices."""
     with pytest.raises(UsageError, match="Valid choices: courier"):
         robot_called("rover")
@@ -242,16 +240,16 @@ def test_an_unknown_robot_lists_the_known() -> None:
 SPEC = CameraSpec(width=96, height=96)
 
 
-def seen(frame: Frame, name: str) -> np.ndarray:
-    """Rows and columns of the pixels with a label, (N, 2)."""
+def label_pixels(frame: Frame, name: str) -> np.ndarray:
+    """Return rows and columns of the pixels with a label, (N, 2)."""
     assert frame.labels is not None
     return np.argwhere(frame.labels == LABELS[name])
 
 
 @pytest.mark.engine
 def test_the_camera_sees_the_street() -> None:
-    """From the sidewalk: sky above, sidewalk below, and the person ahead in the middle, the feet on
-    the ground."""
+    """From the sidewalk, sky is above, sidewalk below, and a person ahead in the middle with the
+    feet on the ground."""
     world = BulletWorld(StreetSurface(MAP, seed=1))
     with BulletCamera(world, SPEC, depth=True) as camera:
         robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
@@ -260,7 +258,7 @@ def test_the_camera_sees_the_street() -> None:
     assert frame.labels is not None and frame.depth is not None
     assert (frame.labels[:3, 46:60] == LABELS["sky"]).all()
     assert (frame.labels[-3:, 20:76] == LABELS["sidewalk"]).all()
-    rows, columns = seen(frame, "person").T
+    rows, columns = label_pixels(frame, "person").T
     assert abs(columns.mean() - 47.5) < 2.0
     assert frame.depth[rows, columns].mean() == pytest.approx(
         4.7 * math.cos(math.radians(10.0)), abs=0.3
@@ -277,14 +275,14 @@ def test_a_moved_person_is_drawn_where_the_snapshot_says() -> None:
     in it."""
     with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as camera:
         robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
-        assert seen(camera.render(robot, person(-15.0, 6.0)), "person")[:, 1].mean() < 40.0
-        assert seen(camera.render(robot, person(-15.0, 4.0)), "person")[:, 1].mean() > 56.0
-        assert len(seen(camera.render(robot, person(-25.0, 5.0)), "person")) == 0
+        assert label_pixels(camera.render(robot, person(-15.0, 6.0)), "person")[:, 1].mean() < 40.0
+        assert label_pixels(camera.render(robot, person(-15.0, 4.0)), "person")[:, 1].mean() > 56.0
+        assert len(label_pixels(camera.render(robot, person(-25.0, 5.0)), "person")) == 0
 
 
 @pytest.mark.engine
-def test_a_picture_depends_on_its_moment_alone() -> None:
-    """The same state is the same picture, whatever was drawn before and in whatever camera."""
+def test_a_picture_depends_only_on_the_current_state() -> None:
+    """The same state gives the same picture, whatever was drawn before and in any camera."""
     robot = RobotState(Pose(-4.0, 5.0, 0.3), z_m=0.12)
     street = person(-1.0, 5.5, math.pi)
     with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as camera:
@@ -301,8 +299,8 @@ def test_a_picture_depends_on_its_moment_alone() -> None:
 
 @pytest.mark.engine
 def test_everything_has_its_label() -> None:
-    """One view over the street holds every label, and the lamp shows red or green as the signal
-    says."""
+    """One view over the street has every label but props, and the lamp is red or green as the
+    signal says."""
     strips = {
         k: dataclasses.replace(s, signalised=s.kind == "crossing") for k, s in MAP.strips.items()
     }
@@ -334,15 +332,17 @@ def test_the_camera_leans_with_the_ramp() -> None:
     with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as camera:
         for y, z in ((-1.0, 0.0), (4.22, 0.06)):
             robot = RobotState(Pose(0.0, y, math.pi / 2), z_m=z)
-            heads.append(seen(camera.render(robot, person(0.0, y + 6.0)), "person")[:, 0].min())
+            heads.append(
+                label_pixels(camera.render(robot, person(0.0, y + 6.0)), "person")[:, 0].min()
+            )
     assert heads[1] - heads[0] == pytest.approx(
         48.0 * math.tan(1.0 / 12.0) / math.tan(math.radians(37.5)), abs=2.0
     )
 
 
 @pytest.mark.engine
-def test_a_camera_outside_its_with_block_says_so() -> None:
-    """The message names the remedy, and closing twice is fine."""
+def test_a_camera_outside_its_with_block_is_refused() -> None:
+    """The message names the remedy, and closing twice is allowed."""
     camera = BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC)
     with pytest.raises(EngineError, match="'with' block"):
         camera.render(RobotState(OPEN), EMPTY)

@@ -47,7 +47,7 @@ def place(request: pytest.FixtureRequest) -> StreetMap:
 def climbs(
     place: StreetMap, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[str, Polyline]]:
-    """Lines from the middle of a crossing over its ramp onto a sidewalk beside its corner."""
+    """Yield lines from the middle of a crossing over its ramp onto a sidewalk beside its corner."""
     crossings = [strip for strip in place.strips.values() if strip.kind == "crossing"]
     order = rng.permutation(len(crossings)).tolist()
     found = 0
@@ -73,7 +73,7 @@ def climbs(
 
 
 class Climb(NamedTuple):
-    """How a climb went: seconds, slowest metres in any second while driving, metres left, largest
+    """Outcome of a climb: seconds, slowest metres in any second while driving, metres left, largest
     tilt."""
 
     time_s: float
@@ -115,26 +115,26 @@ def climb(world: BulletWorld, line: Polyline) -> Climb:
 
 
 def test_route_climbs_every_ramp(place: StreetMap) -> None:
-    """Driven by `route` from crossings onto corners and sidewalks: it arrives, and never stands
-    still for a second."""
+    """From crossings onto corners and sidewalks `route` arrives and never stands still for a
+    second."""
     done = 0
     with BulletWorld(StreetSurface(place, seed=3)) as world:
         for name, line in climbs(place, CLIMBS_PER_CITY, np.random.default_rng(5)):
-            went = climb(world, line)
-            assert went.left_m < 0.5 and went.slowest_m > 0.05, (name, went)
-            assert went.tilt_rad < math.atan(1.0 / 12.0) + 0.03, (name, went)
+            outcome = climb(world, line)
+            assert outcome.left_m < 0.5 and outcome.slowest_m > 0.05, (name, outcome)
+            assert outcome.tilt_rad < math.atan(1.0 / 12.0) + 0.03, (name, outcome)
             done += 1
     assert done == CLIMBS_PER_CITY
 
 
 def test_ramps_rise_one_in_twelve_at_most(place: StreetMap) -> None:
-    """The surface asked for is nowhere steeper; of its triangles few are, where flares are rounded
-    by facets."""
+    """The height function is nowhere steeper, and few of the triangles are, where facets round the
+    flares."""
     spots = [s.line[0, :2] for s in place.strips.values() if s.kind == "crossing"][:6]
     spots += [Polyline(s.line).at(at).xy for s in place.strips.values() for at in s.driveways][:6]
     rng = np.random.default_rng(1)
     steep_m2 = 0.0
-    whole_m2 = 0.0
+    total_m2 = 0.0
     for key in dict.fromkeys(tile_at(*spot) for spot in spots):
         tile = build_tile(place, key)
         x0, y0, x1, y1 = tile_bounds(key)
@@ -148,16 +148,16 @@ def test_ramps_rise_one_in_twelve_at_most(place: StreetMap) -> None:
                 normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
                 steep = np.hypot(normal[:, 0], normal[:, 1]) > 1.1 * RAMP_SLOPE * normal[:, 2]
                 steep_m2 += 0.5 * float(normal[steep, 2].sum())
-                whole_m2 += 0.5 * float(normal[:, 2].sum())
-    assert whole_m2 > 50.0
-    assert steep_m2 < 0.03 * whole_m2
+                total_m2 += 0.5 * float(normal[:, 2].sum())
+    assert total_m2 > 50.0
+    assert steep_m2 < 0.03 * total_m2
 
 
 def curbs(
     place: StreetMap, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[Strip, Pose, Pose]]:
-    """A sidewalk, a pose on it, and one on the road, face to face over a curb far from ramps and
-    driveways."""
+    """Yield a sidewalk, a pose on it, and one on the road, facing each other over a curb far from
+    ramps and driveways."""
     sidewalks = [
         s
         for s in place.strips.values()
@@ -176,12 +176,16 @@ def curbs(
         )
 
 
-def test_the_robot_does_not_climb_curbs_and_never_leaves_unnoticed(place: StreetMap) -> None:
-    """At full speed at a curb it stays below; driven off a curb it is out of the walkable area
-    before it falls."""
+def test_the_robot_does_not_climb_curbs_and_falls_only_off_the_walkable_area(
+    place: StreetMap,
+) -> None:
+    """At full speed it stays below a curb; driven off a curb it leaves the walkable area before it
+    falls."""
     street = Street(0)
     with BulletWorld(StreetSurface(place, seed=3)) as world:
-        for strip, on_walk, on_road in curbs(place, CURBS_PER_CITY, np.random.default_rng(6)):
+        found = [*curbs(place, CURBS_PER_CITY, np.random.default_rng(6))]
+        assert len(found) == CURBS_PER_CITY
+        for strip, on_walk, on_road in found:
             area = WalkableArea(place.walkable_near(strip.polygon.buffer(10.0)))
             world.place(on_road)
             states = [

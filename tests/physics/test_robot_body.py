@@ -1,4 +1,4 @@
-"""What the gl camera draws of a robot: the shapes of its URDF, files of meshes among them."""
+"""The drawn body of a robot: shapes of its URDF and mesh files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHASSIS = re.compile(r'<box size="([\d. ]+)"\s*/>')
 
 
 def with_visual(folder: Path, shape: str) -> Path:
-    """The courier, its first box shown as something else."""
+    """Write the courier's URDF with another shape in place of its first box."""
     text = urdf_path(COURIER).read_text()
     path = folder / "other.urdf"
     path.write_text(CHASSIS.sub(shape, text, count=1))
@@ -26,8 +26,8 @@ def with_visual(folder: Path, shape: str) -> Path:
 
 @pytest.mark.parametrize("ending", ["obj", "stl", "glb"])
 def test_a_body_from_a_file_is_drawn_like_one_of_boxes(tmp_path: Path, ending: str) -> None:
-    """A box in a file, scaled by the URDF, has the corners, normals, colour and place of the box it
-    stands for."""
+    """A box in a mesh file, scaled by the URDF, has the corners, normals, colour and place of the
+    box it replaces."""
     import trimesh
 
     box = CHASSIS.search(urdf_path(COURIER).read_text())
@@ -44,13 +44,13 @@ def test_a_body_from_a_file_is_drawn_like_one_of_boxes(tmp_path: Path, ending: s
 
 
 def corners(mesh: object) -> set[tuple[float, ...]]:
-    """Positions and normals of the corners of a mesh, to a hundredth of a millimetre."""
+    """Return positions and normals of the corners of a mesh, to a hundredth of a millimetre."""
     rows = np.column_stack([mesh.vertices, mesh.normals])  # type: ignore[attr-defined]
     return set(map(tuple, (np.rint(1e5 * rows) + 0.0).tolist()))
 
 
 def test_a_colour_inside_a_visual_is_drawn(tmp_path: Path) -> None:
-    """It replaces the one of its name under `robot`."""
+    """It replaces the colour of its name under `robot`."""
     path, colour = with_visual(tmp_path, r'<box size="\1"/>'), '<color rgba="1 0 0 1"/>'
     text = path.read_text()
     path.write_text(text.replace('name="body"/>', f'name="body">{colour}</material>', 1))
@@ -58,8 +58,8 @@ def test_a_colour_inside_a_visual_is_drawn(tmp_path: Path) -> None:
     assert robot_parts(path)[1].colour == robot_parts(urdf_path(COURIER))[1].colour
 
 
-def test_a_body_that_cannot_be_drawn_is_named(tmp_path: Path) -> None:
-    """A file that is not there, and a shape that is none."""
+def test_an_invalid_visual_is_refused(tmp_path: Path) -> None:
+    """A missing mesh file and an unsupported shape are named."""
     with pytest.raises(SpecError, match=r"gone\.stl: cannot be read as a mesh"):
         robot_parts(with_visual(tmp_path, '<mesh filename="gone.stl"/>'))
     link_parts.cache_clear()

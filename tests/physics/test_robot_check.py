@@ -26,7 +26,7 @@ LINK = re.compile(r'  <link name="rear_left">.*?</link>\n', re.S)
 
 
 def edited(folder: Path, *changes: tuple[str | re.Pattern[str], str]) -> Robot:
-    """The scout with an edited URDF."""
+    """Return the scout with an edited URDF."""
     text = urdf_path(SCOUT).read_text()
     for old, new in changes:
         after = text.replace(old, new) if isinstance(old, str) else old.sub(new, text)
@@ -38,7 +38,7 @@ def edited(folder: Path, *changes: tuple[str | re.Pattern[str], str]) -> Robot:
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_shipped_robots_are_valid(robot: Robot) -> None:
-    """Row and URDF of each pass."""
+    """The row and the URDF of each robot pass the check."""
     check_robot(robot)
 
 
@@ -72,7 +72,7 @@ def test_shipped_robots_are_valid(robot: Robot) -> None:
 def test_a_faulty_urdf_is_refused_with_its_path(
     changes: list[tuple[Any, str]], why: str, tmp_path: Path
 ) -> None:
-    """Links, joints, masses, axes, units and sizes that differ from the row."""
+    """Links, joints, masses, axes, units and sizes must match the row."""
     robot = edited(tmp_path, *changes)
     with pytest.raises(SpecError, match=why) as caught:
         check_robot(robot)
@@ -94,7 +94,7 @@ def test_a_faulty_urdf_is_refused_with_its_path(
 def test_a_faulty_row_is_refused_with_its_field(
     robot: Robot, changes: dict[str, Any], why: str
 ) -> None:
-    """Numbers out of range, contradictions, and a missing mount."""
+    """Numbers out of range, contradictions, and a missing mount are refused."""
     for name, value in changes.items():
         field = name.removeprefix("drive.")
         if field != name:
@@ -105,7 +105,7 @@ def test_a_faulty_row_is_refused_with_its_field(
 
 
 def test_the_robot_of_the_documents_is_valid(tmp_path: Path) -> None:
-    """The row and the URDF on the page of robots are sound and agree."""
+    """The row and the URDF on the page of robots agree."""
     (row,), (urdf,) = (blocks(language, "docs/robots.md") for language in ("python", "xml"))
     (tmp_path / "barrow.urdf").write_text(urdf.text)
     names: dict[str, Any] = {}
@@ -114,8 +114,8 @@ def test_the_robot_of_the_documents_is_valid(tmp_path: Path) -> None:
 
 
 def test_the_documents_have_the_fields_of_rows_and_the_joints_of_the_dog() -> None:
-    """Every field of a row on wheels; axis, range, angle at rest and torque of each joint; and the
-    directions of positive angles."""
+    """The page names every field of a row on wheels, and axis, range, rest angle and torque of each
+    joint with their directions."""
     text = text_of("docs/robots.md")
     for field in (*dataclasses.fields(Robot), *dataclasses.fields(Skid)):
         assert field.name == "drive" or f"`{field.name}`" in text, field.name
@@ -137,7 +137,7 @@ def test_the_documents_have_the_fields_of_rows_and_the_joints_of_the_dog() -> No
 def test_a_run_does_not_begin_with_a_faulty_robot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A missing URDF is named, no folder is made, and `rear_lft` is compared with the URDF."""
+    """A missing URDF and an unknown joint are named, and no folder is made."""
     drive = dataclasses.replace(COURIER.drive, left=("wheel_front_left", "wheel_rear_lft"))
     for changes, why in (
         ({"urdf": str(tmp_path / "gone.urdf")}, r"gone.urdf: cannot be read: No such file"),

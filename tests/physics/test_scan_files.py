@@ -1,4 +1,4 @@
-"""Reading of scans: meshes, splats, their frames and their order."""
+"""Reading of scans: meshes, splats, frames and order."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _cloud() -> Cloud:
 
 
 def _covariances(cloud: Cloud) -> np.ndarray:
-    """By scipy's rotations and matrix products."""
+    """Return covariances by scipy's rotations and matrix products."""
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_quat(cloud.quaternions[:, [1, 2, 3, 0]]).as_matrix()
@@ -58,7 +58,8 @@ def _covariances(cloud: Cloud) -> np.ndarray:
 def test_splats_of_every_format_are_the_same(
     tmp_path: Path, name: str, data: bytes, place_m: float, size: float
 ) -> None:
-    """Centres, covariances, colours and opacities survive each format as well as it stores them."""
+    """Centres, covariances, colours and opacities are read as precisely as each format stores
+    them."""
     (tmp_path / name).write_bytes(data)
     raw = read_splats(tmp_path / name, read_source(tmp_path / name))
     cloud = _cloud()
@@ -71,7 +72,7 @@ def test_splats_of_every_format_are_the_same(
 
 
 def test_other_quaternion_orders_and_harmonics_are_read() -> None:
-    """Rotations stored x, y, z, w are read by option; harmonics above degree 0 are left out."""
+    """Rotations stored x, y, z, w are read by option, and harmonics above degree 0 are left out."""
     cloud = _cloud()
     extra = tuple(f"f_rest_{k}" for k in range(45))
     raw = read_splats(Path("a.ply"), gaussian_ply(cloud, order="xyzw", extra=extra), "xyzw")
@@ -80,7 +81,7 @@ def test_other_quaternion_orders_and_harmonics_are_read() -> None:
 
 
 def test_a_frame_turns_scales_and_moves_splats() -> None:
-    """Covariances follow the matrix: A C A' for the whole similarity, computed another way."""
+    """Covariances follow the matrix: A C A' for the whole similarity, computed in another way."""
     cloud = _cloud()
     raw = RawSplats(cloud.centres, cloud.scales, cloud.quaternions, np.zeros((500, 4), np.uint8))
     matrix = combine(
@@ -97,11 +98,13 @@ def test_a_frame_turns_scales_and_moves_splats() -> None:
 
 
 def test_a_far_scan_gets_a_local_origin_and_true_north() -> None:
-    """Coordinates of UTM become metres around a local origin, turned from grid to true north."""
+    """UTM coordinates become metres around a local origin, turned from grid to true north."""
     low, high = np.array([391_000.0, 5_819_900.0, 30.0]), np.array([391_100.0, 5_820_100.0, 45.0])
-    matrix, there = place(low, high, Placing(crs="EPSG:25833"))
-    assert there is not None
-    assert (there.latitude_deg, there.longitude_deg) == pytest.approx((52.5192, 13.3943), abs=1e-4)
+    matrix, origin = place(low, high, Placing(crs="EPSG:25833"))
+    assert origin is not None
+    assert (origin.latitude_deg, origin.longitude_deg) == pytest.approx(
+        (52.5192, 13.3943), abs=1e-4
+    )
     north = move(np.array([[391_050.0, 5_820_100.0, 30.0]]), matrix)[0]
     # 1.606 degrees west of the zone's middle: grid north is 1.274 degrees west of true north.
     assert np.degrees(np.arctan2(north[0], north[1])) == pytest.approx(-1.274, abs=0.01)
@@ -111,7 +114,7 @@ def test_a_far_scan_gets_a_local_origin_and_true_north() -> None:
 
 @pytest.mark.parametrize("ending", ["glb", "ply", "obj"])
 def test_meshes_of_every_format_are_the_same(tmp_path: Path, ending: str) -> None:
-    """Vertices, triangles and vertex colours survive each format."""
+    """Vertices, triangles and vertex colours are equal in each format."""
     wanted = street()
     path = tmp_path / f"a.{ending}"
     wanted.mesh().export(path)
@@ -129,7 +132,7 @@ def test_meshes_of_every_format_are_the_same(tmp_path: Path, ending: str) -> Non
 
 
 def test_colours_of_gltf_are_linear_unless_its_program_writes_srgb(tmp_path: Path) -> None:
-    """A byte of 55 is sRGB 128 as the specification says; trimesh writes sRGB itself."""
+    """A byte of 55 is sRGB 128 by the specification; trimesh writes sRGB."""
     mesh = street().mesh()
     mesh.visual.vertex_colors = np.full((len(mesh.vertices), 4), 55, np.uint8)
     path = tmp_path / "a.glb"
@@ -140,7 +143,7 @@ def test_colours_of_gltf_are_linear_unless_its_program_writes_srgb(tmp_path: Pat
 
 
 def test_a_texture_is_baked_to_vertices(tmp_path: Path) -> None:
-    """Edges are split to 0.1 m without gaps, and vertices have the colour of the texture there."""
+    """Edges are split to 0.1 m without gaps, and vertices have the colour of the texture."""
     pixels = np.zeros((64, 64, 3), np.uint8)
     pixels[:32], pixels[32:] = (255, 0, 0), (0, 0, 255)
     quad = trimesh.Trimesh(
@@ -214,6 +217,6 @@ def test_the_order_in_the_files_changes_no_bit() -> None:
     ids=["zstd", "cut-spz", "cut-splat", "cut-ply", "names", "ascii", "supersplat", "other"],
 )
 def test_splats_that_cannot_be_read_are_refused(name: str, data: bytes, words: str) -> None:
-    """The message names the file, what is wrong, and what to do."""
+    """The message names the file, the fault and the remedy."""
     with pytest.raises(MapError, match=f"{name}.*{words}"):
         read_splats(Path(name), data)

@@ -20,12 +20,12 @@ CURB_M = 0.12
 
 
 def land(xy: Floats) -> Floats:
-    """A hill of 5 % with a curb at y = 20."""
+    """Return heights of a hill of 5 % with a curb at y = 20."""
     return 0.05 * xy[:, 0] + np.where(xy[:, 1] > 20.0, CURB_M, 0.0)
 
 
 def sheet(x0: float, y0: float, x1: float, y1: float, step_m: float, z: float | None) -> Floats:
-    """Triangles of a surface that faces up, (T, 3, 3): of the land, or level at z."""
+    """Return triangles of a surface that faces up, (T, 3, 3): of the land, or level at z."""
     columns, rows = (max(1, round(side / step_m)) + 1 for side in (x1 - x0, y1 - y0))
     grid = np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows))
     xy = np.column_stack([v.ravel() for v in grid])
@@ -41,7 +41,7 @@ def sheet(x0: float, y0: float, x1: float, y1: float, step_m: float, z: float | 
 
 
 def box(x0: float, y0: float, x1: float, y1: float, low: float, high: float) -> Floats:
-    """Walls and roof of a house without a floor, (T, 3, 3)."""
+    """Return walls and roof of a house without a floor, (T, 3, 3)."""
     ring = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
     walls = []
     for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
@@ -75,7 +75,8 @@ def lattice(grid: HeightGrid) -> Floats:
 
 @pytest.fixture(scope="module")
 def street() -> HeightGrid:
-    """Land with a bridge, a roof, a tree crown and a post over it, seen by a perfect scanner."""
+    """Return land with a bridge, a roof, a tree crown and a post over it, as a perfect scanner sees
+    it."""
     ground = sheet(0.0, 0.0, SIZE_M, SIZE_M, 0.5, None)
     middle = ground.mean(axis=1)
     under_house = (np.abs(middle[:, :2] - (30.0, 30.0)) < 6.0).all(axis=1)
@@ -92,9 +93,8 @@ def street() -> HeightGrid:
     )
 
 
-def test_bridges_roofs_and_crowns_do_not_win(street: HeightGrid) -> None:
-    """Under them the ground is that of the land: measured where the scan saw it, else
-    interpolated."""
+def test_the_ground_lies_below_bridges_roofs_and_crowns(street: HeightGrid) -> None:
+    """Under them the ground is the land: measured where the scan saw it, else interpolated."""
     for x, y in ((20.0, 10.0), (6.0, 26.0), (12.15, 15.15)):
         assert street.heights[at(street, x, y)] == pytest.approx(
             0.05 * x + CURB_M * (y > 20), abs=0.03
@@ -106,7 +106,7 @@ def test_bridges_roofs_and_crowns_do_not_win(street: HeightGrid) -> None:
     assert holes.count == 1 and holes.area_m2 == pytest.approx(144.0, rel=0.1)
 
 
-def test_what_stands_blocks_and_what_hangs_does_not(street: HeightGrid) -> None:
+def test_standing_objects_block_and_overhanging_ones_do_not(street: HeightGrid) -> None:
     """Posts and walls block; bridges, crowns and curbs do not."""
     assert street.blocked[at(street, 12.0, 15.25)] and street.blocked[at(street, 24.0, 30.0)]
     for x, y in ((20.0, 10.0), (6.0, 26.0), (20.0, 20.0), (11.0, 15.25)):
@@ -147,7 +147,7 @@ def test_half_a_million_triangles_take_seconds() -> None:
 
 
 def test_the_order_of_triangles_changes_no_bit() -> None:
-    """Height grids are equal to the bit, whatever the order of triangles."""
+    """Height grids are equal to the bit for any order of triangles."""
     parts = np.concatenate([sheet(0.0, 0.0, 20.0, 20.0, 0.2, None), box(5, 5, 9, 9, 0.0, 3.0)])
     one, other = (
         height_grid(mesh_of(parts), None, 0.1),
@@ -158,7 +158,7 @@ def test_the_order_of_triangles_changes_no_bit() -> None:
 
 
 def test_splats_are_ground_where_the_mesh_has_none() -> None:
-    """Opaque splats fill a hole of the mesh; transparent ones do not."""
+    """Opaque splats fill a hole of the mesh, and transparent ones do not."""
     ground = sheet(0.0, 0.0, 20.0, 20.0, 0.5, 0.0)
     middle = ground.mean(axis=1)
     hole = (np.abs(middle[:, :2] - 10.0) < 3.0).all(axis=1)
@@ -188,7 +188,7 @@ def test_scans_without_ground_are_refused() -> None:
 
 
 def front(x0: float, x1: float, y: float, high: float) -> Floats:
-    """A house front as an app scans it: one sheet whose front faces -y, (T, 3, 3)."""
+    """Return a house front as an app scans it: one sheet whose front faces -y, (T, 3, 3)."""
     a, b = (x0, y), (x1, y)
     low = [(*a, -0.2), (*b, -0.2)]
     top = [(*a, high), (*b, high)]
@@ -196,8 +196,7 @@ def front(x0: float, x1: float, y: float, high: float) -> Floats:
 
 
 def test_ground_behind_house_fronts_is_not_drafted() -> None:
-    """Of a street with ground before and behind its fronts, the draft is the ground before them; drawn
-    areas are not affected."""
+    """The draft is the ground in front of the houses, and drawn areas are not affected."""
     mesh = mesh_of(
         sheet(0.0, 0.0, 60.0, 20.0, 1.0, 0.0),
         front(0.0, 28.0, 8.0, 4.0),

@@ -1,4 +1,4 @@
-"""Surfaces of scanned places: ground, obstacles, and what cameras see of them."""
+"""Surfaces of scanned places: ground, obstacles, and camera pictures."""
 
 from __future__ import annotations
 
@@ -27,10 +27,8 @@ SIZE_M = 24.0
 
 
 def sloped_scan(*, hole: bool = False, kind: str = "sidewalk", grid_m: float = SIZE_M) -> Scan:
-    """A scanned slope with a wall across it, in two colours; its middle may be missing.
-
-    grid_m: half the side of the height grid, which may be larger than the mesh.
-    """
+    """Return a scanned slope with a wall across it, in two colours; its middle may be missing.
+    grid_m: half the side of the height grid, which may be larger than the mesh."""
     at = np.arange(-SIZE_M, SIZE_M + 0.1, 1.0)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
     ground = np.column_stack([x, y, GRADE * x])
@@ -81,7 +79,7 @@ def surface_of(scan: Scan) -> ScanSurface:
 
 
 def test_a_robot_stands_and_drives_on_the_scanned_ground() -> None:
-    """Its base is within a centimetre of the slope wherever it is put, and after 2 s of driving."""
+    """Its base is within a centimetre of the slope after 2 s of driving from any place."""
     surface = surface_of(sloped_scan())
     with BulletWorld(surface) as world:
         for x, y, heading in ((-10.0, 1.0, 0.3), (0.0, -2.0, 2.0), (3.0, 8.0, -1.0)):
@@ -94,7 +92,7 @@ def test_a_robot_stands_and_drives_on_the_scanned_ground() -> None:
 
 
 def test_a_scanned_wall_stops_a_robot_and_hides_people() -> None:
-    """The contact is with a wall; points behind it are hidden, those before it are not."""
+    """The contact is with a wall, and only points behind the wall are hidden."""
     with BulletWorld(surface_of(sloped_scan())) as world:
         world.place(Pose(WALL_X_M - 1.5, 0.0, 0.0))
         motions = [world.step(Command(1.0, 0.0), Street(0), Street(0), 10) for _ in range(60)]
@@ -107,7 +105,7 @@ def test_a_scanned_wall_stops_a_robot_and_hides_people() -> None:
 
 @pytest.mark.parametrize(("kind", "value"), [("sidewalk", 0.9), ("verge", 0.7)])
 def test_the_ground_of_an_area_has_the_friction_of_its_kind(kind: str, value: float) -> None:
-    """Patches cover the areas to 1 m2, and the tiles around cover everything else."""
+    """Patches cover the area to 1 m2 and have the friction of its kind."""
     surface = surface_of(sloped_scan(kind=kind))
     patches = [
         p for key in tiles_touching(shapely.box(-16, -3, 16, 3)) for p in surface.chunk(key).ground
@@ -121,9 +119,9 @@ def test_the_ground_of_an_area_has_the_friction_of_its_kind(kind: str, value: fl
 
 
 @pytest.mark.parametrize("hole", [False, True], ids=["whole", "with a hole"])
-def test_cameras_see_the_scan(hole: bool) -> None:
-    """Both show the wall before the slope in the scan's colours, with the same labels; a hole in an
-    area is closed."""
+def test_both_cameras_show_the_scan(hole: bool) -> None:
+    """Both show the wall in front of the slope in the scan's colours with equal labels, and a hole
+    in an area is closed."""
     surface = surface_of(sloped_scan(hole=hole))
     spec = CameraSpec(width=96, height=96)
     with BulletWorld(surface) as world:
@@ -142,7 +140,7 @@ def test_cameras_see_the_scan(hole: bool) -> None:
 
 
 def test_nothing_is_drawn_around_a_scan() -> None:
-    """Where the scan ends, both cameras see nothing, and no ground of the height grid."""
+    """Beyond the end of the scan both cameras see no ground of the height grid."""
     spec = CameraSpec(width=96, height=96)
     with BulletWorld(surface_of(sloped_scan(grid_m=80.0))) as world:
         robot = world.place(Pose(-SIZE_M + 0.5, 0.0, math.pi))
@@ -156,7 +154,7 @@ def test_nothing_is_drawn_around_a_scan() -> None:
 
 
 def test_a_renderer_names_the_look_of_scans() -> None:
-    """Films and reports of a run show the look that its record names."""
+    """The look in the name of a renderer is that of its record."""
     for appearance in ("splats", "mesh"):
         assert appearance_of(renderer_of("gl", appearance)) == appearance
     assert appearance_of(renderer_of("bullet")) == appearance_of("none") == "splats"
@@ -164,6 +162,6 @@ def test_a_renderer_names_the_look_of_scans() -> None:
 
 def test_the_tiles_of_a_scan_depend_on_the_scan_alone() -> None:
     """Another scan has other tiles, whatever the cache holds."""
-    whole, other = surface_of(sloped_scan()), surface_of(sloped_scan(hole=True))
-    counts = [sum(len(one.mesh) for one in s.scanned((0, 0))) for s in (whole, other, whole)]
+    complete, holed = surface_of(sloped_scan()), surface_of(sloped_scan(hole=True))
+    counts = [sum(len(one.mesh) for one in s.scanned((0, 0))) for s in (complete, holed, complete)]
     assert counts[0] == counts[2] != counts[1]

@@ -1,4 +1,4 @@
-"""The sky: where the sun stands, how bright and how red it is, and pictures of the user's."""
+"""The sky: position, brightness and colour of the sun, and users' pictures."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def luminance(colour: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("latitude", [0.0, 30.0, 48.0, -35.0])
-def test_at_the_equinox_noon_stands_as_high_as_the_latitude_leaves(latitude: float) -> None:
-    """On day 81 at noon the sun is at 90 degrees less the latitude, to the south in the north, and
-    rises due east."""
+def test_the_equinox_sun_stands_at_90_degrees_less_the_latitude(latitude: float) -> None:
+    """On day 81 at noon the sun is in the south of the northern hemisphere, and it rises due
+    east."""
     noon, morning = sun_direction(12.0, 81, latitude), sun_direction(6.0, 81, latitude)
     assert math.degrees(math.asin(noon[2])) == pytest.approx(90.0 - abs(latitude), abs=1e-6)
     assert noon[0] == pytest.approx(0.0, abs=1e-12)
@@ -33,9 +33,9 @@ def test_at_the_equinox_noon_stands_as_high_as_the_latitude_leaves(latitude: flo
     assert morning == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
 
 
-def test_midsummer_is_as_the_tilt_says() -> None:
-    """On day 172, 48 N: noon at 90 - 48 + 23.45 degrees, sunrise at cos w = -tan(48) tan(23.45),
-    4.08 h solar time."""
+def test_midsummer_follows_the_tilt_of_the_earth() -> None:
+    """On day 172 at 48 N noon is at 90 - 48 + 23.45 degrees, and sunrise at cos w = -tan(48)
+    tan(23.45), 4.08 h solar time."""
     assert math.degrees(math.asin(sun_direction(12.0, 172, 48.0)[2])) == pytest.approx(
         65.45, abs=0.01
     )
@@ -49,7 +49,7 @@ def test_midsummer_is_as_the_tilt_says() -> None:
     assert np.linalg.norm(sun_direction(9.3, 40, 61.0)) == pytest.approx(1.0)
 
 
-def test_a_uniform_sky_lights_a_surface_as_it_should() -> None:
+def test_a_uniform_sky_lights_any_surface_to_one() -> None:
     """Radiance 1 everywhere lights any white surface to 1; from above only, a wall gets half."""
     rows = 64
     ones = np.ones((rows, 2 * rows, 3), np.float32)
@@ -59,8 +59,8 @@ def test_a_uniform_sky_lights_a_surface_as_it_should() -> None:
     assert irradiance(above, np.array([1.0, 0.0, 0.0])) == pytest.approx([0.5] * 3, rel=2e-3)
 
 
-def test_the_sun_stands_where_the_picture_shows_it() -> None:
-    """The brightest pixel of a clear sky lies towards the sun, by the formula of the docstring."""
+def test_the_brightest_pixel_is_at_the_sun() -> None:
+    """The brightest pixel of a clear sky is in the direction of the sun."""
     sky = sky_of(Light(hour=9.0, cloud_cover=0.0))
     rows = len(sky.radiance)
     row, column = np.unravel_index(int(np.argmax(sky.radiance @ LUMINANCE)), (rows, 2 * rows))
@@ -72,9 +72,8 @@ def test_the_sun_stands_where_the_picture_shows_it() -> None:
 
 @pytest.mark.parametrize("cover", [0.0, 0.6, 1.0])
 @pytest.mark.parametrize("hour", [0.0, 4.5, 12.0, 20.0])
-def test_every_sky_is_usable(hour: float, cover: float) -> None:
-    """Finite, never negative, exposed so that a grey card in the open is neither black nor
-    white."""
+def test_every_sky_is_finite_and_exposed(hour: float, cover: float) -> None:
+    """Radiance is never negative, and a grey card in the open is neither black nor white."""
     sky = sky_of(Light(hour=hour, cloud_cover=cover), seed=3)
     assert np.isfinite(sky.radiance).all() and sky.radiance.min() >= 0.0
     card = 0.4 * (sky.ambient[0] + sky.sun_colour * max(float(sky.sun[2]), 0.0)) * sky.exposure
@@ -82,9 +81,9 @@ def test_every_sky_is_usable(hour: float, cover: float) -> None:
     assert 0.04 < luminance(filmic) < 0.75
 
 
-def test_daylight_falls_as_it_does() -> None:
-    """An overcast leaves a sixth to a third of noon's light, dusk less than a hundredth, night the
-    lamps'."""
+def test_daylight_falls_under_clouds_at_dusk_and_at_night() -> None:
+    """Overcast leaves a sixth to a third of noon's light, dusk less than a hundredth, and night
+    only lamps."""
 
     def open_ground(light: Light) -> float:
         sky = sky_of(light)
@@ -103,8 +102,8 @@ def test_daylight_falls_as_it_does() -> None:
     assert sky_of(Light(hour=0.0)).lamps == 1.0 and sky_of(Light(hour=12.0)).lamps == 0.0
 
 
-def test_fog_hides_what_its_visibility_says() -> None:
-    """At fog_m 5 % of a contrast is left; thick fog takes the sun's shadows and greys the sky."""
+def test_fog_leaves_five_percent_of_contrast_at_its_visibility() -> None:
+    """Thick fog also removes the sun's shadows and greys the sky."""
     sky = sky_of(Light(fog_m=60.0, cloud_cover=0.0))
     assert math.exp(-sky.fog_per_m * 60.0) == pytest.approx(0.05)
     assert sky.fog_colour.max() / sky.fog_colour.min() < 1.3
@@ -119,19 +118,18 @@ def test_exposure_follows_the_stops() -> None:
     assert np.array_equal(plain.radiance, brighter.radiance)
 
 
-def picture(path: Path, rows: int = 128, columns: int = 256) -> np.ndarray:
-    """A grey sky with a sun of 9 pixels at 30 degrees over the north."""
+def write_sky_picture(path: Path, rows: int = 128, columns: int = 256) -> np.ndarray:
+    """Write a grey sky with a sun of 9 pixels at 30 degrees over the north."""
     sky = np.full((rows, columns, 3), 0.5, np.float32)
     sky[rows // 3 - 1 : rows // 3 + 2, columns // 4 - 1 : columns // 4 + 2] = 80.0
     assert cv2.imwrite(str(path), sky)
     return sky
 
 
-def test_a_picture_of_the_users_brings_its_sun(tmp_path: Path) -> None:
-    """The sun stands at the brightest spot and its light is taken out of the ambient, so that
-    nothing counts twice."""
+def test_the_sun_of_a_users_picture_is_extracted(tmp_path: Path) -> None:
+    """The sun is at the brightest spot, and its light is removed from the ambient light."""
     path = tmp_path / "sky.hdr"
-    picture(path)
+    write_sky_picture(path)
     sky = sky_of(Light(hdri=str(path)))
     assert sky.sun == pytest.approx([0.0, math.cos(math.pi / 6), 0.5], abs=0.06)
     assert luminance(sky.ambient[0] + sky.sun_colour * sky.sun[2]) == pytest.approx(1.0, rel=1e-3)
@@ -145,27 +143,27 @@ def test_a_picture_of_the_users_brings_its_sun(tmp_path: Path) -> None:
 
 
 def test_broken_pictures_are_named(tmp_path: Path) -> None:
-    """Missing, foreign, cut, square, black and non-finite pictures are told apart, each with its
+    """Missing, invalid, truncated, square and black pictures have different messages, each with its
     file."""
     path = tmp_path / "sky.hdr"
     light = Light(hdri=str(path))
 
-    def told() -> str:
+    def refusal() -> str:
         sky_of.cache_clear()
         with pytest.raises(SpecError) as error:
             sky_of(light)
         assert str(path) in str(error.value)
         return str(error.value)
 
-    assert "does not exist" in told()
+    assert "does not exist" in refusal()
     path.write_bytes(b"PNG")
-    assert "is no Radiance picture" in told()
+    assert "is no Radiance picture" in refusal()
     path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 32 +X 64\n\x02\x02")
-    assert "cannot be decoded" in told()
-    picture(path, 256, 256)
-    assert "is 256 x 256 pixels" in told()
+    assert "cannot be decoded" in refusal()
+    write_sky_picture(path, 256, 256)
+    assert "is 256 x 256 pixels" in refusal()
     cv2.imwrite(str(path), np.zeros((32, 64, 3), np.float32))
-    assert "black above the horizon" in told()
+    assert "black above the horizon" in refusal()
 
 
 @pytest.mark.skipif(not ASSETS.is_dir(), reason="the shared HDRI skies are not here")

@@ -1,5 +1,5 @@
-"""Splats in the gl camera: they agree with a slow reference, and cover people where the scan's mesh
-does."""
+"""Splats in the gl camera: agreement with a slow reference, and covering of people like the scan's
+mesh."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ SUN = ScanSun(azimuth_deg=90.0, elevation_deg=45.0)
 
 
 def test_splats_agree_with_a_reference_in_float64() -> None:
-    """Over blobs, needles, huge, transparent and opaque splats, and some behind the eye, 99.9 % of
-    pixels agree within 1/255; so do 99 % of the depths within 1 mm."""
+    """99.9 % of pixels agree within 1/255, and 99 % of the depths within 1 mm. Splats are blobs,
+    needles, huge, transparent, opaque, or behind the eye."""
     near, same_m = [], []
     for seed in range(4):
         splats = random_splats(seed)
@@ -82,8 +82,8 @@ def _last(splats: Splats, count: int) -> Splats:
 
 
 @pytest.mark.parametrize("count", [1, 70, 5000])
-def test_a_card_draws_as_the_processor_does(count: int) -> None:
-    """Sorting in shaders, and other sizes of work, change no bit."""
+def test_sorting_in_shaders_changes_no_bit(count: int) -> None:
+    """Sorting in shaders, and other work sizes, give the same pictures."""
     splats = random_splats(7, max(count, 300))
     few = _last(splats, count)
     here, card = (drawn(few, tuning=tuning) for tuning in (PROCESSOR, CARD))
@@ -96,9 +96,9 @@ def test_a_card_draws_as_the_processor_does(count: int) -> None:
     [{}, {"views": 2}, {"splats": 9000}, {"pairs": 20_000}],
     ids=lambda limits: " ".join(limits) or "one pass",
 )
-def test_views_drawn_together_have_the_bits_of_each_alone(limits: dict[str, int]) -> None:
-    """Five views at once, one of them without a splat in view, whole or in passes of limited
-    memory: bit for bit the pictures of single views."""
+def test_views_drawn_together_equal_single_views(limits: dict[str, int]) -> None:
+    """Five views at once, one without a splat in view, equal single views bit for bit, in one pass
+    or in passes of limited memory."""
     splats = random_splats(7, 3000)
     aims = [(1.0, 0.02, -0.05), (1.0, 0.5, 0.1), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)]
     eyes = [(0.0, 0.0, 0.0), (1.0, 0.3, 0.2), (0.0, 0.0, 90.0), (9.0, 0.0, 0.0), (-2.0, 1.0, 0.0)]
@@ -115,8 +115,8 @@ def test_views_drawn_together_have_the_bits_of_each_alone(limits: dict[str, int]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2047, 2048, 100_000])
-def test_sorts_in_shaders_are_those_of_numpy(count: int) -> None:
-    """Sums, and pairs sorted stably by 11 bits of their keys, also of many blocks."""
+def test_sorts_in_shaders_equal_those_of_numpy(count: int) -> None:
+    """Sums, and pairs sorted stably by 11 bits of their keys, are equal, also with many blocks."""
     rng = np.random.default_rng(count)
     keys = rng.integers(0, 2000, count).astype(np.uint32)
     numbers = np.arange(count, dtype=np.uint32)
@@ -138,7 +138,7 @@ def test_sorts_in_shaders_are_those_of_numpy(count: int) -> None:
 
 
 def test_sums_in_shaders_have_three_levels() -> None:
-    """More values than the square of a block."""
+    """More values than the square of a block are summed."""
     count = 2048 * 2048 + 5
     with context.context() as gl:
         shaders, buffers = SplatShaders(gl, CARD), Buffers(gl)
@@ -151,7 +151,8 @@ def test_sums_in_shaders_have_three_levels() -> None:
 
 
 def test_huge_splats_fill_a_large_picture() -> None:
-    """All pixels have what 150 faint layers let through, though each covers thousands of tiles."""
+    """All pixels have what 150 faint layers let through, though each layer covers thousands of
+    tiles."""
     count = 150
     centres = np.tile((20.0, 0.0, 0.0), (count, 1)).astype(np.float32)
     wide = covariances(np.tile(np.eye(3), (count, 1, 1)), np.full((count, 3), 2000.0))
@@ -181,7 +182,7 @@ def test_a_tile_may_have_more_splats_than_a_loop_has_iterations() -> None:
 
 
 def test_a_picture_depends_on_every_splat() -> None:
-    """One splat in another colour gives other bits, the same splats the same."""
+    """One splat in another colour gives other bits, and the same splats the same."""
     splats = random_splats(3)
     rgba = splats.rgba.copy()
     visible = 299
@@ -201,7 +202,7 @@ def test_keys_grow_with_the_distance() -> None:
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:
-    """A picture by one thread is the picture by four."""
+    """A picture by one thread equals one by four."""
     drawing = [
         subprocess.Popen(
             [sys.executable, "-c", "import tests.support.splat_scan as s; print(s.picture_hash())"],
@@ -286,28 +287,32 @@ def _shares(x_m: float) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("x_m", [1.0, 4.0, WALL_X_M - 0.4, WALL_X_M + 1.5])
 def test_splats_cover_people_where_the_mesh_does(x_m: float) -> None:
-    """Before and behind a wall, 95 % of their visible pixels are shown, also of the lowest 0.3 m,
-    and 95 % of the hidden ones are not."""
+    """95 % of the visible pixels of people in front of and behind a wall are shown, also of the
+    lowest 0.3 m. 95 % of the hidden ones are not."""
     assert min(_shares(x_m)) >= 0.95
 
 
 def test_people_behind_a_wall_do_not_show_through_gaps_of_its_splats() -> None:
-    """Where a wall of the mesh hides people in other clothes, the pictures are equal, however faint
-    the wall's splats are."""
+    """Where a wall of the mesh hides people, other clothes change no pixel, however faint the
+    wall's splats are."""
     lines = [line_of_people(WALL_X_M + 1.5, called) for called in "ck"]
     first, second = (_picture(street_scan(opacity=25), "splats", line) for line in lines)
     bare = [_picture(street_scan(opacity=0, walled=False), "splats", line) for line in lines]
-    whole = _picture(street_scan(), "mesh", lines[0])
-    assert bare[0].labels is not None and bare[1].labels is not None and whole.labels is not None
+    mesh_picture = _picture(street_scan(), "mesh", lines[0])
+    assert (
+        bare[0].labels is not None
+        and bare[1].labels is not None
+        and mesh_picture.labels is not None
+    )
     hidden = (bare[0].labels == LABELS["person"]) & (bare[1].labels == LABELS["person"])
-    hidden &= whole.labels == LABELS["building"]
+    hidden &= mesh_picture.labels == LABELS["building"]
     assert hidden.sum() > 200 and (bare[0].rgb != bare[1].rgb)[hidden].any(axis=1).mean() > 0.5
     apart = np.abs(first.rgb.astype(int) - second.rgb).max(axis=2)
     assert (apart[hidden] == 0).mean() > 0.95
 
 
 def test_without_the_depth_test_splats_cover_everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test above fails if splats are not limited by the mesh."""
+    """The test of covering fails if splats are not limited by the mesh."""
     draw = SplatDrawing.draw
 
     def unlimited(self: SplatDrawing, *given: object, limited: bool) -> None:
@@ -318,10 +323,10 @@ def test_without_the_depth_test_splats_cover_everything(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("tuning", [PROCESSOR, CARD], ids=["processor", "card"])
-def test_a_batch_draws_scans_as_their_own_cameras_do(
+def test_a_batch_of_scans_equals_single_cameras(
     tuning: Tuning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two scanned places and four robots at once: bit for bit the pictures of single cameras."""
+    """Two scanned places and four robots at once equal single cameras bit for bit."""
     scans = [street_scan(sun=SUN), street_scan(noise_m=0.02)]
     worlds = [BulletWorld(ScanSurface(tiny_map(), scans[k], 0)) for k in (0, 0, 0, 1)]
     poses = (Pose(-3.0, 2.0, 0.0), Pose(-1.0, 1.0, 0.1), Pose(0.0, 3.0, -0.2), Pose(2.0, 0.5, 0.3))
@@ -347,8 +352,8 @@ def test_a_batch_draws_scans_as_their_own_cameras_do(
 
 
 def test_labels_and_depth_are_those_of_the_mesh() -> None:
-    """Where both draw the mesh or people: 97 % of the labels, and 95 % of the depths within 10 cm,
-    up to 10 m away."""
+    """Where both draw the mesh or people, up to 10 m away, 97 % of the labels and 95 % of the
+    depths agree within 10 cm."""
     street = walkers(6)
     splats, mesh = (_picture(street_scan(noise_m=0.004), look, street) for look in APPEARANCES)
     assert splats.labels is not None and splats.depth is not None and mesh.depth is not None
@@ -361,8 +366,8 @@ def test_labels_and_depth_are_those_of_the_mesh() -> None:
 
 @pytest.mark.parametrize("sun", [SUN, None], ids=["sun", "contact"])
 def test_people_darken_the_splats_around_their_feet(sun: ScanSun | None) -> None:
-    """A shadow beside a person, on the side away from the sun, or below it without a known sun, and
-    on all sides of its feet; people behind the wall cast none on the street before it."""
+    """A person has a shadow away from the sun, or below it without a known sun, and on all sides of
+    its feet. People behind a wall darken no street in front of it."""
     scan = street_scan(sun=sun)
     full_street = walkers(2)
     empty, full, behind = (
@@ -384,8 +389,8 @@ def test_people_darken_the_splats_around_their_feet(sun: ScanSun | None) -> None
     assert min(darker[one].mean() for one in at_feet) > 5.0
 
 
-def test_exposure_brightens_people_alone() -> None:
-    """One stop more leaves the splats as they are."""
+def test_exposure_brightens_only_people() -> None:
+    """One stop more leaves the splats unchanged."""
     scan = street_scan(sun=SUN)
     brighter = dataclasses.replace(scan, facts=msgspec.structs.replace(scan.facts, exposure_ev=1.0))
     one, other = (_picture(s, "splats", walkers(2)) for s in (scan, brighter))
@@ -397,7 +402,8 @@ def test_exposure_brightens_people_alone() -> None:
 
 
 def test_the_appearance_is_part_of_the_renderer() -> None:
-    """Records tell pictures of meshes from those of splats; only the gl camera has both."""
+    """Records distinguish pictures of meshes from those of splats, and only the gl camera has
+    both."""
     names = [renderer_of("gl", look) for look in APPEARANCES]
     assert names[0] == renderer_of("gl") != names[1]
     assert renderer_of("bullet", "mesh") == renderer_of("bullet")

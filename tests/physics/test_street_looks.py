@@ -1,4 +1,4 @@
-"""Looks of streets: crowns of twigs with gaps, decals, and clear glass."""
+"""Looks of streets: crowns of twigs with gaps, decals, and transparent glass."""
 
 from __future__ import annotations
 
@@ -22,12 +22,9 @@ from physics.textures.decals import decal_layers
 from physics.textures.walls import CUT_OUT, prop_layers
 from scenarios.places.nets import place
 
-needs_gl = [
-    pytest.mark.engine,
-    pytest.mark.skipif(
-        not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
-    ),
-]
+needs_gl = pytest.mark.skipif(
+    not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
+)
 SPEC = CameraSpec(width=256, height=192)
 
 
@@ -46,7 +43,7 @@ def first_prop(world: BulletWorld, kind: str) -> Prop:
 
 
 def view_of(camera: GlCamera, prop: Prop, away_m: float, up_m: float) -> Frame:
-    """A picture of a prop from its front."""
+    """Return a picture of a prop from its front."""
     turn = prop.heading_rad - 0.5 * math.pi
     eye = (prop.x_m + away_m * math.cos(turn), prop.y_m + away_m * math.sin(turn), 1.2)
     return camera.picture(eye, (prop.x_m, prop.y_m, up_m), Street(0), None, (256, 192))
@@ -72,7 +69,7 @@ def test_twigs_stay_above_heads_and_within_the_crown() -> None:
 
 
 def test_decals_lie_on_roads_and_sidewalks(world: BulletWorld) -> None:
-    """Pictures on the ground lie 4 mm above it, with their middle on a street."""
+    """Decals lie 4 mm above the ground, with their middle on a street."""
     surface = world.surface
     assert isinstance(surface, StreetSurface)
     middle = shapely.Point(first_prop(world, "tree").x_m, first_prop(world, "tree").y_m)
@@ -86,44 +83,42 @@ def test_decals_lie_on_roads_and_sidewalks(world: BulletWorld) -> None:
     assert len(found) >= 6 and found <= set(decal_layers(256).names)
 
 
+@needs_gl
+@pytest.mark.engine
 @pytest.mark.parametrize("drawing", ["draw_decals", "draw_panes"])
-class TestBlended:
-    pytestmark = needs_gl
-
-    def test_blending_changes_colours_as_it_should(
-        self, drawing: str, world: BulletWorld, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """Decals change neither labels nor depth; glass has its own, and shows what is behind."""
-        prop = first_prop(world, "shelter" if drawing == "draw_panes" else "tree")
-        with GlCamera(world, SPEC, depth=True) as camera:
-            whole = view_of(camera, prop, 5.0, 1.0)
-            monkeypatch.setattr(StreetDrawing, drawing, lambda *_, **__: None)
-            bare = view_of(camera, prop, 5.0, 1.0)
-        assert whole.labels is not None and bare.labels is not None
-        assert whole.depth is not None and bare.depth is not None
-        changed = (whole.rgb != bare.rgb).any(axis=2)
-        assert changed.mean() > 0.001
-        if drawing == "draw_decals":
-            assert np.array_equal(whole.labels, bare.labels)
-            assert np.array_equal(whole.depth, bare.depth)
-            return
-        pane = whole.depth < bare.depth - 0.01
-        assert pane.mean() > 0.05 and (whole.labels[pane] == LABELS["prop"]).all()
-        assert np.corrcoef(whole.rgb[pane].ravel(), bare.rgb[pane].ravel())[0, 1] > 0.7
+def test_decals_and_glass_are_blended(
+    drawing: str, world: BulletWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decals change neither labels nor depth; glass has its own, and shows what is behind it."""
+    prop = first_prop(world, "shelter" if drawing == "draw_panes" else "tree")
+    with GlCamera(world, SPEC, depth=True) as camera:
+        drawn = view_of(camera, prop, 5.0, 1.0)
+        monkeypatch.setattr(StreetDrawing, drawing, lambda *_, **__: None)
+        bare = view_of(camera, prop, 5.0, 1.0)
+    assert drawn.labels is not None and bare.labels is not None
+    assert drawn.depth is not None and bare.depth is not None
+    changed = (drawn.rgb != bare.rgb).any(axis=2)
+    assert changed.mean() > 0.001
+    if drawing == "draw_decals":
+        assert np.array_equal(drawn.labels, bare.labels)
+        assert np.array_equal(drawn.depth, bare.depth)
+        return
+    pane = drawn.depth < bare.depth - 0.01
+    assert pane.mean() > 0.05 and (drawn.labels[pane] == LABELS["prop"]).all()
+    assert np.corrcoef(drawn.rgb[pane].ravel(), bare.rgb[pane].ravel())[0, 1] > 0.7
 
 
-class TestCrowns:
-    pytestmark = needs_gl
-
-    def test_a_crown_has_gaps_that_show_what_is_behind(self, world: BulletWorld) -> None:
-        """In the box around a crown's pixels are others, whose depth is farther than the tree."""
-        tree = first_prop(world, "tree")
-        away_m = 7.0
-        with GlCamera(world, SPEC, depth=True) as camera:
-            seen = view_of(camera, tree, away_m, 0.7 * tree.size_m[2])
-        assert seen.labels is not None and seen.depth is not None
-        near = (seen.labels == LABELS["prop"]) & (seen.depth < away_m + 3.0)
-        rows, columns = np.nonzero(near[:96])
-        box = near[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-        edges = (box[:, 1:] != box[:, :-1]).sum(axis=1)
-        assert 0.2 < box.mean() < 0.95 and edges.max() >= 6
+@needs_gl
+@pytest.mark.engine
+def test_a_crown_has_gaps_that_show_what_is_behind(world: BulletWorld) -> None:
+    """The box around a crown's pixels also has pixels that are farther than the tree."""
+    tree = first_prop(world, "tree")
+    away_m = 7.0
+    with GlCamera(world, SPEC, depth=True) as camera:
+        seen = view_of(camera, tree, away_m, 0.7 * tree.size_m[2])
+    assert seen.labels is not None and seen.depth is not None
+    near = (seen.labels == LABELS["prop"]) & (seen.depth < away_m + 3.0)
+    rows, columns = np.nonzero(near[:96])
+    box = near[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    edges = (box[:, 1:] != box[:, :-1]).sum(axis=1)
+    assert 0.2 < box.mean() < 0.95 and edges.max() >= 6

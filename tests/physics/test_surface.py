@@ -1,5 +1,4 @@
-"""A plain surface, a slope with a step at its end: driven on, bumped into, drawn by both
-cameras."""
+"""A plain surface, a slope with a step at its end: driving, contacts, and both cameras."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ PROFILE = {
     "curb": ((LONG_M, GRADE * LONG_M), (LONG_M, TOP_M)),
     "plateau": ((LONG_M, TOP_M), (14.0, TOP_M)),
 }
-"""Seen from the side, in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet
+"""Profile in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet
 at x = 0.41."""
 LABEL = {
     "sidewalk": "sidewalk",
@@ -49,7 +48,7 @@ def height(x_m: float) -> float:
 
 
 class Hill(Surface):
-    """The slope with its step."""
+    """A slope with a step at its end."""
 
     def heights(self, xy: ArrayLike) -> Floats:
         return np.array([height(x_m) for x_m in np.asarray(xy, dtype=float).reshape(-1, 2)[:, 0]])
@@ -62,12 +61,12 @@ class Hill(Surface):
         for name, ((begin, z0), (end, z1)) in PROFILE.items():
             left, right = max(begin, x0), min(end, x1)
             if begin == end:
-                there = x0 <= begin < x1
+                overlaps = x0 <= begin < x1
                 z = np.array([z0, z1])
             else:
-                there = left < right
+                overlaps = left < right
                 z = np.interp((left, right), (begin, end), (z0, z1))
-            if low >= high or not there:
+            if low >= high or not overlaps:
                 continue
             corners = np.array(
                 [(left, low, z[0]), (right, low, z[1]), (right, high, z[1]), (left, high, z[0])]
@@ -85,8 +84,8 @@ def surface() -> Hill:
     return Hill()
 
 
-def test_a_robot_leans_as_the_slope_does(surface: Hill) -> None:
-    """Whichever way it faces; a vehicle lies on its wheels, and no foot floats."""
+def test_a_robot_leans_like_the_slope(surface: Hill) -> None:
+    """It leans at any heading, a vehicle lies on its wheels, and no foot floats."""
     for heading, roll, pitch in ((0.0, 0.0, -1.0), (math.pi, 0.0, 1.0), (math.pi / 2, -1.0, 0.0)):
         z, leant, nodding = surface.lean(Pose(3.0, 1.0, heading), COURIER.drive.span_m)
         assert z == pytest.approx(3.0 * GRADE, abs=1e-6)
@@ -100,8 +99,8 @@ def test_a_robot_leans_as_the_slope_does(surface: Hill) -> None:
 
 @pytest.mark.engine
 def test_the_robot_climbs_the_slope_and_is_stopped_by_the_step(surface: Hill) -> None:
-    """Its wheels stay on the slope, it leans as that does, keeps its speed, and does not get
-    over the step."""
+    """Its wheels stay on the slope, it leans like it, keeps its speed, and does not get over the
+    step."""
     with BulletWorld(surface) as world:
         state = world.place(Pose(-1.5, 1.0, 0.0))
         states = []
@@ -124,7 +123,7 @@ def test_the_robot_climbs_the_slope_and_is_stopped_by_the_step(surface: Hill) ->
 
 @pytest.mark.engine
 def test_the_robot_drops_off_the_step(surface: Hill) -> None:
-    """From above it falls by the height of the step, and goes on downhill on its wheels."""
+    """From above it falls by the height of the step, and continues downhill on its wheels."""
     with BulletWorld(surface) as world:
         state = world.place(Pose(8.5, -1.0, math.pi))
         states = []
@@ -147,7 +146,7 @@ VIEWS = (
 
 
 def points_of(frame: Frame, eye: np.ndarray, target: np.ndarray, fov_deg: float) -> np.ndarray:
-    """(H, W, 3) what each pixel shows, in world metres."""
+    """Return (H, W, 3) world points in metres that each pixel shows."""
     assert frame.depth is not None
     high, wide = frame.depth.shape
     taken = shot(eye, target, (wide, high), fov_deg)
@@ -164,8 +163,7 @@ def points_of(frame: Frame, eye: np.ndarray, target: np.ndarray, fov_deg: float)
 def test_a_camera_draws_a_mesh_where_it_is(
     make: type[GlCamera | BulletCamera], surface: Hill
 ) -> None:
-    """Of four views each pixel of the mesh lies on it by its depth, on the part that its label
-    names."""
+    """In four views each pixel of the mesh lies on it by its depth, on the part of its label."""
     if make is GlCamera and not context.available():
         pytest.skip("no OpenGL through EGL here (see `cosim doctor`)")
     seen = set()

@@ -1,4 +1,4 @@
-"""Terrain: heights and creases by hand; elevations of nets cleaned, clamped or dropped; tiles on
+"""Terrain: heights and creases by hand; cleaned, clamped or dropped elevations of nets; tiles on
 the land."""
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from sumo_nets.net.elevation import (
     terrain_of_courses,
 )
 from sumo_nets.net.snapshot import map_as_bytes, map_from_bytes
-from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
+from tests.support.tiny_street import KEYS, assert_no_cracks, plan_areas, tiny_map, triangles
 
 HAND = Terrain(10.0, 20.0, 2.0, np.array([[0, 1, 2], [0, 1, 6]], dtype=np.float32))
 """One flat rise to the east, and a cell whose north-east corner is pulled up by 4 m."""
 
 
 def hills(x0: float, y0: float, columns: int, rows: int) -> Terrain:
-    """Waves of some 8 %, 2 m apart, with a bend at every node."""
+    """Return waves of some 8 %, 2 m apart, with a bend at every node."""
     x, y = np.meshgrid(x0 + 2.0 * np.arange(columns), y0 + 2.0 * np.arange(rows))
     return Terrain(
         x0,
@@ -56,9 +56,9 @@ def hills(x0: float, y0: float, columns: int, rows: int) -> Terrain:
 HILLY = dataclasses.replace(tiny_map(), terrain=hills(-160.0, -160.0, 161, 161))
 
 
-def test_heights_by_hand() -> None:
-    """Nodes, sides and the two triangles of a cell; beyond the lattice the heights at its edge go
-    on."""
+def test_heights_match_hand_computed_values() -> None:
+    """Nodes, sides and the two triangles of a cell are exact, and beyond the lattice the heights at
+    its edge continue."""
     points = [
         (10, 20),
         (12, 22),
@@ -75,8 +75,8 @@ def test_heights_by_hand() -> None:
 
 
 @given(st.lists(st.tuples(*[st.floats(-1e4, 1e4)] * 2), min_size=1, max_size=40))
-def test_a_height_does_not_depend_on_its_company(points: list[tuple[float, float]]) -> None:
-    """Many points asked at once get the very bits that each gets alone."""
+def test_a_height_does_not_depend_on_other_points(points: list[tuple[float, float]]) -> None:
+    """Many points at once get the same bits as each point alone."""
     terrain = HILLY.terrain
     assert terrain is not None
     assert terrain.height(points).tolist() == [
@@ -87,19 +87,20 @@ def test_a_height_does_not_depend_on_its_company(points: list[tuple[float, float
 def straight(
     z: list[float], length_m: float = 100.0, y_m: float = 0.0, on: On = "street", edge: str = "e"
 ) -> Course:
-    """A course eastwards with elevations at even distances, zeros left away as netconvert does."""
+    """Return a course eastwards with elevations at even distances, without zeros, as netconvert
+    writes it."""
     at = zip(np.linspace(0.0, length_m, len(z)), z, strict=True)
     points = [f"{x:.2f},{y_m:.2f}" + ("" if h == 0.0 else f",{h:.2f}") for x, h in at]
     return parse_course(edge, " ".join(points), on)
 
 
 def along(terrain: Terrain, length_m: float = 100.0, y_m: float = 0.0) -> np.ndarray:
-    """Heights above the map's zero at every metre of a street."""
+    """Return heights above the map's zero at every metre of a street."""
     x = np.arange(0.0, length_m + 0.5)
     return terrain.height(np.column_stack([x, np.full(len(x), y_m)])) + terrain.datum_m
 
 
-def test_points_with_and_without_elevation_mix() -> None:
+def test_missing_elevations_are_interpolated() -> None:
     """Missing elevations, which are 0 beside 60 m, and a spike are interpolated, and counted."""
     mixed = "0,0,60 12.5,0,61 25,0 37.5,0,0 50,0,64 62.5,0,65 75,0,95 87.5,0,67 100,0,68"
     terrain, found = terrain_of_courses([parse_course("e", mixed)])
@@ -109,7 +110,7 @@ def test_points_with_and_without_elevation_mix() -> None:
 
 
 def test_a_place_at_sea_level_keeps_its_zeros() -> None:
-    """A 0 that a street can come down to is one."""
+    """A 0 that a street can descend to is an elevation."""
     terrain, found = terrain_of_courses([straight([0, 0, 1, 3, 6, 9])])
     assert terrain is not None and found is not None
     assert found.missing == 0
@@ -117,7 +118,7 @@ def test_a_place_at_sea_level_keeps_its_zeros() -> None:
 
 
 def test_the_land_is_level_across_a_street() -> None:
-    """To the left and to the right of a rising street the land is as high as on it."""
+    """Left and right of a rising street the land is as high as on it."""
     terrain, _ = terrain_of_courses([straight([0, 10], y_m=y) for y in (-4.0, 0.0, 4.0)])
     assert terrain is not None
     spots = [(x, y) for x in range(15, 86) for y in (-5.0, 0.0, 5.0)]
@@ -127,8 +128,8 @@ def test_the_land_is_level_across_a_street() -> None:
 
 
 def test_steep_streets_are_clamped_and_counted() -> None:
-    """A fault of 6 m in the middle of a street becomes a ramp of the steepest grade allowed; its
-    ends stay."""
+    """A fault of 6 m in the middle of a street becomes a ramp of the steepest allowed grade, and
+    its ends stay."""
     terrain, found = terrain_of_courses([straight([20.0] * 20 + [26.0] * 20, 400.0)])
     assert terrain is not None and found is not None
     level = along(terrain, 400.0)
@@ -137,9 +138,8 @@ def test_steep_streets_are_clamped_and_counted() -> None:
     assert found.clamped > 5 and 2.0 < found.moved_m < 3.1
 
 
-def test_steps_stay_steep_and_leave_the_streets_alone() -> None:
-    """Steps of 50 % between two streets do not move them; the strip of the steps is one that no
-    robot takes."""
+def test_steps_stay_steep_and_do_not_move_streets() -> None:
+    """Steps of 50 % between two streets do not move them, and no robot may use their strip."""
     up = parse_course("s", "50,0,10 50,20,20", "steps")
     terrain, found = terrain_of_courses([straight([10, 10]), up, straight([20, 20], y_m=20.0)])
     assert terrain is not None and found is not None and found.clamped == 0
@@ -156,17 +156,17 @@ def test_steps_stay_steep_and_leave_the_streets_alone() -> None:
     assert steep_strips(terrain, (stairs, street)) == ("stairs",)
 
 
-def test_paths_up_hills_count_as_steps_only_when_steep() -> None:
-    """A path of 10 % is a walkway and keeps the bound; one of 30 % is left as it is."""
-    for rise_m, moved in ((10.0, False), (30.0, False)):
+def test_paths_up_hills_are_not_clamped() -> None:
+    """Paths of 10 % and of 30 % keep their rise."""
+    for rise_m in (10.0, 30.0):
         terrain, found = terrain_of_courses([straight([0.5, 0.5 + rise_m], on="path")])
-        assert terrain is not None and found is not None and (found.clamped > 0) == moved
+        assert terrain is not None and found is not None and found.clamped == 0
         assert along(terrain)[-5] - along(terrain)[5] == pytest.approx(0.9 * rise_m, rel=0.03)
 
 
 def test_false_elevations_are_dropped() -> None:
-    """Spikes, steps of tens of metres, one height everywhere, hardly any height: flat ground, and
-    the reason."""
+    """Spikes, steps of tens of metres, equal heights and too few heights give flat ground with the
+    reason."""
     rng = np.random.default_rng(1)
     for courses, why in (
         (
@@ -182,14 +182,14 @@ def test_false_elevations_are_dropped() -> None:
 
 
 def test_a_flat_net_has_no_elevation() -> None:
-    """Points without elevation, or with 0 alone, say nothing."""
+    """Points without elevation, or with 0 only, give no terrain."""
     assert terrain_of_courses([parse_course("e", "0,0 9,9")]) == (None, None)
     assert terrain_of_courses([straight([0.0, 0.0])]) == (None, None)
     assert terrain_of_courses([]) == (None, None)
 
 
-def test_bridges_steps_and_paths_are_told_by_type_and_params() -> None:
-    """SUMO's type names, and OSM's tags in the params."""
+def test_bridges_steps_and_paths_are_recognised_by_type_and_params() -> None:
+    """SUMO's type names, and OSM's tags in the params, are used."""
     assert kind_at("highway.secondary_tunnel", {}, False) == "raised"
     assert kind_at("highway.path", {"bridge": "yes"}, True) == "raised"
     assert (
@@ -212,10 +212,10 @@ LINES = st.lists(
 
 @settings(max_examples=60)
 @given(LINES, st.sampled_from(["street", "path", "steps", "raised"]), st.booleans())
-def test_no_elevations_are_too_bad_to_be_read(
+def test_any_elevations_give_finite_terrain_or_a_reason(
     lines: list[list[tuple[float, float, float]]], on: On, ring: bool
 ) -> None:
-    """Whatever a net says, there is a finite land or none, and a drop has its reason."""
+    """Any net has a finite terrain or none, and a dropped one has its reason."""
     courses = [
         Course(f"e{i}", np.array(line), "street" if i else on, ring and i == 0)
         for i, line in enumerate(lines)
@@ -232,8 +232,8 @@ def test_no_elevations_are_too_bad_to_be_read(
 
 @given(st.data(), st.integers(2, 30))
 def test_clamped_heights_keep_their_bounds(data: st.DataObject, count: int) -> None:
-    """On any graph, from any heights: no joint rises more than it may, and what keeps the bounds is
-    left alone."""
+    """On any graph with any heights no joint rises more than allowed, and valid heights are
+    unchanged."""
     z = np.array(data.draw(st.lists(st.floats(-400.0, 5000.0), min_size=count, max_size=count)))
     joints = data.draw(
         st.lists(st.tuples(*[st.integers(0, count - 1)] * 2, st.floats(0.06, 3.0)), max_size=60)
@@ -246,7 +246,7 @@ def test_clamped_heights_keep_their_bounds(data: st.DataObject, count: int) -> N
 
 
 def test_tiles_on_hills_have_no_cracks_and_lie_on_the_land() -> None:
-    """Edges are shared by two triangles; off the ramps triangles are within a millimetre of the
+    """Edges are shared by two triangles, and off the ramps triangles are within a millimetre of the
     land."""
     terrain = HILLY.terrain
     assert terrain is not None
@@ -254,7 +254,7 @@ def test_tiles_on_hills_have_no_cracks_and_lie_on_the_land() -> None:
         tile = build_tile(HILLY, key)
         corners = np.concatenate([triangles(tile, name) for name in tile.parts])
         assert abs(plan_areas(corners).sum() - 48.0**2) < 1e-6
-        no_cracks(key, corners)
+        assert_no_cracks(key, corners)
         for name in ("road", "sidewalk"):
             faces = triangles(tile, name)
             inside = faces[np.hypot(*(faces.mean(axis=1)[:, :2]).T) > 12.0].mean(axis=1)
@@ -266,8 +266,7 @@ def test_tiles_on_hills_have_no_cracks_and_lie_on_the_land() -> None:
 
 
 def test_heights_on_hills_meet_at_tile_borders_and_follow_the_mesh() -> None:
-    """Two tiles agree on their border, and a tile's heights are those of its own vertices, the
-    curb's foot included."""
+    """Two tiles agree on their border, and a tile's heights are those of its own vertices."""
     left = build_tile(HILLY, (-1, -1))
     right = build_tile(HILLY, (0, -1))
     border = np.column_stack(
@@ -292,8 +291,8 @@ def test_ramps_rise_one_in_twelve_over_the_land() -> None:
 
 
 def test_nothing_floats_on_a_hill() -> None:
-    """Houses reach down to the lowest land around them, props to the lowest under them; doors are
-    at the street."""
+    """Houses reach down to the lowest land around them and props to the lowest under them, and
+    doors are at the street."""
     ground = StreetSurface(HILLY, 4)
     terrain = HILLY.terrain
     assert terrain is not None
@@ -313,22 +312,28 @@ def test_nothing_floats_on_a_hill() -> None:
     assert (math.tan(-pitch), math.tan(roll)) == pytest.approx((east, north), abs=0.02)
 
 
-def test_a_snapshot_keeps_the_land() -> None:
-    """Terrain and elevation come back from a snapshot to the bit; a flat map comes back flat."""
-    told = Elevation(1.5, 9.0, 20, 3, 0.01, 4, 0.5, ("a", "b"), (("c", 1),))
-    again = map_from_bytes(map_as_bytes(dataclasses.replace(HILLY, elevation=told)))
-    assert again.terrain is not None and HILLY.terrain is not None and again.elevation == told
-    assert np.array_equal(again.terrain.heights, HILLY.terrain.heights)
-    assert again.terrain.heights.dtype == np.float32 and again.terrain.step_m == 2.0
+def test_a_snapshot_stores_the_terrain() -> None:
+    """Terrain and elevation are read back to the bit, and a flat map stays flat."""
+    elevation = Elevation(1.5, 9.0, 20, 3, 0.01, 4, 0.5, ("a", "b"), (("c", 1),))
+    restored = map_from_bytes(map_as_bytes(dataclasses.replace(HILLY, elevation=elevation)))
     assert (
-        again.steep == {"a", "b"} and Port("c", 1) in again.too_steep and len(again.too_steep) == 5
+        restored.terrain is not None
+        and HILLY.terrain is not None
+        and restored.elevation == elevation
+    )
+    assert np.array_equal(restored.terrain.heights, HILLY.terrain.heights)
+    assert restored.terrain.heights.dtype == np.float32 and restored.terrain.step_m == 2.0
+    assert (
+        restored.steep == {"a", "b"}
+        and Port("c", 1) in restored.too_steep
+        and len(restored.too_steep) == 5
     )
     flat = map_from_bytes(map_as_bytes(tiny_map()))
     assert flat.terrain is None and flat.elevation is None
 
 
 def test_corners_too_steep_to_cross_are_closed() -> None:
-    """Of three ports the one above the others is closed; on level land none is."""
+    """Of three ports the one above the others is closed, and on level land none is."""
     cliff = np.where(np.arange(40)[:, None] >= 22, 10.0, 0.0) * np.ones((1, 40))
     terrain = Terrain(-40.0, -40.0, 2.0, cliff.astype(np.float32))
     strip = next(iter(tiny_map().strips.values()))
@@ -349,8 +354,8 @@ def test_corners_too_steep_to_cross_are_closed() -> None:
     assert steep_ports(level, strips, [corner], ()) == ()
 
 
-def test_flat_ground_is_what_it_was() -> None:
-    """Without terrain a tile is at height 0; a land of height 0 gives the same heights and
+def test_flat_terrain_equals_no_terrain() -> None:
+    """Without terrain a tile is at height 0, and terrain of height 0 gives the same heights and
     leans."""
     flat = StreetSurface(tiny_map(), 4)
     zero = Terrain(-200.0, -200.0, 2.0, np.zeros((200, 200), dtype=np.float32))

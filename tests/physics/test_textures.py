@@ -1,5 +1,4 @@
-"""Textures: they tile, they are the same in every process, colours can be put on them, and every
-name is there."""
+"""Textures: they tile, are equal in every process, take colours, and have every name."""
 
 from __future__ import annotations
 
@@ -28,7 +27,8 @@ STACKS = (ground_layers, wall_layers, prop_layers, facade_layers)
 
 
 def rough(picture: np.ndarray, axis: int) -> np.ndarray:
-    """Mean absolute step between neighbouring rows (or columns), the last to the first included."""
+    """Return the mean absolute step between neighbouring rows (or columns), including the last to
+    the first."""
     values = picture.astype(float)
     other = tuple(a for a in range(values.ndim) if a != axis)
     return np.asarray(np.abs(values - np.roll(values, -1, axis=axis)).mean(axis=other))
@@ -45,14 +45,14 @@ def test_surfaces_have_no_seams(stack: object) -> None:
 
 
 def test_textures_are_the_same_in_every_process() -> None:
-    """Another process draws the same bytes; another seed draws others."""
+    """Another process draws the same bytes, and another seed draws others."""
     code = (
         "import zlib\nfrom physics.textures.ground import ground_layers\n"
         "from physics.textures.facades import facade_layers\n"
         "print([zlib.crc32(f(256).rgba) for f in (ground_layers, facade_layers)])"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == str(
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str(
         [zlib.crc32(f(256).rgba) for f in (ground_layers, facade_layers)]
     )
     assert not np.array_equal(ground_layers(256, 1).rgba, ground_layers(256).rgba)
@@ -68,8 +68,7 @@ def test_a_tint_becomes_the_mean_colour() -> None:
 
 
 def test_every_name_in_the_tables_is_a_layer() -> None:
-    """Surfaces and styles of walls name layers that exist, and every surface of the ground has
-    one."""
+    """Surfaces and wall styles name existing layers, and every surface of the ground has one."""
     for names in SURFACE_LAYERS.values():
         assert set(names) <= set(GROUND_RECIPES)
     walls, facades = set(wall_layers(256).names), set(facade_layers(256).names)
@@ -96,16 +95,16 @@ def test_every_name_in_the_tables_is_a_layer() -> None:
     )
 
 
-def test_colours_are_decoded_as_the_standard_says() -> None:
-    """sRGB 0.5 is 0.214 linear, and encoding undoes decoding."""
+def test_colours_are_decoded_by_the_srgb_standard() -> None:
+    """sRGB 0.5 is 0.214 linear, and encoding inverts decoding."""
     assert srgb_to_linear((0.0, 0.5, 1.0)) == pytest.approx([0.0, 0.21404, 1.0], abs=1e-4)
     assert linear_to_srgb(srgb_to_linear(np.linspace(0.0, 1.0, 11))) == pytest.approx(
         np.linspace(0.0, 1.0, 11), abs=1e-5
     )
 
 
-def test_wrong_sizes_and_names_are_told() -> None:
-    """A size that is none, an unknown layer and stacks that do not fit are refused."""
+def test_wrong_sizes_and_names_are_refused() -> None:
+    """An invalid size, an unknown layer and stacks that do not fit are refused."""
     with pytest.raises(SpecError, match="size_px must be one of 256, 512, 1024, not 100"):
         ground_layers(100)
     with pytest.raises(
@@ -114,5 +113,5 @@ def test_wrong_sizes_and_names_are_told() -> None:
         ground_layers(256).index("lava")
     with pytest.raises(UsageError, match="one size"):
         join_layers(ground_layers(256), wall_layers(512))
-    whole = join_layers(ground_layers(256), wall_layers(256))
-    assert len(whole) == len(ground_layers(256)) + len(wall_layers(256))
+    joined = join_layers(ground_layers(256), wall_layers(256))
+    assert len(joined) == len(ground_layers(256)) + len(wall_layers(256))

@@ -17,19 +17,20 @@ from physics.ground.tiles import (
     tiles_within,
 )
 from physics.street.buildings import BuildingRows
-from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
+from tests.support.tiny_street import KEYS, assert_no_cracks, plan_areas, tiny_map, triangles
 
 MAP = tiny_map()
 
 
 @pytest.fixture(scope="module")
 def tiles() -> dict[Key, Tile]:
-    """The tiles around the crossing."""
+    """Return the tiles around the crossing."""
     return {key: build_tile(MAP, key) for key in KEYS}
 
 
 def test_a_tile_is_covered_once(tiles: dict[Key, Tile]) -> None:
-    """The triangles of every tile, seen from above, fill its square exactly and none looks down."""
+    """The triangles of every tile, seen from above, fill its square exactly, and none faces
+    down."""
     for tile in tiles.values():
         areas = np.concatenate([plan_areas(triangles(tile, name)) for name in tile.parts])
         assert areas.min() > -1e-9
@@ -37,14 +38,14 @@ def test_a_tile_is_covered_once(tiles: dict[Key, Tile]) -> None:
 
 
 def test_neighbouring_triangles_share_their_corners(tiles: dict[Key, Tile]) -> None:
-    """Within a tile every edge off the border is shared by two triangles, walls and their feet
-    included."""
+    """Within a tile every edge off the border is shared by two triangles, also at walls and their
+    feet."""
     for key, tile in tiles.items():
-        no_cracks(key, np.concatenate([triangles(tile, name) for name in tile.parts]))
+        assert_no_cracks(key, np.concatenate([triangles(tile, name) for name in tile.parts]))
 
 
 def test_heights_meet_at_tile_borders(tiles: dict[Key, Tile]) -> None:
-    """Two tiles agree on the height of points on their common border, on the ramps too."""
+    """Two tiles agree on the height of points on their common border, also on ramps."""
     left = tiles[(-1, -1)]
     right = tiles[(0, -1)]
     x = tile_bounds((0, -1))[0]
@@ -53,8 +54,8 @@ def test_heights_meet_at_tile_borders(tiles: dict[Key, Tile]) -> None:
 
 
 def test_the_curb_ramp_rises_one_in_twelve() -> None:
-    """From the crossing's end the corner climbs 1:12 to the curb's height; the flares follow the
-    same rule."""
+    """From the end of the crossing the corner climbs 1:12 to the curb's height, and so do the
+    flares."""
     tile = build_tile(MAP, tile_at(0.0, 5.0))
     ahead = tile.height([[0.0, 3.5 + d] for d in (0.001, 0.36, 0.72, 1.44, 2.0)])
     assert np.allclose(ahead, [0.0, 0.03, 0.06, 0.12, 0.12], atol=2e-4)
@@ -65,8 +66,7 @@ def test_the_curb_ramp_rises_one_in_twelve() -> None:
 
 
 def test_the_kinds_of_ground_lie_where_the_map_says(tiles: dict[Key, Tile]) -> None:
-    """Triangles' middles: sidewalk on strips, stripes on the crossing, road on lanes, verge on the
-    verge."""
+    """The middles of triangles of a kind lie on strips, the crossing, lanes or the verge."""
     where = {
         "road": shapely.box(-80, -3.5, 80, 3.5),
         "stripe": shapely.box(-1.6, -3.5, 1.6, 3.5),
@@ -91,8 +91,7 @@ def test_tiles_do_not_depend_on_the_order(tiles: dict[Key, Tile]) -> None:
 
 
 def test_buildings_line_the_street_and_keep_off_it() -> None:
-    """Both sides have buildings, none over walkable ground or road, and they begin at the frontage
-    distance."""
+    """Both sides have buildings at the frontage distance, none over walkable ground or road."""
     frontage = BuildingRows(MAP, seed=4)
     built = [b for key in tiles_within(0.0, 0.0, 100.0) for b in frontage.in_tile(key)]
     street = shapely.box(-80, -8, 80, 6.5)
@@ -104,7 +103,7 @@ def test_buildings_line_the_street_and_keep_off_it() -> None:
 
 
 def test_buildings_do_not_depend_on_the_order_but_on_the_seed() -> None:
-    """Tiles asked for in any order hold the same buildings; another seed gives others."""
+    """Tiles in any order hold the same buildings, and another seed gives others."""
     one, two, other = BuildingRows(MAP, 4), BuildingRows(MAP, 4), BuildingRows(MAP, 5)
     forward = {key: one.in_tile(key) for key in KEYS}
     backward = {key: two.in_tile(key) for key in reversed(KEYS)}

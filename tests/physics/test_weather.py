@@ -1,4 +1,4 @@
-"""Weather: hashes, friction, pictures by the gl camera."""
+"""Weather: hashes, friction, and pictures of the gl camera."""
 
 from __future__ import annotations
 
@@ -55,8 +55,9 @@ def test_the_documents_have_every_weather() -> None:
         assert (float(grip), float(hurry)) == (weather.grip, weather.hurry), name
 
 
-def test_bad_weather_is_refused() -> None:
-    """An unknown name lists the valid ones; weather in a photographed sky is a contradiction."""
+def test_invalid_weather_is_refused() -> None:
+    """An unknown name lists the valid ones, and weather in a photographed sky is a
+    contradiction."""
     with pytest.raises(SpecError, match=r"unknown weather 'rian'\. Valid choices: clear, dusk, .*"):
         short_way("a", weather="rian")
     with pytest.raises(UsageError, match=r"unknown weather 'rian'.*Did you mean rain\?"):
@@ -66,7 +67,7 @@ def test_bad_weather_is_refused() -> None:
 
 
 def test_weather_keeps_people_indoors() -> None:
-    """At night fewer residents and children are outside; a clear day changes no crowd."""
+    """At night fewer residents and children are outside, and a clear day changes no crowd."""
     one = short_way("a", crowd=CrowdSpec(residents=10, groups=0.6, children=0.2))
     assert one.weathered_crowd is one.crowd
     night = one.in_weather("night").weathered_crowd
@@ -75,8 +76,8 @@ def test_weather_keeps_people_indoors() -> None:
 
 @pytest.mark.engine
 def test_rain_and_snow_lengthen_the_braking_distance() -> None:
-    """On dry ground the motors limit braking at 4 m/s; with locked wheels, on wet ground and on
-    snow, the distances are as the inverse friction."""
+    """On dry ground the motors limit braking at 4 m/s; with locked wheels, distances on wet ground
+    and snow are inverse to the friction."""
     slides_m = []
     for grip in (1.0, WET_GRIP, SNOW_GRIP):
         with BulletWorld(StreetSurface(tiny_map(), seed=1), grip=grip) as world:
@@ -105,7 +106,7 @@ def street_map() -> StreetMap:
 
 @pytest.fixture(scope="module")
 def frames(world: BulletWorld) -> Iterator[dict[str, Frame]]:
-    """The same view in weathers that together have every variant of the programs."""
+    """Return the same view in weathers that together use every variant of the programs."""
     found = {}
     robot, street = moment(world, 3)
     for name in (CLEAR, "heavy_rain", "low_sun", "snow", "rainy_night"):
@@ -118,7 +119,7 @@ def frames(world: BulletWorld) -> Iterator[dict[str, Frame]]:
 @needs_gl
 @pytest.mark.engine
 def test_labels_and_depth_do_not_depend_on_the_weather(frames: dict[str, Frame]) -> None:
-    """Drops, snow and darkness change colours alone, and each weather its own; in rain people have
+    """Drops, snow and darkness change only colours, each weather its own, and in rain people have
     umbrellas."""
     clear = frames[CLEAR]
     assert clear.labels is not None and clear.depth is not None
@@ -136,7 +137,8 @@ def test_labels_and_depth_do_not_depend_on_the_weather(frames: dict[str, Frame])
 def test_clear_days_have_no_weather_in_their_pictures(
     world: BulletWorld, frames: dict[str, Frame]
 ) -> None:
-    """Clear, overcast and foggy days use the programs of days; a clear day has the same bits."""
+    """Clear, overcast and foggy days use the programs of days, and a clear day has the same
+    bits."""
     for name, look in (
         (name, weather_look(weather, weathered_sky(Light(), weather, 1), 1, True))
         for name, weather in WEATHERS.items()
@@ -152,7 +154,7 @@ def test_clear_days_have_no_weather_in_their_pictures(
 def test_lamps_light_the_ground_at_night(
     world: BulletWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without its lamps a night's ground is darker; near a lamp it is much darker."""
+    """Without its lamps the ground is darker at night, and much darker near a lamp."""
     robot, street = moment(world, 3)
     with GlCamera(world, SPEC, weather=WEATHERS["night"]) as camera:
         lit = camera.render(robot, street)
@@ -169,7 +171,7 @@ def test_lamps_light_the_ground_at_night(
 @needs_gl
 @pytest.mark.engine
 def test_fewer_windows_are_lit_late_at_night(world: BulletWorld) -> None:
-    """Pixels of walls are lit at 21:00 and dark at 4:30, hardly any the other way round."""
+    """Pixels of walls are lit at 21:00 and dark at 4:30, and hardly any the other way round."""
     assert lit_share(4.5) < 0.1 < lit_share(23.0) < lit_share(21.0) and lit_share(
         24.0
     ) == lit_share(0)

@@ -1,5 +1,5 @@
-"""People beside people: the measures on tracks made by hand, and our walkers on the streets they
-are watched on."""
+"""Crowd statistics: the measures on hand-made tracks, and the simulated walkers of the
+benchmark."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from scenarios.tools.bench.people_tracks import (
 
 
 def _walking(rows: list[tuple[float, float, float]], frames: int = 41) -> pd.DataFrame:
-    """Tracks of people who walk along x from (x, y) at a speed, ten frames a second."""
+    """Return tracks of people who walk along x from (x, y) at a speed, ten frames a second."""
     tracks = [
         (k, frame, x_m + mps * frame / 10, y_m)
         for k, (x_m, y_m, mps) in enumerate(rows)
@@ -35,20 +35,21 @@ def _walking(rows: list[tuple[float, float, float]], frames: int = 41) -> pd.Dat
     return pd.DataFrame(tracks, columns=["id", "frame", "x", "y"])
 
 
-def test_everybody_counts_at_the_density_of_its_moment() -> None:
-    """Three abreast in a window of 2 m x 2 m are 0.75 persons/m2, who follows alone is 0.25."""
+def test_each_person_counts_at_the_density_around_it() -> None:
+    """Three people abreast in a window of 2 m x 2 m have 0.75 persons/m2, and a lone follower has
+    0.25."""
     tracks = _walking([(-2.0, -0.6, 1.0), (-2.0, 0.0, 1.0), (-2.0, 0.6, 1.0), (-4.5, 0.0, 1.5)])
     found = speeds_by_density(tracks, [shapely.box(-1.0, -1.0, 1.0, 1.0)])
     assert set(np.unique(found[:, 0])) == {0.25, 0.75, 1.0}
     assert found[found[:, 0] == 0.75, 1] == pytest.approx(1.0)
     assert found[found[:, 0] == 0.25, 1] == pytest.approx(1.5)
-    (low, few), (_, many), (nobody, none) = in_bins(found, (0.0, 0.5, 1.5, 2.0))
+    (low, few), (_, many), (empty, empty_count) = in_bins(found, (0.0, 0.5, 1.5, 2.0))
     assert low.mean == pytest.approx(1.5)
-    assert few + many == len(found) and none == 0 and np.isnan(nobody.mean)
+    assert few + many == len(found) and empty_count == 0 and np.isnan(empty.mean)
 
 
-def test_the_nearest_is_the_nearest_of_the_same_moment() -> None:
-    """One passes a place where another was before: only where they are at the same time counts."""
+def test_the_nearest_person_is_searched_in_the_same_frame() -> None:
+    """A person who passes a place that another one left earlier is not its nearest neighbour."""
     tracks = _walking([(0.0, 0.0, 1.0), (-3.0, 0.0, 1.0), (0.0, 4.0, 1.0)], frames=11)
     assert nearest_m(tracks).reshape(3, 11) == pytest.approx(
         np.repeat([[3.0], [3.0], [4.0]], 11, axis=1)
@@ -57,16 +58,16 @@ def test_the_nearest_is_the_nearest_of_the_same_moment() -> None:
     assert free_speeds(tracks, apart_m=3.5, least_s=0.5) == pytest.approx([1.0])
 
 
-def test_gaps_are_from_leaving_to_coming() -> None:
-    """At 1 m/s a lane 1.4 m wide (2 m with the shoulders) is left after 2 s; a vehicle 4 m long at
-    10 m/s is there 0.23 s before its middle is, and gone 0.23 s after."""
+def test_a_gap_lasts_from_leaving_to_the_next_arrival() -> None:
+    """A person at 1 m/s leaves a lane 1.4 m wide (2 m with the shoulders) after 2 s. A vehicle 4 m
+    long at 10 m/s arrives 0.23 s before its middle and leaves 0.23 s after it."""
     times_s = np.arange(0.0, 20.0, 0.01)
     person = np.column_stack([times_s, np.zeros_like(times_s), times_s - 10.0])
 
     def vehicle(at_s: float, y_m: float) -> np.ndarray:
-        there = np.ones_like(times_s)
+        ones = np.ones_like(times_s)
         return np.column_stack(
-            [times_s, 10.0 * (times_s - at_s), y_m * there, 4.0 * there, 1.4 * there]
+            [times_s, 10.0 * (times_s - at_s), y_m * ones, 4.0 * ones, 1.4 * ones]
         )
 
     # It is on the far lane, at y = 2, from 11 s to 13 s.
@@ -84,25 +85,25 @@ def test_gaps_are_from_leaving_to_coming() -> None:
     assert vehicle_first_s == pytest.approx([11.0 - 8.0 - 0.23], abs=0.03)
 
 
-def test_distances_are_of_what_is_given() -> None:
-    """The same figures are 0 apart; others by mean and deviation, or by the mean difference of
-    percentiles."""
+def test_distances_between_distributions_match_hand_computed_values() -> None:
+    """Equal figures have distance 0; others differ by mean and deviation, or by the mean difference
+    of percentiles."""
     assert normal_distance(MeanSd(1.0, 0.3), MeanSd(1.0, 0.3)) == 0.0
     assert normal_distance(MeanSd(1.0, 0.3), MeanSd(1.3, 0.7)) == pytest.approx(0.5)
     assert percentile_distance(np.arange(101.0), (10, 50), (11, 47)) == pytest.approx(2.0)
 
 
-def test_pedpy_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without pedpy one line says how to get it."""
+def test_a_missing_pedpy_is_named_with_its_installation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pedpy, one line says how to install it."""
     monkeypatch.setitem(sys.modules, "pedpy", None)
     with pytest.raises(MachineError, match=r"pip install -e '\.\[people\]' in the checkout"):
         need_pedpy()
 
 
 @pytest.mark.engine
-def test_the_ring_holds_as_many_as_are_asked_for() -> None:
-    """On a ring of 0.5 persons/m2 everybody is there to the end, walks on it both ways, and comes
-    forward."""
+def test_the_ring_holds_the_requested_density() -> None:
+    """On a ring of 0.5 persons/m2 all people stay to the end, walk in both directions, and make
+    progress."""
     ring, tracks = walk_round(
         Flow(0.5, both_ways=True, groups=0.5), seconds=2.0, seed=0, settle_s=1.0
     )

@@ -1,4 +1,5 @@
-"""What `cosim map check` says that fits on a place, held against what the builders draw there."""
+"""The capacity that `cosim map check` reports for a place, compared with what the builders draw
+there."""
 
 from __future__ import annotations
 
@@ -27,20 +28,20 @@ pytestmark = pytest.mark.engine
 @pytest.mark.parametrize(
     "where", [City(seed=1, size_m=500.0), CityMap(map="sumo-fkk-in")], ids=lambda p: p.name
 )
-def test_what_is_offered_can_be_drawn_and_nothing_else(where: Place) -> None:
-    """Each kind of event and each structure has a place where a scenario of it is drawn, and none
-    where it is not."""
+def test_scenarios_can_be_drawn_exactly_where_the_check_offers_them(where: Place) -> None:
+    """Each kind of event and each structure can be drawn where the check finds a place for it, and
+    nowhere else."""
     _, street_map = place(where)
     graph = WalkGraph(street_map)
     capacity = capacity_of(street_map, graph)
     drawn = set()
-    with_reason = contextlib.suppress(CosimError)
+    refusal_allowed = contextlib.suppress(CosimError)
     for name, kind in EVENT_KINDS.items():
-        with with_reason:
+        with refusal_allowed:
             build_reactive(kind, where, street_map, graph, 0, name)
             drawn.add(name)
     for structure in STRUCTURES:
-        with with_reason:
+        with refusal_allowed:
             build_unit(structure, where, street_map, graph, 0, structure)
             drawn.add(structure)
     found = {
@@ -56,7 +57,7 @@ def test_what_is_offered_can_be_drawn_and_nothing_else(where: Place) -> None:
 
 
 def street(width_m: float) -> StreetMap:
-    """Two sidewalks of 60 m that meet at a corner."""
+    """Return two sidewalks of 60 m that meet at a corner."""
     lines = {
         "west": np.array([[0.0, 0.0], [60.0, 0.0]]),
         "north": np.array([[62.0, 2.0], [62.0, 62.0]]),
@@ -91,10 +92,9 @@ MIN_M = {
 
 
 @pytest.mark.parametrize(("width_m", "fit"), [(1.6, 0), (2.7, 4), (4.0, 7)])
-def test_a_kind_that_needs_a_wider_sidewalk_has_no_place_and_the_reason_is_told(
-    width_m: float, fit: int
-) -> None:
-    """Of two sidewalks, none, or both; without a crosswalk none for those that cross one."""
+def test_a_kind_without_a_place_is_reported_with_the_reason(width_m: float, fit: int) -> None:
+    """Too narrow sidewalks and missing crosswalks leave no place for a kind, and the reason is
+    given."""
     capacity = capacity_of(street(width_m), WalkGraph(street(width_m)))
     assert {name: str(count) for name, count in capacity.events.items()} == {
         "ped_crossing": "none: there are no crosswalks"
@@ -117,14 +117,16 @@ def test_a_kind_that_needs_a_wider_sidewalk_has_no_place_and_the_reason_is_told(
 
 
 def test_the_check_counts_the_places_of_each_kind(cosim: Cosim, tmp_path: Path) -> None:
-    """A row for each of the eight events, the three structures and long routes; the same in JSON;
-    nothing is called possible."""
+    """The check has a row for each of the eight events, the three structures and long routes, and
+    the same in JSON."""
     done = cosim("map", "check", "sumo-fkk-in", cwd=tmp_path)
     assert done.returncode == 0 and "possible" not in done.stdout
     as_json = cosim("map", "check", "sumo-fkk-in", "--json", cwd=tmp_path)
-    told = json.loads(as_json.stdout)["capacity"]
-    assert list(told["events"]) == [*EVENT_KINDS] and list(told["structures"]) == [*STRUCTURES]
-    for name, count in told["events"].items():
+    capacity = json.loads(as_json.stdout)["capacity"]
+    assert list(capacity["events"]) == [*EVENT_KINDS] and list(capacity["structures"]) == [
+        *STRUCTURES
+    ]
+    for name, count in capacity["events"].items():
         (row,) = [line for line in done.stdout.splitlines() if f"event {name} " in line]
         assert (f" {count['found']} of {count['places']} " if count["found"] else "none of") in row
     assert any("long route" in line and "ways drawn" in line for line in done.stdout.splitlines())

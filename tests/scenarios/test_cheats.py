@@ -1,4 +1,4 @@
-"""Policies made to game the rules, on shipped scenarios."""
+"""Policies that exploit the rules, on shipped scenarios."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ KINDS = tuple(EVENT_KINDS)
 NAMES = tuple(name for name in cheats.CHEATS if name != "Quitter")
 
 HARDEST = {"StopAndGo": ("lateral", "overtaking")}
-"""Who crosses or cuts in lets the robot go by its speed, so it is there that stops by the clock
-could pay."""
+"""People who cross or cut in adapt to the robot's speed, so periodic stops could work best there."""
 
 
 def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:
-    """The first shipped ones of these events."""
+    """Return the first shipped scenarios of these events."""
     shipped = [s for s in load_suite("reactive").scenarios if s.events]
     return [s.id for kind in kinds for s in [s for s in shipped if s.events[0].kind == kind][:each]]
 
@@ -42,9 +41,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.mark.engine
 def test_a_cheat_solves_no_event(cheat: str, request: pytest.FixtureRequest) -> None:
-    """On one kind of event each, and on each kind one of them; all on all with --whole: no success,
-    and none is left out of the table. Without engines blind drivers are tried on every kind, at
-    every speed."""
+    """Each cheat fails on one kind of event, and each kind has one cheat (all pairs with --whole).
+    No episode is left out of the table."""
     whole = request.config.getoption("--whole")
     number = NAMES.index(cheat)
     kinds = KINDS if whole else HARDEST.get(cheat, (KINDS[number % 8],))
@@ -55,9 +53,9 @@ def test_a_cheat_solves_no_event(cheat: str, request: pytest.FixtureRequest) -> 
 
 
 @pytest.mark.engine
-def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: Cosim) -> None:
-    """It has failed, hit nobody, and covered nothing of its route; its run has no rates and ends
-    with 1; resumed, it does not repeat the episode, and says how that is done."""
+def test_a_policy_that_ends_its_process_has_failed(tmp_path: Path, cosim: Cosim) -> None:
+    """The episode has failed without contacts and progress, and the run has no rates and exit code
+    1. A resumed run does not repeat the episode, and says how to do so."""
     way = event_way("obstructing", "one", at_m=11.0)
     suite = Suite(name="one", version="1", scenarios=(way,))
     write_suite(suite, tmp_path / "one.json")
@@ -76,8 +74,8 @@ def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("robot", [name for name in ROBOTS if isinstance(ROBOTS[name].drive, Legs)])
-def test_legs_gain_a_cheat_nothing(robot: str, request: pytest.FixtureRequest) -> None:
-    """Walking straight ahead or standing solves no event with a robot on legs, either."""
+def test_cheats_solve_no_event_on_legs(robot: str, request: pytest.FixtureRequest) -> None:
+    """Walking straight ahead and standing solve no event with a robot on legs."""
     if robot == "walker":
         request.getfixturevalue("walker_weights")
     options = EpisodeOptions(seed=0, robot=robot)

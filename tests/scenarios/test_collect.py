@@ -1,5 +1,4 @@
-"""`cosim collect`: what it writes is what was driven, whatever stopped it and however many
-processes drove."""
+"""`cosim collect` writes what was driven, after interruptions and with any number of processes."""
 
 from __future__ import annotations
 
@@ -68,27 +67,27 @@ ASKED = (
 )
 
 
-class Desk(NamedTuple):
-    """A folder with ways.json, and three demos collected of it. ways: 3 to 4 m straight on; the
-    second of the four has no time for that."""
+class Collection(NamedTuple):
+    """A folder with ways.json and three demonstrations collected from it. ways: 3 to 4 m straight
+    ahead; the second of the four has too little time."""
 
     folder: Path
     ways: tuple[Scenario, ...]
-    said: str
+    output: str
 
     @property
     def solved(self) -> tuple[Scenario, ...]:
         return self.ways[0], *self.ways[2:]
 
-    def kept(self, way: Scenario) -> Path:
+    def episode_folder(self, way: Scenario) -> Path:
         (folder,) = self.folder.glob(f"demos/runs/*/episodes/{way.id}")
         return folder
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Desk:
-    """Collecting was begun by two processes, killed when one episode was over, and gone on with by
-    one."""
+def collection(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Collection:
+    """Return a collection that two processes began, that was killed after one episode, and that one
+    process resumed."""
     folder = tmp_path_factory.mktemp("desk")
     where = City(seed=1, size_m=500.0)
     _, street_map = place(where)
@@ -112,25 +111,25 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Desk:
         assert any("done, 1 of 3" in line for line in begun.stderr)
         begun.kill()
     assert not (folder / "demos/meta").exists()
-    said = cosim(*ASKED, "--resume", cwd=folder)
-    assert said.returncode == 0, said.stderr
-    return Desk(folder, ways, said.stdout)
+    result = cosim(*ASKED, "--resume", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return Collection(folder, ways, result.stdout)
 
 
 @pytest.fixture(scope="module")
-def packed(desk: Desk, cosim: Cosim) -> Packed:
-    said = cosim("dataset", "pack", "demos", "-o", "demos.npz", cwd=desk.folder)
-    assert said.returncode == 0, said.stderr
-    return read_packed(desk.folder / "demos.npz")
+def packed(collection: Collection, cosim: Cosim) -> Packed:
+    result = cosim("dataset", "pack", "demos", "-o", "demos.npz", cwd=collection.folder)
+    assert result.returncode == 0, result.stderr
+    return read_packed(collection.folder / "demos.npz")
 
 
-def shown_here(
+def demonstration_here(
     way: Scenario,
     expert: PolicyCaller,
     collecting: DemoOptions = NOISY,
     learner: Policy | None = None,
 ) -> Demonstration:
-    """The demonstration of an episode that this process drives."""
+    """Return the demonstration of an episode that this process drives."""
     beside = None if learner is None else PolicyCaller.of(learner)
     demonstrator = Demonstrator(expert, collecting, "route_point", beside)
     options = EpisodeOptions(goal="route_point", seed=0)
@@ -140,38 +139,39 @@ def shown_here(
     )
 
 
-def test_what_was_killed_and_went_on_is_to_the_byte_what_one_process_drives(
-    desk: Desk, packed: Packed
+def test_a_resumed_collection_equals_that_of_one_process(
+    collection: Collection, packed: Packed
 ) -> None:
-    """Each demonstration has the bytes of one that is driven here, in one go; the data set has its
-    rows, in the order of the suite; what was not solved is told and left out, and a further
-    scenario is driven in its place."""
-    shown = [shown_here(way, load_policy("orca")) for way in desk.solved]
-    kept = [(desk.kept(way) / DEMONSTRATION).read_bytes() for way in desk.solved]
+    """Each demonstration has the bytes of one that is driven here, and the data set has its rows in
+    the order of the suite. Unsolved scenarios are reported and left out, and a further scenario
+    replaces each."""
+    shown = [demonstration_here(way, load_policy("orca")) for way in collection.solved]
+    kept = [
+        (collection.episode_folder(way) / DEMONSTRATION).read_bytes() for way in collection.solved
+    ]
     assert not [
         way.id
-        for way, file, one in zip(desk.solved, kept, shown, strict=True)
+        for way, file, one in zip(collection.solved, kept, shown, strict=True)
         if file != one.encoded()
     ]
     for name in ("state", "goal", "command", "waypoints", "driven", "disturbed"):
         np.testing.assert_array_equal(
             getattr(packed, name), np.concatenate([getattr(one, name) for one in shown])
         )
-    assert packed.meta["scenarios"] == [way.id for way in desk.solved]
-    assert "(3 episodes, " in desk.said
-    assert "Dropped 1 that were not solved: ended by timeout: 1" in desk.said
-    assert not (desk.kept(desk.ways[1]) / DEMONSTRATION).exists()
+    assert packed.meta["scenarios"] == [way.id for way in collection.solved]
+    assert "(3 episodes, " in collection.output
+    assert "Dropped 1 that were not solved: ended by timeout: 1" in collection.output
+    assert not (collection.episode_folder(collection.ways[1]) / DEMONSTRATION).exists()
 
 
 def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
-    desk: Desk, packed: Packed
+    collection: Collection, packed: Packed
 ) -> None:
-    """Row k of an episode is of tick 4 k: its speeds are those that the trajectory has there, its
-    command is what was driven then unless it was disturbed, and its next waypoint is where the
-    robot was 4 ticks later."""
+    """Row k of an episode is of tick 4 k: its speeds are those of the trajectory, its command is
+    the driven one unless it was disturbed, and its next waypoint is the position 4 ticks later."""
     assert packed.disturbed.any()
-    for number, way in enumerate(desk.solved):
-        log = Log.load(desk.kept(way) / "trajectory.npz")
+    for number, way in enumerate(collection.solved):
+        log = Log.load(collection.episode_folder(way) / "trajectory.npz")
         rows = packed.episode == number
         speed, pose = (
             np.vstack([first, all_]) for first, all_ in (((0, 0), log.speed), (way.start, log.pose))
@@ -180,9 +180,9 @@ def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
         np.testing.assert_allclose(packed.state[rows], speed[ticks], atol=1e-6)
         as_driven = np.abs(packed.command[rows] - log.command[ticks]).max(axis=1) < 1e-6
         assert (as_driven | packed.disturbed[rows]).all()
-        there = packed.driven[rows] > 0
-        far_m = np.hypot(*(pose[ticks[there] + 4] - pose[ticks[there]])[:, :2].T)
-        np.testing.assert_allclose(np.hypot(*packed.waypoints[rows][there, 0].T), far_m, atol=1e-5)
+        driven = packed.driven[rows] > 0
+        far_m = np.hypot(*(pose[ticks[driven] + 4] - pose[ticks[driven]])[:, :2].T)
+        np.testing.assert_allclose(np.hypot(*packed.waypoints[rows][driven, 0].T), far_m, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -222,23 +222,27 @@ def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
         "split of cities",
     ],
 )
-def test_another_data_set_is_refused_in_its_folder(
-    desk: Desk, cosim: Cosim, more: tuple[str, ...], words: str
+def test_a_folder_with_another_data_set_is_refused(
+    collection: Collection, cosim: Cosim, more: tuple[str, ...], words: str
 ) -> None:
-    """Other settings, a used folder and options that mean nothing are refused in one line, and
-    nothing is touched."""
-    before = sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
-    said = cosim(*ASKED, *more, cwd=desk.folder)
-    assert said.returncode == 2
-    assert words in said.stderr
-    assert "Traceback" not in said.stderr
-    assert before == sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
+    """Other settings, a used folder and contradictory options are refused in one line, and no file
+    changes."""
+    before = sorted((path, path.stat().st_mtime_ns) for path in collection.folder.rglob("*"))
+    result = cosim(*ASKED, *more, cwd=collection.folder)
+    assert result.returncode == 2
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr
+    assert before == sorted(
+        (path, path.stat().st_mtime_ns) for path in collection.folder.rglob("*")
+    )
 
 
-def test_recorded_sensors_are_columns_of_the_data_set(desk: Desk, packed: Packed) -> None:
-    """A row has the distances of the lidar, without a return its range, the inertial reading and
-    32 people; packed too."""
-    held = read_data_set(desk.folder / "demos")
+def test_recorded_sensors_are_columns_of_the_data_set(
+    collection: Collection, packed: Packed
+) -> None:
+    """Each row has the lidar's distances (its range without a return), the inertial reading and 32
+    people, and so have packed rows."""
+    held = read_data_set(collection.folder / "demos")
     scans, readings = held.rows["observation.scan"], held.rows["observation.imu"]
     assert scans.shape == (len(held), 60) and scans.min() > 0.0 and scans.max() == 20.0
     assert readings.shape == (len(held), 6) and abs(readings[:, 5].mean() - 9.81) < 0.2
@@ -248,35 +252,34 @@ def test_recorded_sensors_are_columns_of_the_data_set(desk: Desk, packed: Packed
     assert packed.people.shape == (len(held), 32, 5)
 
 
-def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(
-    desk: Desk, cosim: Cosim
-) -> None:
-    """Without meta/ it is not whole: --resume drives nothing again and writes the same bytes."""
-    made = desk.folder / "demos"
-    there = [
+def test_an_incomplete_data_set_is_written_again(collection: Collection, cosim: Cosim) -> None:
+    """Without meta/ a data set is incomplete: --resume drives nothing again and writes the same
+    bytes."""
+    made = collection.folder / "demos"
+    files_written = [
         path
         for name in ("meta", "data", "videos")
         for path in (made / name).rglob("*")
         if path.is_file()
     ]
-    files = {path: path.read_bytes() for path in there}
+    files = {path: path.read_bytes() for path in files_written}
     shutil.rmtree(made / "meta")
     (made / "writing").mkdir()
     (made / "writing/half").write_bytes(b"")
-    said = cosim(*ASKED, "--resume", cwd=desk.folder)
-    assert said.returncode == 0, said.stderr
-    assert "done, " not in said.stderr
+    result = cosim(*ASKED, "--resume", cwd=collection.folder)
+    assert result.returncode == 0, result.stderr
+    assert "done, " not in result.stderr
     assert files == {path: path.read_bytes() for path in files}
     assert not (made / "writing").exists()
 
 
-def test_fresh_scenarios_are_drawn_the_same_in_pieces() -> None:
-    """Two structures in two small cities: each is drawn under its name and by a light of its own,
-    and who draws them in two pieces gets the same."""
+def test_fresh_scenarios_do_not_depend_on_how_they_are_divided() -> None:
+    """Two structures in two small cities have a name and a light each, and drawing them in two
+    parts gives the same scenarios."""
     from scenarios.suites.new_scenarios import NewScenarios
 
-    there = NewScenarios(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
-    drawn = there.drawn(0, 5)
+    fresh = NewScenarios(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
+    drawn = fresh.drawn(0, 5)
     assert {one.id for one in drawn} <= {
         "straight-1-000",
         "curve-1-000",
@@ -285,11 +288,11 @@ def test_fresh_scenarios_are_drawn_the_same_in_pieces() -> None:
         "straight-1-001",
     }
     assert len({one.light for one in drawn}) == len(drawn) >= 3
-    assert [*there.drawn(0, 2), *there.drawn(2, 3)] == drawn
+    assert [*fresh.drawn(0, 2), *fresh.drawn(2, 3)] == drawn
 
 
-class Sees:
-    """An expert that sees by a camera of its own."""
+class SeeingExpert:
+    """An expert with a camera of its own."""
 
     manifest = Manifest("sees", camera=CameraSpec(width=32, height=32), goal="final_point")
 
@@ -302,30 +305,31 @@ class Sees:
         return Command(1.4, 0.0)
 
 
-def test_an_expert_that_sees_keeps_its_own_camera(desk: Desk) -> None:
-    """It is given pictures of its own size, and those of the collecting camera are kept."""
-    expert = Sees()
+def test_an_expert_that_sees_keeps_its_own_camera(collection: Collection) -> None:
+    """The expert gets pictures of its own size, and the data set has those of the collecting
+    camera."""
+    expert = SeeingExpert()
     kept = DemoOptions(camera=CameraSpec(width=64, height=48), rate_hz=4.0, unsolved=True)
-    shown = shown_here(desk.ways[0], PolicyCaller.of(expert), kept)
+    shown = demonstration_here(collection.ways[0], PolicyCaller.of(expert), kept)
     assert set(expert.shapes) == {(32, 32, 3)}
     assert len(expert.shapes) == len(shown) > 5
     assert shown.colours.sum() == len(shown) * 64 * 48 * 3
 
 
-class Stands:
+class StandingExpert:
     """An expert that never drives."""
 
     manifest = Manifest("stands", camera=None, goal="route_point")
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command:
         return Command(0.0, 0.0)
 
 
-class Learner(Stands):
-    """Drives on, and knows nothing that a picture does not show. asked: the ticks of an episode."""
+class Learner(StandingExpert):
+    """A learner that drives straight ahead by its picture alone. asked: the ticks of an episode."""
 
     manifest = Manifest(
         "learner", rate_hz=5.0, camera=CameraSpec(width=64, height=48), goal="route_point"
@@ -341,15 +345,15 @@ class Learner(Stands):
         return Command(0.7, 0.1)
 
 
-def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Desk) -> None:
-    """It is asked at every picture, drives its share of the time, seconds at once, while each row
-    has the expert's answer; the same seed gives the same bytes."""
+def test_a_learner_drives_and_the_expert_labels_each_row(collection: Collection) -> None:
+    """The expert is queried at every picture, and the learner drives its share of the time in
+    stretches of seconds. The same seed gives the same bytes."""
     kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), noise=0.6, learner="learner", unsolved=True
     )
-    way = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0)
+    way = msgspec.structs.replace(collection.ways[0], time_limit_s=20.0)
     learner = Learner()
-    shown = shown_here(way, PolicyCaller.of(Stands()), kept, learner)
+    shown = demonstration_here(way, PolicyCaller.of(StandingExpert()), kept, learner)
     assert learner.asked == sorted(set(learner.asked)) and len(learner.asked) == len(shown) > 20
     assert not shown.command.any()
     assert 0.3 < shown.disturbed.mean() < 0.9
@@ -360,17 +364,22 @@ def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Des
         > 0.4
         > shown.state[1:, 0][~shown.disturbed[:-1]].mean()
     )
-    assert shown_here(way, PolicyCaller.of(Stands()), kept, learner).encoded() == shown.encoded()
+    assert (
+        demonstration_here(way, PolicyCaller.of(StandingExpert()), kept, learner).encoded()
+        == shown.encoded()
+    )
 
 
-def test_a_learner_that_explores_drives_alone_and_its_commands_have_rewards(desk: Desk) -> None:
-    """Rows have the commands that were driven; rewards have its progress, the time and its end."""
+def test_an_exploring_learner_drives_alone_and_its_commands_have_rewards(
+    collection: Collection,
+) -> None:
+    """Rows have the driven commands; rewards cover its progress, the time and its end."""
     kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), explore=0.3, learner="learner", unsolved=True
     )
-    way = msgspec.structs.replace(desk.ways[0], time_limit_s=6.0)
+    way = msgspec.structs.replace(collection.ways[0], time_limit_s=6.0)
     demonstrator = Demonstrator(
-        PolicyCaller.of(Stands()), kept, "route_point", PolicyCaller.of(Learner())
+        PolicyCaller.of(StandingExpert()), kept, "route_point", PolicyCaller.of(Learner())
     )
     outcome = run_episode(way, demonstrator, EpisodeOptions(goal="route_point", seed=0))
     assert outcome.log is not None
@@ -414,12 +423,12 @@ class Dies(Learner):
 """
 
 
-def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
-    desk: Desk, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+def test_a_learner_drives_the_same_in_every_process(
+    collection: Collection, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two processes with a learner of one's own write the bytes of one; the data set tells which it
-    was, and is not gone on with by another one, or by what the same name means now."""
-    (desk.folder / "beside.py").write_text(BESIDE)
+    """Two processes with a user's learner write the bytes of one process. The data set names the
+    learner, and is not resumed with another one or with an edited one."""
+    (collection.folder / "beside.py").write_text(BESIDE)
     some = ("--scenario", "way-0", "--scenario", "way-2")
     asked = (
         "collect",
@@ -433,37 +442,39 @@ def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
         "--out",
         "taught",
     )
-    said = cosim(*asked, "--learner", "beside:Learner", "--jobs", "2", cwd=desk.folder)
-    assert said.returncode == 0, said.stderr
-    monkeypatch.syspath_prepend(desk.folder)
+    result = cosim(*asked, "--learner", "beside:Learner", "--jobs", "2", cwd=collection.folder)
+    assert result.returncode == 0, result.stderr
+    monkeypatch.syspath_prepend(collection.folder)
     learner = load_policy("beside:Learner")
     kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), noise=0.6, learner="beside:Learner", unsolved=True
     )
-    for way in (desk.ways[0], desk.ways[2]):
-        shown = shown_here(way, load_policy("orca"), kept, learner)
+    for way in (collection.ways[0], collection.ways[2]):
+        shown = demonstration_here(way, load_policy("orca"), kept, learner)
         assert shown.disturbed.any()
         assert (
-            desk.folder / f"taught/runs/00/episodes/{way.id}" / DEMONSTRATION
+            collection.folder / f"taught/runs/00/episodes/{way.id}" / DEMONSTRATION
         ).read_bytes() == shown.encoded()
-    told = json.loads((desk.folder / "taught/meta/cosim.json").read_bytes())
-    assert (told["learner"], told["learner_source"]) == ("learner", learner.source_hash)
+    about = json.loads((collection.folder / "taught/meta/cosim.json").read_bytes())
+    assert (about["learner"], about["learner_source"]) == ("learner", learner.source_hash)
 
-    said = cosim(*asked, "--learner", "beside:Another", "--resume", cwd=desk.folder)
+    result = cosim(*asked, "--learner", "beside:Another", "--resume", cwd=collection.folder)
     assert (
-        said.returncode == 2
-        and "its learner is beside:Learner, and this command has beside:Another" in said.stderr
+        result.returncode == 2
+        and "its learner is beside:Learner, and this command has beside:Another" in result.stderr
     )
-    (desk.folder / "beside.py").write_text(BESIDE.replace("0.7", "0.6"))
-    said = cosim(*asked, "--learner", "beside:Learner", "--resume", cwd=desk.folder)
-    assert said.returncode == 2 and "is of another data set: its learner_source is" in said.stderr
+    (collection.folder / "beside.py").write_text(BESIDE.replace("0.7", "0.6"))
+    result = cosim(*asked, "--learner", "beside:Learner", "--resume", cwd=collection.folder)
+    assert (
+        result.returncode == 2 and "is of another data set: its learner_source is" in result.stderr
+    )
 
 
-def test_a_learner_that_would_see_something_else_is_refused() -> None:
-    """With what to give; so is one beside an expert that sees by a camera of its own, and one that
-    is blind."""
+def test_a_learner_with_another_camera_is_refused() -> None:
+    """The message says what to set. A learner beside an expert with its own camera is refused, and
+    so is a blind learner."""
     asked = DemoOptions(camera=CameraSpec(width=80, height=60), noise=0.6, learner="learner")
-    expert, learner = PolicyCaller.of(Stands()), PolicyCaller.of(Learner())
+    expert, learner = PolicyCaller.of(StandingExpert()), PolicyCaller.of(Learner())
     with pytest.raises(
         UsageError,
         match=r"front, 80 x 60 px.* give --camera 64x48 --fov 75 --mount front --rate 5$",
@@ -484,22 +495,25 @@ def test_a_learner_that_would_see_something_else_is_refused() -> None:
         UsageError,
         match="'stands' is no policy that drives by one camera, speeds, a goal and recorded sensors alone",
     ):
-        Demonstrator(expert, asked, None, PolicyCaller.of(Stands()))
+        Demonstrator(expert, asked, None, PolicyCaller.of(StandingExpert()))
     with pytest.raises(UsageError, match="expert 'sees' sees by a camera of its own"):
         Demonstrator(
-            PolicyCaller.of(Sees()), msgspec.structs.replace(asked, rate_hz=4.0), None, learner
+            PolicyCaller.of(SeeingExpert()),
+            msgspec.structs.replace(asked, rate_hz=4.0),
+            None,
+            learner,
         )
     with pytest.raises(SpecError, match="give --noise"):
         msgspec.structs.replace(asked, noise=0.0)
 
 
-def test_the_lerobot_package_reads_a_data_set(desk: Desk, packed: Packed) -> None:
-    """Its LeRobotDataset has the rows and pictures that are packed. Skipped where lerobot is not
-    installed."""
+def test_the_lerobot_package_reads_a_data_set(collection: Collection, packed: Packed) -> None:
+    """The package's LeRobotDataset has the rows and pictures that are packed. Skipped where lerobot
+    is not installed."""
     datasets = pytest.importorskip(
         "lerobot.datasets.lerobot_dataset", reason="lerobot is not installed"
     )
-    read = datasets.LeRobotDataset("cosim/demos", root=desk.folder / "demos")
+    read = datasets.LeRobotDataset("cosim/demos", root=collection.folder / "demos")
     assert len(read) == len(packed)
     for row, one in ((row, read[row]) for row in range(len(read))):
         np.testing.assert_array_equal(one["action"].numpy(), packed.command[row])

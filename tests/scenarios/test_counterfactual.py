@@ -1,4 +1,4 @@
-"""An episode beside the same street without its robot, with the real engines."""
+"""An episode compared with the same street without its robot, with the real engines."""
 
 from __future__ import annotations
 
@@ -40,35 +40,36 @@ TICKS = 400
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    """A way over a crossing."""
+    """Return a way over a crossing."""
     _, street_map = place(SMALL)
     return build_all(SMALL, street_map, WalkGraph(street_map), 3, 1)[0]
 
 
 def streets(scenario: Scenario, robot: RobotState, absent: bool) -> tuple[list[Street], Entrances]:
-    """Twenty seconds around a robot that stands, or does not, where it is put."""
+    """Return twenty seconds around a robot at a fixed place, or without it."""
     with crowd_of(scenario) as crowd:
         return [
-            crowd.step(robot, nobody(tick), absent=absent) for tick in range(TICKS)
+            crowd.step(robot, no_robot(tick), absent=absent) for tick in range(TICKS)
         ], crowd.entrances
 
 
-def once_more(scenario: Scenario, robot: RobotState, entrances: Entrances) -> list[Street]:
+def repeated_streets(scenario: Scenario, robot: RobotState, entrances: Entrances) -> list[Street]:
+    """Return the same twenty seconds again without a robot, from recorded entrances."""
     with crowd_of(scenario, entrances) as crowd:
-        return [crowd.step(robot, nobody(tick), absent=True) for tick in range(TICKS)]
+        return [crowd.step(robot, no_robot(tick), absent=True) for tick in range(TICKS)]
 
 
-def nobody(tick: int) -> EventReply:
+def no_robot(tick: int) -> EventReply:
     return EventReply(episode="t", tick=tick, states=(), actors=())
 
 
-def test_a_street_without_a_robot_is_itself_when_it_is_simulated_again(scenario: Scenario) -> None:
-    """Nobody is there either time: the same people, groups too, and vehicles at the same places, to
-    the last bit."""
+def test_a_street_without_a_robot_is_repeated_to_the_bit(scenario: Scenario) -> None:
+    """Without a robot, the same people, groups and vehicles are at the same places in a second
+    simulation."""
     robot = RobotState(Pose(*scenario.start))
     grouped = msgspec.structs.replace(scenario, crowd=CrowdSpec(groups=0.5))
     before, entrances = streets(grouped, robot, absent=True)
-    for a, b in zip(before, once_more(grouped, robot, entrances), strict=True):
+    for a, b in zip(before, repeated_streets(grouped, robot, entrances), strict=True):
         assert (a.people.ids, a.vehicles.ids) == (b.people.ids, b.vehicles.ids)
         assert (
             a.people.xy.tobytes() == b.people.xy.tobytes()
@@ -77,9 +78,8 @@ def test_a_street_without_a_robot_is_itself_when_it_is_simulated_again(scenario:
         assert a.vehicles.xy.tobytes() == b.vehicles.xy.tobytes()
 
 
-def test_everybody_who_came_to_the_robot_comes_without_it_too(scenario: Scenario) -> None:
-    """Around a robot that stands in the middle of a crossing vehicles are held up, and all can be
-    compared."""
+def test_everybody_near_the_robot_also_comes_without_it(scenario: Scenario) -> None:
+    """A robot in the middle of a crossing delays vehicles, and all of them can be compared."""
     crossing = scenario.crossings[0]
     middle = scenario.route_line.at(0.5 * (crossing.enter_s_m + crossing.leave_s_m))
     busy = Scenario(
@@ -88,7 +88,7 @@ def test_everybody_who_came_to_the_robot_comes_without_it_too(scenario: Scenario
     )
     robot = RobotState(middle)
     with_it, entrances = streets(busy, robot, absent=False)
-    without = once_more(busy, robot, entrances)
+    without = repeated_streets(busy, robot, entrances)
     present, absent = Tracks(), Tracks()
     people, same_people = Tracks(), Tracks()
     for a, b in zip(with_it, without, strict=True):
@@ -103,11 +103,11 @@ def test_everybody_who_came_to_the_robot_comes_without_it_too(scenario: Scenario
     assert cars.delay_s > 5.0
 
 
-def test_a_run_says_whom_its_robot_delayed_only_when_asked(
+def test_a_run_records_delays_only_on_request(
     scenario: Scenario, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """The delays are in row and record of the run that asked; nothing else differs from the run
-    that did not."""
+    """Rows and records of the requesting run have the delays, and nothing else differs from a run
+    without them."""
     short = msgspec.structs.replace(scenario, time_limit_s=10.0)
     write_suite(Suite(name="one", version="1", scenarios=(short,)), tmp_path / "one.json")
     done = cosim(
@@ -132,7 +132,9 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(
     assert not set(names) & set(plain.measures)
 
 
-def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_path: Path) -> None:
+def test_a_run_sends_progress_messages_while_it_compares(
+    scenario: Scenario, tmp_path: Path
+) -> None:
     """A counterfactual comparison sends five progress messages."""
     short = Suite(
         name="s", version="1", scenarios=(msgspec.structs.replace(scenario, time_limit_s=5.0),)
@@ -140,14 +142,14 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     driver = load_policy("orca")
     manifest = driver.manifest
     spec = msgspec.structs.replace(spec_of(short, "orca"), counterfactual=True)
-    told: list[Message] = []
+    messages: list[Message] = []
     with RunFolder.create(tmp_path / "run", spec, short) as folder:
         options = EpisodeOptions(camera="bullet", counterfactual=True)
         hello = Hello("orca", manifest, driver.source_hash)
         transport = LocalProcesses(folder.path / "logs")
-        run_all(folder, short.scenarios, hello, transport, handle=told.append, options=options)
-    assert [type(message) for message in told] == [EpisodeProgress] * 10 + [Done]
-    assert [getattr(message, "compared", None) for message in told[5:-1]] == [
+        run_all(folder, short.scenarios, hello, transport, handle=messages.append, options=options)
+    assert [type(message) for message in messages] == [EpisodeProgress] * 10 + [Done]
+    assert [getattr(message, "compared", None) for message in messages[5:-1]] == [
         0.0,
         0.2,
         0.4,
@@ -156,11 +158,11 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     ]
 
 
-def test_an_episode_outlives_its_comparison(
+def test_a_failed_comparison_does_not_fail_its_episode(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever goes wrong in the street without the robot: the episode is done, and the record says
-    what it was."""
+    """Errors in the street without the robot leave the episode done, and the record states the
+    error."""
 
     def fails(*_: object) -> NoReturn:
         raise KeyError("v7")

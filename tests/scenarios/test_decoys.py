@@ -26,7 +26,7 @@ GO_ON = [name for name, kind in EVENT_KINDS.items() if kind.decoy is not None]
 
 
 def event(kind: str, half_width_m: float | None = None, **fields: object) -> Event:
-    """An event 50 m along a route on the x axis, with a free side where its kind has one."""
+    """Return an event 50 m along a route on the x axis, with a free side where its kind has one."""
     row = EVENT_KINDS[kind]
     gate = row.layout.gate_half_m if row.layout is not None else None
     known = {
@@ -45,14 +45,14 @@ def event(kind: str, half_width_m: float | None = None, **fields: object) -> Eve
 
 
 def drive(
-    one: Event,
+    planned: Event,
     v_mps: float,
     start_m: float,
     to_m: float,
     left_m: float = 0.0,
     weaves_m: float = 0.0,
 ) -> list[tuple[Pose, EventReply]]:
-    """Pose and reply at every tick of a robot that drives beside the x axis."""
+    """Return pose and reply at every tick of a robot that drives beside the x axis."""
     track: list[tuple[Pose, EventReply]] = []
     states: tuple[object, ...] = ()
     for tick in itertools.count():
@@ -72,7 +72,7 @@ def drive(
             route_s_m=x_m,
             robot_length_m=COURIER.length_m,
             robot_width_m=COURIER.width_m,
-            events=(one,),
+            events=(planned,),
             states=states,  # type: ignore[arg-type]
         )
         reply = react(query)
@@ -89,13 +89,14 @@ def least_gap_m(track: list[tuple[Pose, EventReply]]) -> float:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_event_and_decoy_are_equal_until_the_trigger_and_then_differ(kind: str) -> None:
-    """Tick by tick under the same motion of the robot, also with a trigger distance of its own."""
+    """Event and decoy are equal tick by tick under the same motion of the robot, also with a given
+    trigger distance."""
     own_m = {"overtaking": -1.5, "ped_crossing": 3.0, "lateral": 3.3}.get(kind, 8.5)
     for side, trigger_m in itertools.product((-1, 1), (None, own_m)):
-        one = event(kind, side=side, trigger_m=trigger_m)
+        planned = event(kind, side=side, trigger_m=trigger_m)
         tracks = [
             drive(twin, 1.5, 25.0, 62.0, weaves_m=0.3)
-            for twin in (one, EVENT_KINDS[kind].decoy_of(one))
+            for twin in (planned, EVENT_KINDS[kind].decoy_of(planned))
         ]
         pairs = [(a[1], b[1]) for a, b in zip(*tracks, strict=True)]
         triggers = [a.states[0].triggered_tick for a, _ in pairs]
@@ -116,10 +117,10 @@ def test_free_sides_of_an_event_and_its_mirror_exclude_each_other(kind: str) -> 
         if row.group is not None:
             counts = range(row.group(half_m, None), row.group(half_m, None) + 1)  # type: ignore[arg-type]
         for people, free in itertools.product(counts, (-1, 1)):
-            one = event(kind, half_m, people=people, free_side=free)
-            assert not list(gate_faults(row, one))
-            assert closed_m(row, one) <= CLOSED_M + 1e-9
-            low, high = open_interval_m(row, one)
+            planned = event(kind, half_m, people=people, free_side=free)
+            assert not list(gate_faults(row, planned))
+            assert closed_m(row, planned) <= CLOSED_M + 1e-9
+            low, high = open_interval_m(row, planned)
             assert -math.copysign(1, low + high) != free
     fewest, most = (event(kind, 2.0, people=n) for n in row.people)
     narrow = msgspec.structs.replace(most, half_width_m=0.5 * _taken_m(kind, most) + 0.5)
@@ -128,38 +129,39 @@ def test_free_sides_of_an_event_and_its_mirror_exclude_each_other(kind: str) -> 
     assert "in its mirror" in next(gate_faults(row, wide))
 
 
-def _taken_m(kind: str, one: Event) -> float:
-    low, high = open_interval_m(EVENT_KINDS[kind], one)
-    return 2.0 * one.half_width_m - (high - low)
+def _taken_m(kind: str, planned: Event) -> float:
+    low, high = open_interval_m(EVENT_KINDS[kind], planned)
+    return 2.0 * planned.half_width_m - (high - low)
 
 
 @pytest.mark.parametrize("kind", MIRRORED)
 def test_people_are_in_place_before_the_fastest_robot_arrives(kind: str) -> None:
-    """From either edge they reach the closed side, and stand where the row says."""
+    """From either edge people reach the closed side, and stand where the row says."""
     row = EVENT_KINDS[kind]
     assert row.layout is not None and row.layout.gate_half_m is not None
     for half_m, side, free in itertools.product(row.layout.gate_half_m, (-1, 1), (-1, 1)):
         people = row.people[1] if row.group is None else row.group(half_m, None)  # type: ignore[arg-type]
-        one = event(kind, half_m, people=people, side=side, free_side=free, speed_mps=1.1)
-        track = drive(one, 2.5, 38.0, 48.4, left_m=30.0)
+        planned = event(kind, half_m, people=people, side=side, free_side=free, speed_mps=1.1)
+        track = drive(planned, 2.5, 38.0, 48.4, left_m=30.0)
         before, now = track[-2][1].states[0].walkers, track[-1][1].states[0].walkers
         assert [(w.x_m, w.y_m) for w in before] == [(w.x_m, w.y_m) for w in now]
-        right_m, left_m = row.blocked(one)  # type: ignore[misc]
+        right_m, left_m = row.blocked(planned)  # type: ignore[misc]
         assert min(w.y_m for w in now) - 0.3 == pytest.approx(right_m)
         assert max(w.y_m for w in now) + 0.3 == pytest.approx(left_m)
 
 
 @pytest.mark.parametrize("kind", MIRRORED)
 def test_a_blind_robot_meets_people_of_the_event_or_of_its_mirror(kind: str) -> None:
-    """Whatever its lane and speed."""
+    """A blind robot meets people of one of the two at any lane and speed."""
     row = EVENT_KINDS[kind]
     assert row.layout is not None and row.layout.gate_half_m is not None
     half_m = row.layout.gate_half_m[1]
     people = row.people[0] if row.group is None else row.group(half_m, None)  # type: ignore[arg-type]
     for left_m, v_mps in itertools.product(np.linspace(-half_m, half_m, 9).tolist(), (0.5, 2.5)):
-        one = event(kind, half_m, people=people)
+        planned = event(kind, half_m, people=people)
         gaps = [
-            least_gap_m(drive(twin, v_mps, 39.0, 52.0, left_m)) for twin in (one, row.decoy_of(one))
+            least_gap_m(drive(twin, v_mps, 39.0, 52.0, left_m))
+            for twin in (planned, row.decoy_of(planned))
         ]
         between = kind == "conversing" and min(gaps) < 0.1
         assert min(gaps) < 0.0 or between
@@ -167,16 +169,16 @@ def test_a_blind_robot_meets_people_of_the_event_or_of_its_mirror(kind: str) -> 
 
 @pytest.mark.parametrize("kind", GO_ON)
 def test_a_robot_that_continues_passes_the_people_of_a_decoy(kind: str) -> None:
-    """On the middle of the way at its cruising speed, on ways of several widths."""
+    """A robot on the middle of the way at its cruising speed passes, on ways of several widths."""
     row = EVENT_KINDS[kind]
     for half_m, side, speed_mps in itertools.product((1.3, 1.6, 2.88), (-1, 1), (1.1, 1.65)):
         if kind == "overtaking" and half_m < 1.4:
             continue
         for people in range(row.people[0], row.people[1] + 1):
-            one = event(kind, half_m, side=side, speed_mps=speed_mps, people=people)
+            planned = event(kind, half_m, side=side, speed_mps=speed_mps, people=people)
             sides = (1, -1, 0) if row.has_free_side else (0,)
             for free in sides:
-                twin = row.decoy_of(msgspec.structs.replace(one, free_side=free))
+                twin = row.decoy_of(msgspec.structs.replace(planned, free_side=free))
                 gap_m = least_gap_m(drive(twin, 1.5, 25.0, 75.0))
                 assert gap_m > 0.12, (half_m, side, people, gap_m)
 
@@ -188,8 +190,10 @@ def test_decoys_of_gestures_show_one_of_four_others_at_the_same_place() -> None:
         pose_of(row, row.decoy_of(event("gesturing", x_m=float(x_m)))) for x_m in range(50, 90)
     }
     assert shown == {"wave", "call", "point", "scratch"}
-    one = event("gesturing")
-    pairs = zip(*(drive(twin, 1.5, 36.0, 49.0) for twin in (one, row.decoy_of(one))), strict=True)
+    planned = event("gesturing")
+    pairs = zip(
+        *(drive(twin, 1.5, 36.0, 49.0) for twin in (planned, row.decoy_of(planned))), strict=True
+    )
     for (_, a), (_, b) in pairs:
         assert [(w.x_m, w.y_m, w.heading_rad) for w in a.states[0].walkers] == [
             (w.x_m, w.y_m, w.heading_rad) for w in b.states[0].walkers
@@ -198,7 +202,7 @@ def test_decoys_of_gestures_show_one_of_four_others_at_the_same_place() -> None:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_people_of_decoys_stay_where_the_row_says(kind: str) -> None:
-    """When the robot has passed, they are there; people without a place still walk."""
+    """When the robot has passed, they are at their places; people without a place still walk."""
     row = EVENT_KINDS[kind]
     for side, left_m in itertools.product((-1, 1), (-0.3, 0.0, 0.3)):
         decoy = row.decoy_of(event(kind, side=side, people=row.people[1]))
@@ -215,11 +219,11 @@ def test_people_of_decoys_stay_where_the_row_says(kind: str) -> None:
 
 @pytest.mark.parametrize("patience_s", [2.0, 4.0])
 @pytest.mark.parametrize("kind", ["frontal", "lateral", "ped_crossing"])
-def test_people_wait_for_their_patience_before_a_standing_robot(
+def test_people_wait_before_a_standing_robot_until_their_patience_ends(
     kind: str, patience_s: float
 ) -> None:
-    """Then they walk round it, without a touch."""
-    one = event(kind, 1.9, patience_s=patience_s)
+    """Then they walk round it without touching it."""
+    planned = event(kind, 1.9, patience_s=patience_s)
     states: tuple[object, ...] = ()
     x_m, met, went = 44.0, None, None
     gaps = []
@@ -240,7 +244,7 @@ def test_people_wait_for_their_patience_before_a_standing_robot(
             route_s_m=x_m,
             robot_length_m=0.7,
             robot_width_m=0.55,
-            events=(one,),
+            events=(planned,),
             states=states,  # type: ignore[arg-type]
         )
         states = react(query).states

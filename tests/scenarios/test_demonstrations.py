@@ -1,4 +1,4 @@
-"""Demonstrations and data sets of known pictures and known ways; no engine runs."""
+"""Demonstrations and data sets of known pictures and known drives; no engine runs."""
 
 from __future__ import annotations
 
@@ -65,15 +65,15 @@ ABOUT = {
 
 
 def known_pictures(episode: int, count: int) -> np.ndarray:
-    """(count, 48, 64, 3): a smooth pattern of the episode's own that moves by 4 pixels from picture
-    to picture."""
+    """Return (count, 48, 64, 3) pictures: a smooth pattern of the episode that moves by 4 pixels
+    from picture to picture."""
     small = np.random.default_rng(episode).integers(30, 226, (4, 6, 3), np.uint8)
     wide = cv2.resize(small, (64 + 4 * count, 48), interpolation=cv2.INTER_CUBIC)
     return np.stack([wide[:, 4 * k : 4 * k + 64] for k in range(count)])
 
 
-def shown(episode: int, count: int) -> Demonstration:
-    """An episode of known pictures; its numbers tell which row of which episode they are of."""
+def known_demonstration(episode: int, count: int) -> Demonstration:
+    """Return an episode of known pictures; its numbers identify the row and the episode."""
     clip = Clip((64, 48), FPS)
     pictures = known_pictures(episode, count)
     for one in pictures:
@@ -114,7 +114,7 @@ def written(
 
 @pytest.fixture(scope="module")
 def demonstrations() -> list[Demonstration]:
-    return [shown(episode, count) for episode, count in enumerate(LENGTHS)]
+    return [known_demonstration(episode, count) for episode, count in enumerate(LENGTHS)]
 
 
 @pytest.fixture(scope="module")
@@ -122,12 +122,11 @@ def data_set(tmp_path_factory: pytest.TempPathFactory, demonstrations: list[Demo
     return written(tmp_path_factory.mktemp("sets") / "one", demonstrations)
 
 
-def test_pictures_come_back_from_the_film_at_their_rows_and_times(
+def test_decoded_pictures_match_their_rows_and_times(
     data_set: Path, demonstrations: list[Demonstration]
 ) -> None:
-    """Decoded, picture k of an .mp4 is at k / 5 s the one that was drawn for row k, within what the
-    codec loses, and nearer to it than to those of the rows beside it, across the borders of
-    episodes too."""
+    """Picture k of a decoded .mp4, at k / 5 s, is that of row k within the codec's loss. It is
+    nearer to it than to those of adjacent rows, across the borders of episodes too."""
     (film,) = read_data_set(data_set).films
     drawn = np.concatenate([known_pictures(k, count) for k, count in enumerate(LENGTHS)]).astype(
         float
@@ -145,7 +144,8 @@ def test_a_data_set_has_the_same_bytes_whenever_it_is_written(
 ) -> None:
     """Encoded and written again, every file is the same."""
     again = written(
-        tmp_path / "again", [shown(episode, count) for episode, count in enumerate(LENGTHS)]
+        tmp_path / "again",
+        [known_demonstration(episode, count) for episode, count in enumerate(LENGTHS)],
     )
     files = sorted(path.relative_to(data_set) for path in data_set.rglob("*") if path.is_file())
     assert len(files) == 7
@@ -156,7 +156,7 @@ def test_a_data_set_has_the_same_bytes_whenever_it_is_written(
 def test_a_clip_is_the_same_whatever_instructions_the_processor_has(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Restricted to those of older processors, or to none of the fast ones, the encoder writes the
+    """With the instructions of older processors, or without any fast ones, the encoder writes the
     same bytes."""
     rng = np.random.default_rng(0)
     known = known_pictures(5, 12)
@@ -181,8 +181,8 @@ def test_a_clip_is_the_same_whatever_instructions_the_processor_has(
 
 
 def test_a_clip_is_the_same_wherever_its_pictures_lie_in_memory() -> None:
-    """Pictures at any address give the bytes of pictures at another; a picture is told apart from
-    one whose red and blue are changed, and a grey one stays grey."""
+    """Pictures at any address give the same bytes, and grey and coloured pictures keep their
+    colours to 2 levels of 255."""
     pictures = known_pictures(5, 6)
 
     def clip_of(shift: int) -> bytes:
@@ -201,20 +201,20 @@ def test_a_clip_is_the_same_wherever_its_pictures_lie_in_memory() -> None:
     assert np.abs(_rgb_of(_planes_of(np.ascontiguousarray(flat))).astype(int) - flat).max() <= 2
 
 
-def test_the_tables_are_what_info_json_tells(data_set: Path) -> None:
-    """Every feature but the film is a column of its type and length; episodes tell from where to
-    where they go."""
+def test_tables_match_info_json(data_set: Path) -> None:
+    """Every feature except the film is a column of its type and length, and episodes state the
+    range of their rows."""
     info = json.loads((data_set / "meta/info.json").read_text())
     table = pq.read_table(data_set / info["data_path"].format(chunk_index=0, file_index=0))
     key = "observation.images.front"
     assert set(table.column_names) == set(info["features"]) - {key}
     for name in table.column_names:
         kind = table.schema.field(name).type
-        told = info["features"][name]
-        many = told["shape"] != [1]
-        assert (kind.list_size if many else 1) == told["shape"][0]
-        assert str(kind.value_type if many else kind) == {"float32": "float"}.get(
-            told["dtype"], told["dtype"]
+        feature = info["features"][name]
+        is_list = feature["shape"] != [1]
+        assert (kind.list_size if is_list else 1) == feature["shape"][0]
+        assert str(kind.value_type if is_list else kind) == {"float32": "float"}.get(
+            feature["dtype"], feature["dtype"]
         )
     (path,) = (data_set / "meta/episodes").rglob("*.parquet")
     episodes = pq.read_table(path).to_pylist()
@@ -230,11 +230,11 @@ def test_the_tables_are_what_info_json_tells(data_set: Path) -> None:
     )
 
 
-def test_packed_rows_are_those_that_were_kept(
+def test_packed_rows_equal_those_of_the_data_sets(
     data_set: Path, demonstrations: list[Demonstration]
 ) -> None:
-    """Two data sets in one file: every array is theirs, one after the other, the episodes counted
-    on, with the weather of each, and pictures are made smaller on request."""
+    """Two data sets in one file have their arrays one after the other, with continuous episode
+    numbers and each episode's weather. Pictures are made smaller on request."""
     packed = packed_sets([data_set, data_set], (32, 24))
     for name in ("state", "goal", "command", "waypoints", "driven", "disturbed"):
         once = np.concatenate([getattr(one, name) for one in demonstrations])
@@ -246,28 +246,28 @@ def test_packed_rows_are_those_that_were_kept(
 
 
 def test_sensors_are_packed_as_they_were_recorded(tmp_path: Path) -> None:
-    """Distances by ring and ray, inertial readings, people and labels come back from the file; data
+    """Distances by ring and ray, inertial readings, people and labels are read back equal; data
     sets with other sensors are not packed together."""
     draws = np.random.default_rng(3)
     shapes = {"scan": (2, 8), "imu": (6,), "people": (PEOPLE_ROWS, 5)}
     shapes |= {"near": (LABELLED_PEOPLE, 6), "free": (FREE_RAYS,), "scene": (2,)}
     sensors = {name: draws.random((7, *shape), np.float32) for name, shape in shapes.items()}
-    told = {**sensors, "scan": sensors["scan"].reshape(7, -1)}
+    columns = {**sensors, "scan": sensors["scan"].reshape(7, -1)}
     lidar = msgspec.to_builtins(ScanSpec(rays=8, rings=2, elevation_deg=(-5.0, 5.0)))
     about = {**ABOUT, "lidar": lidar, "imu": "exact", "people": "seen"}
-    folder = written(tmp_path / "one", [replace(shown(0, 7), **told)], about)
+    folder = written(tmp_path / "one", [replace(known_demonstration(0, 7), **columns)], about)
     packed_sets([folder]).save(tmp_path / "demos.npz")
     packed = read_packed(tmp_path / "demos.npz")
     for name, readings in sensors.items():
         np.testing.assert_array_equal(getattr(packed, name), readings)
     assert (packed.meta["lidar"]["rings"], packed.meta["imu"]) == (2, "exact")
     with pytest.raises(SpecError, match=r"lidar is .* here and None there"):
-        packed_sets([folder, written(tmp_path / "other", [shown(0, 3)])])
+        packed_sets([folder, written(tmp_path / "other", [known_demonstration(0, 3)])])
 
 
-def test_waypoints_of_a_drive_end_where_the_robot_is_put_back() -> None:
-    """It drives east at 2 m/s, is put back by 4 m after tick 9, rests for a tick and drives on: no
-    waypoint leads from one drive to the other, and the second ones are those after it."""
+def test_waypoints_end_at_a_reset_of_the_robot() -> None:
+    """The robot drives east at 2 m/s, is reset by 4 m after tick 9, rests for a tick and drives on.
+    No waypoint crosses the reset, and later waypoints are of the drive after it."""
     x_m = [0.1 * k for k in range(11)] + [-3.0 + 0.1 * k for k in range(10)]
     pose = np.array([[x, 0.0, 0.0] for x in x_m])
     ticks, begins = np.array([0, 4, 8, 10, 14]), np.array([True, False, False, True, False])
@@ -285,9 +285,9 @@ def test_waypoints_of_a_drive_end_where_the_robot_is_put_back() -> None:
 def test_raw_demonstrations_are_packed_in_parts(
     tmp_path: Path, demonstrations: list[Demonstration]
 ) -> None:
-    """Of an unfinished collection what is there, in the order of its scenarios, by two processes as
-    by one; one that was put back is two episodes; weathers are those of the scenarios. Older parts are deleted, and runs
-    are in the order of their numbers. A folder without any is named."""
+    """The finished episodes of a collection are packed in the order of its scenarios, by two
+    processes as by one. An episode with a reset is two; old parts are deleted; an empty folder is
+    named."""
     ways = [short_way(f"s-{k:03d}") for k in range(4)]
     ways[1] = ways[1].in_weather("rain")
     run = tmp_path / "raw/runs/00"
@@ -323,10 +323,10 @@ def test_raw_demonstrations_are_packed_in_parts(
     assert [path.name for path in sorted(tmp_path.glob("e-*"))] == ["e-000.npz", "e-f-001.npz"]
     assert read_packed(tmp_path / "e-000.npz").frames.shape == (sum(LENGTHS), 24, 32, 3)
     for number, way in ((100, ways[3]), (11, ways[2])):
-        whole = Suite(name="ways", version="1", scenarios=(way,))
+        one_way = Suite(name="ways", version="1", scenarios=(way,))
         folder = tmp_path / f"many/runs/{number:02d}"
         (folder / "episodes" / way.id).mkdir(parents=True)
-        write_suite(whole, folder / "scenarios.json")
+        write_suite(one_way, folder / "scenarios.json")
         (folder / f"episodes/{way.id}/demonstration.npz").write_bytes(demonstrations[0].encoded())
     (tmp_path / "many/about.json").write_text(json.dumps(ABOUT))
     (part,) = pack_raw([tmp_path / "many"], tmp_path / "m.npz")
@@ -335,10 +335,10 @@ def test_raw_demonstrations_are_packed_in_parts(
         pack_raw([tmp_path], tmp_path / "d.npz")
 
 
-def test_data_sets_that_do_not_fit_are_not_packed_together(data_set: Path, tmp_path: Path) -> None:
-    """Another rate or other waypoints are named, with both values; a folder that holds none is
+def test_incompatible_data_sets_are_not_packed_together(data_set: Path, tmp_path: Path) -> None:
+    """Another rate and other waypoints are named with both values; a folder without a data set is
     named."""
-    other = written(tmp_path / "other", [shown(0, 3)])
+    other = written(tmp_path / "other", [known_demonstration(0, 3)])
     (other / "meta/cosim.json").write_text(json.dumps({**ABOUT, "waypoint_s": 0.5}))
     with pytest.raises(SpecError, match=r"waypoint_s is 0\.2 here and 0\.5 there"):
         packed_sets([data_set, other])
@@ -347,12 +347,12 @@ def test_data_sets_that_do_not_fit_are_not_packed_together(data_set: Path, tmp_p
         packed_sets([other])
 
 
-def _rows_moved(one: Demonstration) -> Demonstration:
-    return replace(one, command=np.roll(one.command, 1, axis=0))
+def _rows_moved(demonstration: Demonstration) -> Demonstration:
+    return replace(demonstration, command=np.roll(demonstration.command, 1, axis=0))
 
 
-def _pictures_moved(one: Demonstration) -> Demonstration:
-    return replace(one, glimpses=np.roll(one.glimpses, 4, axis=0))
+def _pictures_moved(demonstration: Demonstration) -> Demonstration:
+    return replace(demonstration, glimpses=np.roll(demonstration.glimpses, 4, axis=0))
 
 
 @pytest.mark.parametrize(
@@ -363,21 +363,21 @@ def _pictures_moved(one: Demonstration) -> Demonstration:
     ],
     ids=["rows", "pictures"],
 )
-def test_rows_beside_their_pictures_are_found_when_it_is_read_back(
+def test_shifted_rows_or_pictures_are_found_when_a_data_set_is_read(
     data_set: Path,
     demonstrations: list[Demonstration],
     moved: Callable[[Demonstration], Demonstration],
     words: str,
 ) -> None:
-    """What is not as it was kept, in one episode, is refused by name."""
+    """Changed rows or pictures of one episode are refused with its name."""
     kept = [demonstrations[0], moved(demonstrations[1]), demonstrations[2]]
     with pytest.raises(RunError, match=words):
         read_back(data_set, episodes_of(kept))
 
 
 def test_waypoints_are_where_the_robot_is_later_in_its_own_frame() -> None:
-    """Of a robot that drives a circle to the left, its place on the circle, and at the end the same
-    circle goes on by its command."""
+    """On a circle to the left, waypoints are later places on the circle, and after the end the same
+    circle continues by the last command."""
     v_mps = 1.0
     w_radps = 0.5
     angle = w_radps * TICK_S * np.arange(41)
@@ -394,8 +394,8 @@ def test_waypoints_are_where_the_robot_is_later_in_its_own_frame() -> None:
 
 
 def test_waypoints_are_never_those_of_a_disturbed_drive() -> None:
-    """A robot that is turned off its straight way in a burst: waypoints before it and in it go
-    straight on, as the expert would; those after it are driven."""
+    """Waypoints before and in a burst of noise continue straight ahead, as the expert would; those
+    after it are driven."""
     disturbed = np.array([False, False, True, False, False])
     pose = np.zeros((21, 3))
     pose[:, 0] = 0.05 * np.arange(21)
@@ -407,9 +407,9 @@ def test_waypoints_are_never_those_of_a_disturbed_drive() -> None:
     np.testing.assert_allclose(ahead, np.tile([[0.2, 0.0], [0.4, 0.0]], (5, 1, 1)), atol=1e-6)
 
 
-def test_bursts_have_their_share_of_the_time_and_are_drawn_from_the_seed() -> None:
-    """Over many episodes a fifth of the commands is disturbed for --noise 0.2; one seed gives one
-    drive; a robot that the expert has stand is not driven on."""
+def test_noise_bursts_have_their_share_of_the_time_and_depend_on_the_seed() -> None:
+    """With --noise 0.2 a fifth of the commands over many episodes is disturbed, and one seed gives
+    one drive. A robot that the expert stops is not moved."""
     answer = Command(1.0, 0.1)
     collecting = DemoOptions(noise=0.2)
     drives = [[bursts.driven(answer, COURIER) for _ in range(60)] for bursts in _each(collecting)]
@@ -426,7 +426,7 @@ def test_bursts_have_their_share_of_the_time_and_are_drawn_from_the_seed() -> No
 
 
 def test_an_exploring_learner_stops_and_starts_at_times() -> None:
-    """Its commands are changed in their share of the time; half of the changes set its speed."""
+    """Commands are changed for their share of the time, and half of the changes set the speed."""
     collecting = DemoOptions(explore=0.3, learner="small", unsolved=True)
     found = {}
     for v_mps in (0.0, 1.0):
@@ -444,7 +444,7 @@ def _each(collecting: DemoOptions) -> list[_Bursts]:
 
 
 @pytest.mark.parametrize(
-    ("asked", "words"),
+    ("options", "words"),
     [
         ({"rate_hz": 3.0}, "1, 2, 4, 5, 10, 20 pictures a second, not 3"),
         ({"noise": 1.5}, r"noise must be in \[0, 0\.9\]"),
@@ -469,28 +469,29 @@ def _each(collecting: DemoOptions) -> list[_Bursts]:
         "odd picture",
     ],
 )
-def test_what_cannot_be_kept_is_refused(asked: dict[str, object], words: str) -> None:
-    """A rate, a share of noise, waypoints or a size that no data set can have is told with what it
-    may be."""
+def test_invalid_options_of_a_collection_are_refused(
+    options: dict[str, object], words: str
+) -> None:
+    """An invalid rate, share of noise, waypoints or size is refused with the valid range."""
     with pytest.raises(SpecError, match=words):
-        DemoOptions(**asked)  # type: ignore[arg-type]
+        DemoOptions(**options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     "goal", [kind.name for kind in GOALS.values() if not kind.has_data_set_column]
 )
-def test_goals_that_rows_cannot_tell_are_refused(goal: str) -> None:
-    """Pictures as goals, and points that the expert does not drive to, are refused with what may be
-    asked for."""
+def test_goals_that_rows_cannot_store_are_refused(goal: str) -> None:
+    """Picture goals, and points that the expert does not drive to, are refused with the valid
+    goals."""
     with pytest.raises(
         CosimError, match="give --goal, one of none, route_point, final_point, instruction"
     ):
         recording_manifest(Manifest("p", goal=goal_called(goal)), DemoOptions())
 
 
-def test_an_expert_that_sees_is_asked_as_often_as_it_says() -> None:
-    """At another rate the pictures that it remembers would be other times apart; one that sees none
-    is asked at any."""
+def test_an_expert_with_a_camera_is_queried_at_its_own_rate() -> None:
+    """Another rate is refused for an expert with a memory of pictures; a blind expert accepts any
+    rate."""
     with pytest.raises(
         CosimError, match="policy 'p' sees, and answers 4 times a second, not 5: give --rate 4"
     ):
@@ -505,8 +506,8 @@ def test_an_expert_that_sees_is_asked_as_often_as_it_says() -> None:
     "words", ["70:90", "1:2", "7000:7002", "40", "9:9", "a:b", "-4:3", "900:100000"]
 )
 def test_cities_of_the_suites_are_refused(words: str) -> None:
-    """Seeds that a suite uses, and what names no seeds, are refused with an example of what may be
-    asked for."""
+    """Seeds that a suite uses, and text that is no range of seeds, are refused with a valid
+    example."""
     with pytest.raises(CosimError, match=f"--cities {words}: .*900:940"):
         new_cities(words)
 
@@ -522,27 +523,27 @@ def test_cities_of_the_suites_are_refused(words: str) -> None:
 def test_options_that_contradict_each_other_are_refused(
     suite: str, more: dict[str, Any], words: str
 ) -> None:
-    """Two ways to set the weather, and decoys of a suite that has none."""
+    """Two ways to set the weather are refused, and so are decoys of a suite without any."""
     with pytest.raises(UsageError, match=words):
         _source(RunConfig(suite=suite, weather="snow"), DemoConfig(**more))
 
 
 def test_raw_demonstrations_name_the_robot_of_their_scenarios(tmp_path: Path) -> None:
-    """It is that of the suite's scenarios, unless another robot is requested."""
+    """The robot is that of the suite's scenarios, unless another one is requested."""
     way = short_way("s").driven_by("scout")
-    whole = Suite(name="ways", version="1", scenarios=(way,))
+    suite = Suite(name="ways", version="1", scenarios=(way,))
     demonstrator = Demonstrator(load_policy("orca"), DemoOptions(format="raw"), "route_point")
     for requested, robot in (("", "scout"), ("courier", "courier")):
         options = EpisodeOptions(robot=requested)
-        rounds = _Rounds(whole, tmp_path, "orca", demonstrator, options, 1, math.inf, ignore)
+        rounds = _Rounds(suite, tmp_path, "orca", demonstrator, options, 1, math.inf, ignore)
         assert rounds.robot == robot
 
 
-def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:
-    """Structures take turns, then cities, and then all once more; none is of a city of a suite."""
-    there = new_scenarios("reactive", new_cities("900:902"), ["gesturing", "static"])
-    assert there.structures == ("gesturing", "static")
-    assert not {*there.seeds} & {*SEEDS}
+def test_fresh_scenarios_take_structures_and_cities_in_turn() -> None:
+    """Structures take turns, then cities, and then both again; no city belongs to a suite."""
+    drawn = new_scenarios("reactive", new_cities("900:902"), ["gesturing", "static"])
+    assert drawn.structures == ("gesturing", "static")
+    assert not {*drawn.seeds} & {*SEEDS}
     with pytest.raises(
         CosimError,
         match=r"unknown structure of 'unit' 'gesturing'\. Valid choices: crosswalk, curve",
@@ -559,8 +560,7 @@ def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:
 
 
 def test_a_damaged_demonstration_is_named(demonstrations: list[Demonstration]) -> None:
-    """One that was cut off is refused by the file's name, and one that was not is what was
-    encoded."""
+    """A truncated file is refused with its name, and a complete one decodes to what was encoded."""
     data = demonstrations[0].encoded()
     assert data == demonstrations[0].encoded()
     assert Demonstration.decoded(data, "here").encoded() == data

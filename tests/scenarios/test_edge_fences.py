@@ -1,5 +1,4 @@
-"""Ways on maps whose sidewalks lie over one another: fenced in all along, where fences at the
-branches do not do."""
+"""Routes on maps with overlapping sidewalks, which need fences along their edges."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ ROUTE = Polyline([(-30, 0), (30, 0)])
 def laid_over(
     street_map: StreetMap, name: str, *points: tuple[float, float], width_m: float = 2.0
 ) -> StreetMap:
-    """The map with one more footway, which meets no corner."""
+    """Return the map with an additional footway that meets no corner."""
     line = np.array(points)
     polygon = shapely.buffer(LineString(line), width_m / 2, cap_style="flat")
     strip = Strip(name, "sidewalk", line, width_m, polygon, (None, None))
@@ -38,8 +37,8 @@ def laid_over(
 
 
 def test_a_footway_across_a_sidewalk_is_fenced_off() -> None:
-    """Fences at the branches leave it open; a hem closes it on both sides, names it, and keeps off
-    the route."""
+    """Fences at the branches leave the footway open; an edge fence closes it on both sides, names
+    it, and keeps off the route."""
     street_map = laid_over(cross_map(), "path", (-15.0, -50.0), (-10.0, 50.0))
     fences = [barrier_at(street_map, port) for port in ports_to_close(street_map, WAY)]
     with pytest.raises(SpecError, match="a branch is left open"):
@@ -57,14 +56,14 @@ def test_a_footway_across_a_sidewalk_is_fenced_off() -> None:
 
 
 def test_a_footway_along_a_sidewalk_is_fenced_off() -> None:
-    """Half on the sidewalk and half beside it: the hem runs along it."""
+    """The fence runs along a footway that overlaps half of the sidewalk."""
     street_map = laid_over(cross_map(), "beside", (-35.0, 2.0), (-5.0, 2.0), (60.0, 60.0))
     part = prove_single_path(street_map, ROUTE, edge_fences(street_map, WAY), WAY, 0.3)
     assert part.bounds[3] < 2.5
 
 
-def test_a_way_on_its_own_needs_no_hem() -> None:
-    """Where nothing borders on the way there are no fences; where far too much does it is
+def test_an_isolated_route_needs_no_edge_fence() -> None:
+    """A route without adjacent ground has no fences; one with far too much adjacent ground is
     refused."""
     alone = cross_map()
     alone = dataclasses.replace(
@@ -84,7 +83,7 @@ def test_a_way_on_its_own_needs_no_hem() -> None:
 
 @pytest.fixture(scope="module")
 def overlaid() -> StreetMap:
-    """A small city with a footway of 90 m across the middle of each long sidewalk."""
+    """Return a small city with a footway of 90 m across the middle of each long sidewalk."""
     _, street_map = place(City(seed=1, size_m=500.0))
     for strip in list(street_map.strips.values()):
         if strip.kind == "sidewalk" and strip.length_m >= 30.0:
@@ -96,11 +95,11 @@ def overlaid() -> StreetMap:
 
 
 @pytest.mark.engine
-def test_where_no_draw_fits_a_way_is_searched_for_and_hemmed(
+def test_a_route_is_searched_and_fenced_where_no_draw_fits(
     overlaid: StreetMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a map of overlaid sidewalks the same seed gives the same proved route; without the search
-    none, and why."""
+    """On a map of overlapping sidewalks the same seed gives the same proved route; without the
+    search there is none, with the reason."""
     monkeypatch.setattr(long_horizon, "TRIES", 10)
     graph = WalkGraph(overlaid)
     city = City(seed=1, size_m=500.0)
@@ -118,10 +117,11 @@ def test_where_no_draw_fits_a_way_is_searched_for_and_hemmed(
 
 @pytest.mark.engine
 def test_shipped_routes_are_drawn_again_to_the_bit(request: pytest.FixtureRequest) -> None:
-    """Where a draw fits, the search changes nothing: one route, two with --whole."""
+    """The search does not change a route that a draw finds: one route, two with --whole."""
     names = ("lh-011-00", "lh-037-00") if request.config.getoption("--whole") else ("lh-011-00",)
     shipped = {s.id: s for s in load_suite("long-horizon").scenarios}
-    for slot in RECIPES["long-horizon"].slots:
-        if slot.name in names:
-            scenario = shipped[slot.name]
-            assert content_hash(candidate(slot, scenario.seed)) == content_hash(scenario)
+    slots = [slot for slot in RECIPES["long-horizon"].slots if slot.name in names]
+    assert len(slots) == len(names)
+    for slot in slots:
+        scenario = shipped[slot.name]
+        assert content_hash(candidate(slot, scenario.seed)) == content_hash(scenario)

@@ -1,5 +1,5 @@
-"""A kind of event is a row: one that this file alone knows is drawn, read, directed, judged and
-shown."""
+"""A kind of event is a table row: one that is defined only in this file is drawn, read, simulated,
+judged and shown."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ TRIGGER_M = 7.0
 
 
 def begin(event: Event, number: int) -> Walker:
-    """Two of them, at either edge of the sidewalk."""
+    """Return the first states of two people, at either edge of the sidewalk."""
     return walker_at(event, 0.0, (1 - 2 * number) * edge_m(event), math.pi)
 
 
 def change_sides(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
-    """To the other edge, and back when it is over; there they stand."""
+    """Move the people to the other edge, and back when the event is over."""
     side = (2 * number - 1) * (1 if state.phase == "acting" else -1)
     goal = world_point(event, 0.6 * number, side * edge_m(event))
     return walk_to(state.walkers[number], *goal, event.speed_mps, sight_of(event, number, query))
@@ -78,8 +78,9 @@ NEEDS_ROOM = SidewalkLayout((16.0, 18.0), (9.0, 10.0), half_width_m=1.9)
 KINDS: EventKinds = EVENT_KINDS | {SWAPPING.name: SWAPPING}  # type: ignore[operator]
 
 
-def test_every_row_of_the_table_is_the_papers_and_triggers_on_the_way() -> None:
-    """Eight of them; the robot starts farther from an event's place than its trigger reaches."""
+def test_rows_match_the_paper_and_trigger_on_the_way() -> None:
+    """There are eight kinds, and the robot starts farther from an event than its trigger
+    distance."""
     assert [*EVENT_KINDS] == [
         "obstructing",
         "conversing",
@@ -99,9 +100,8 @@ def test_every_row_of_the_table_is_the_papers_and_triggers_on_the_way() -> None:
         ] <= kind.people[1]
 
 
-def test_a_kind_is_named_in_its_own_file_alone() -> None:
-    """Whatever else needs to know something of a kind reads its row: no other module of the product
-    names one, but for the paper's figures, which stand under its names."""
+def test_only_the_file_of_a_kind_names_it() -> None:
+    """No other module names a kind, except the table of the paper's figures."""
     named = [
         f"{path.relative_to(ROOT)}: {node.value}"
         for room in ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
@@ -116,9 +116,9 @@ def test_a_kind_is_named_in_its_own_file_alone() -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
-def test_long_ways_have_the_kinds_of_the_table_handed_in(robot: Robot) -> None:
-    """One of several people, where its layout and the robot find room, as many as its row says;
-    none of no kind."""
+def test_long_routes_use_the_given_table_of_kinds(robot: Robot) -> None:
+    """A kind with several people is placed where its layout and the robot fit, with as many people
+    as its row says."""
     where = small_scenario().place
     _, street_map = place(where)
     loitering = dataclasses.replace(SWAPPING, people=(2, 4), layout=NEEDS_ROOM)
@@ -134,47 +134,46 @@ def test_long_ways_have_the_kinds_of_the_table_handed_in(robot: Robot) -> None:
                 assert event.half_width_m >= layout.half_width_m + robot.width_m - COURIER.width_m
 
 
-def test_a_suite_made_in_python_is_refused_as_one_from_a_file() -> None:
-    """Events that are not as the table says are told before anything runs, not one crashed episode
-    each."""
-    whole = load_suite("reactive")
-    first, second = whole.scenarios[:2]
+def test_an_invalid_suite_made_in_python_is_refused() -> None:
+    """Events that contradict the table are refused before anything runs."""
+    suite = load_suite("reactive")
+    first, second = suite.scenarios[:2]
     odd = [with_event(first, people=3), with_event(second, kind="swapping")]
     with pytest.raises(SpecError) as refusal:
-        check_places(whole, odd)
-    told = str(refusal.value)
+        check_places(suite, odd)
+    message = str(refusal.value)
     assert (
         f"scenario '{first.id}': event 'e0': people of '{first.events[0].kind}' must be 1, not 3"
-        in told
+        in message
     )
     assert (
         f"scenario '{second.id}': Invalid enum value 'swapping' - at `$.events[0].kind`. "
-        f"Valid choices: obstr" in told
+        f"Valid choices: obstr" in message
     )
 
 
 def with_event(scenario: Scenario, **changed: object) -> Scenario:
-    """The scenario, its event changed."""
+    """Return the scenario with a changed event."""
     return msgspec.structs.replace(
         scenario, events=(msgspec.structs.replace(scenario.events[0], **changed),)
     )
 
 
 @pytest.mark.engine
-def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
-    """Its row is all that there is of it: sampled on a city, written, read, directed over Zenoh,
-    triggered, monitored, and in the sheet; without its row it is refused at every door."""
+def test_an_event_is_defined_by_its_row_alone(tmp_path: Path) -> None:
+    """A new row is sampled on a city, written, read, simulated over Zenoh, triggered, monitored and
+    shown; without its row it is refused everywhere."""
     write_city(City(seed=1, size_m=500.0), tmp_path / "city")
     drawn = suite_on_map("reactive", str(tmp_path / "city"), 3, 1, events=["swapping"], kinds=KINDS)
     write_suite(drawn, tmp_path / "s.json")
-    (whole,) = read_suite(tmp_path / "s.json", KINDS).scenarios
+    (sampled,) = read_suite(tmp_path / "s.json", KINDS).scenarios
     with pytest.raises(
         SpecError,
         match=r"'swapping' - at `\$.scenarios\[0\].events\[0\].kind`. Valid choices: obstr",
     ):
         read_suite(tmp_path / "s.json", EVENT_KINDS)
     few = CrowdSpec(persons=3, radius_m=40.0, vehicles=0)
-    scenario = msgspec.structs.replace(whole, crowd=few, obstacles=(), time_limit_s=11.0)
+    scenario = msgspec.structs.replace(sampled, crowd=few, obstacles=(), time_limit_s=11.0)
     (planned,) = scenario.events
     assert planned.trigger_m is not None and planned.trigger_m <= TRIGGER_M
     stops_at_m = planned.route_s_m - planned.trigger_m + 0.3

@@ -20,7 +20,7 @@ PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
 
 
 def event(kind: str, **fields: object) -> Event:
-    """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
+    """Return an event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
     known = {
         "id": "e0",
         "kind": kind,
@@ -34,15 +34,15 @@ def event(kind: str, **fields: object) -> Event:
     return Event(**known | fields)  # type: ignore[arg-type]
 
 
-def ask(
-    one: Event,
+def reply_to_robot(
+    planned: Event,
     tick: int,
     x_m: float,
     y_m: float = 0.0,
     states: tuple[EventState, ...] = (),
     v_mps: float = 1.0,
 ) -> EventReply:
-    """The reply to a robot on the x axis that faces +x."""
+    """Return the reply to a robot on the x axis that faces +x."""
     query = EventQuery(
         episode="t",
         tick=tick,
@@ -55,21 +55,21 @@ def ask(
         route_s_m=x_m,
         robot_length_m=0.7,
         robot_width_m=0.55,
-        events=(one,),
+        events=(planned,),
         states=states,
     )
     return react(query)
 
 
 def drive(
-    one: Event, ticks: int, speed_mps: float, start_m: float = 0.0
+    planned: Event, ticks: int, speed_mps: float, start_m: float = 0.0
 ) -> list[tuple[float, EventState, Actor | None]]:
-    """(robot x, state, actor) at every tick of a robot that drives along the x axis."""
+    """Return (robot x, state, actor) at every tick of a robot that drives along the x axis."""
     states: tuple[EventState, ...] = ()
     out = []
     for tick in range(ticks):
         x_m = start_m + speed_mps * tick * TICK_MS / 1000
-        reply = ask(one, tick, x_m, states=states, v_mps=speed_mps)
+        reply = reply_to_robot(planned, tick, x_m, states=states, v_mps=speed_mps)
         states = reply.states
         out.append((x_m, reply.states[0], reply.actors[0] if reply.actors else None))
     return out
@@ -90,7 +90,8 @@ def drive(
 )
 def test_an_event_triggers_at_its_distance(kind: str, trigger_m: float) -> None:
     """The trigger fires at the first tick at which the robot is within the distance of the paper's
-    table, overtaking at the last one within it behind, a crossing at the end of its crosswalk."""
+    table; overtaking at the last such tick behind the robot, a crossing at the end of its
+    crosswalk."""
     track = drive(event(kind), 1100, 1.0)
     first = next(i for i, (_, state, _) in enumerate(track) if state.phase != "waiting")
     x_m, state, _ = track[first]
@@ -116,9 +117,9 @@ def test_an_obstructing_pedestrian_waits_aside_then_stands_in_the_middle_and_lea
 
 
 def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() -> None:
-    """It aims ahead of the robot by the way to their meeting, keeps its speed, and from the
-    commitment distance on keeps its line."""
-    one = event("frontal")
+    """It aims ahead of the robot according to their distance, keeps its speed, and keeps its line
+    within the commitment distance."""
+    planned = event("frontal")
     states: tuple[EventState, ...] = ()
     headings = []
     gaps = []
@@ -127,7 +128,7 @@ def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() ->
         y_m = 0.004 * tick
         acted = bool(states) and states[0].phase == "acting"
         before = states[0].walkers[0] if states else None
-        reply = ask(one, tick, x_m, y_m, states)
+        reply = reply_to_robot(planned, tick, x_m, y_m, states)
         states = reply.states
         now = states[0].walkers[0]
         if before is not None and acted and not now.blocked_ticks:
@@ -145,8 +146,8 @@ def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() ->
     assert len({round(h, 12) for h in headings[1:]}) == 1
 
 
-def test_event_pedestrians_walk_no_faster_than_told_and_never_jump() -> None:
-    """Between two ticks no actor moves farther than its speed allows."""
+def test_event_pedestrians_keep_their_speed_limit_and_never_jump() -> None:
+    """Between two ticks no event pedestrian moves farther than its speed allows."""
     for kind in EVENT_KINDS:
         fastest = {"lateral": 2.0, "overtaking": 2.7}.get(kind, 1.2)
         states = [state for _, state, _ in drive(event(kind), 1500, 1.3)]
@@ -156,13 +157,14 @@ def test_event_pedestrians_walk_no_faster_than_told_and_never_jump() -> None:
 
 
 def test_the_director_is_stateless() -> None:
-    """The same query gives the same reply, and its states are all that the next tick needs."""
-    one = event("frontal")
-    first = ask(one, 0, 32.0)
-    assert msgspec.json.encode(ask(one, 0, 32.0)) == msgspec.json.encode(first)
-    again = ask(one, 1, 32.1, states=first.states)
-    restarted = ask(
-        one,
+    """The same query gives the same reply, and the returned states are all that the next tick
+    needs."""
+    planned = event("frontal")
+    first = reply_to_robot(planned, 0, 32.0)
+    assert msgspec.json.encode(reply_to_robot(planned, 0, 32.0)) == msgspec.json.encode(first)
+    again = reply_to_robot(planned, 1, 32.1, states=first.states)
+    restarted = reply_to_robot(
+        planned,
         1,
         32.1,
         states=msgspec.json.decode(msgspec.json.encode(first.states), type=tuple[EventState, ...]),
@@ -170,8 +172,8 @@ def test_the_director_is_stateless() -> None:
     assert restarted == again
 
 
-def test_an_event_that_makes_no_sense_is_refused() -> None:
-    """The message names the event, the field and what it may be."""
+def test_an_event_with_an_invalid_id_is_refused() -> None:
+    """The message names the reserved prefix of ids."""
     with pytest.raises(SpecError, match="ids of event pedestrians start with 'e'"):
         event("frontal", id="x1")
     with pytest.raises(SpecError, match="'ei-' begins the ids of injected pedestrians"):
@@ -179,13 +181,13 @@ def test_an_event_that_makes_no_sense_is_refused() -> None:
 
 
 def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
-    """It runs into a robot whose wheels turn in vain, stops there, and after its patience goes round
-    it and on, never inside its outline."""
-    one = event("frontal")
+    """It stops at a robot that does not move, and after its patience walks round it, never inside
+    its outline."""
+    planned = event("frontal")
     states: tuple[EventState, ...] = ()
     gaps = []
     for tick in range(900):
-        reply = ask(one, tick, 35.0, states=states)
+        reply = reply_to_robot(planned, tick, 35.0, states=states)
         states = reply.states
         away = np.abs([states[0].walkers[0].x_m - 35.0, states[0].walkers[0].y_m]) - (0.35, 0.275)
         gaps.append(float(np.hypot(*np.maximum(away, 0.0))) - 0.3)
@@ -195,20 +197,20 @@ def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
 
 
 def test_an_obstructing_pedestrian_does_not_step_into_the_robot() -> None:
-    """When the robot already stands in the middle, the pedestrian comes near but never touches
+    """When the robot already stands in the middle, the pedestrian comes near without touching
     it."""
-    one = event("obstructing")
+    planned = event("obstructing")
     states: tuple[EventState, ...] = ()
     for tick in range(200):
-        states = ask(one, tick, 50.0, states=states).states
+        states = reply_to_robot(planned, tick, 50.0, states=states).states
         away = np.abs([states[0].walkers[0].x_m - 50.0, states[0].walkers[0].y_m]) - (0.35, 0.275)
         assert float(np.hypot(*np.maximum(away, 0.0))) - 0.3 > 0.0
     assert states[0].phase == "acting"
 
 
 def test_talkers_stand_in_a_circle_and_face_each_other() -> None:
-    """Once in place they are equally far from the middle of the sidewalk, which all of them
-    face."""
+    """Once in place they have equal distances from the middle of the sidewalk, and all of them face
+    it."""
     for people in (2, 3, 4):
         track = drive(event("conversing", people=people), 400, 0.3, start_m=39.0)
         walkers = track[-1][1].walkers
@@ -226,7 +228,8 @@ def test_talkers_stand_in_a_circle_and_face_each_other() -> None:
 
 
 def test_a_queue_is_a_line_from_one_side() -> None:
-    """Evenly across the sidewalk from its edge on, facing that edge; the other side is open."""
+    """The line is even across the sidewalk from its edge, faces that edge, and leaves the other
+    side open."""
     for side in (-1, 1):
         walkers = drive(event("queueing", side=side), 400, 0.3, start_m=39.0)[-1][1].walkers
         assert all(w.x_m == pytest.approx(50.0) for w in walkers)
@@ -240,10 +243,10 @@ def test_a_queue_is_a_line_from_one_side() -> None:
 def test_a_lateral_pedestrian_meets_a_robot_that_keeps_its_velocity(
     speed_mps: float, side: int
 ) -> None:
-    """It walks at a right angle to the robot's path, evenly, and without contact would be at its
-    centre with it."""
-    one = event("lateral", side=side)
-    track = drive(one, int(60 / speed_mps * 20), speed_mps)
+    """It walks evenly at a right angle to the robot's path, and without contact would meet its
+    centre."""
+    planned = event("lateral", side=side)
+    track = drive(planned, int(60 / speed_mps * 20), speed_mps)
     acting = [(x, state.walkers[0]) for x, state, _ in track if state.phase == "acting"]
     assert all(w.x_m == pytest.approx(50.0) for _, w in acting)
     _, first = acting[0]
@@ -258,8 +261,8 @@ def test_a_lateral_pedestrian_meets_a_robot_that_keeps_its_velocity(
 
 
 def test_an_overtaking_pedestrian_passes_beside_the_robot_and_cuts_in() -> None:
-    """It starts from behind, is faster, passes without a touch, and slows down ahead, on the
-    robot's line."""
+    """It starts behind the robot, is faster, passes without a touch, and slows down on the robot's
+    line."""
     track = drive(event("overtaking"), 900, 1.2, start_m=40.0)
     acting = [(x, s.walkers[0]) for x, s, _ in track if s.phase == "acting"]
     assert -1.0 <= acting[0][1].x_m - acting[0][0] < -0.85
@@ -272,7 +275,7 @@ def test_an_overtaking_pedestrian_passes_beside_the_robot_and_cuts_in() -> None:
 
 
 def test_people_cross_from_both_ends_of_the_crosswalk() -> None:
-    """They wait off it, set out when the robot enters, one of them on the robot's line, and reach
+    """They wait outside it, start when the robot enters, one of them on the robot's line, and reach
     the other side."""
     track = drive(event("ped_crossing"), 1000, 0.3, start_m=40.0)
     waiting = track[0][1].walkers
@@ -287,9 +290,9 @@ def test_people_cross_from_both_ends_of_the_crosswalk() -> None:
 
 
 def test_a_gesturing_pedestrian_faces_the_robot_throughout() -> None:
-    """In its place it holds up the hand, and turns with a robot that drives past."""
-    one = event("gesturing")
-    track = drive(one, 700, 0.5, start_m=39.0)
+    """It holds up the hand in its place, and turns with a robot that drives past."""
+    planned = event("gesturing")
+    track = drive(planned, 700, 0.5, start_m=39.0)
     shown = [(x, s.walkers[0], a) for x, s, a in track if s.phase == "acting"][80:]
     assert {a.doing for _, _, a in shown if a is not None} == {"stop"}
     for x, w, _ in shown:

@@ -1,5 +1,4 @@
-"""Scenarios as environments of Gymnasium: spaces, rewards, ends, seeds, and the same bits as a
-run."""
+"""Scenarios as Gymnasium environments: spaces, rewards, ends, seeds, and equality with runs."""
 
 from __future__ import annotations
 
@@ -84,15 +83,15 @@ QUIET = Transition(
     ],
     ids=lambda value: " ".join(value) or "nothing" if isinstance(value, dict) else None,
 )
-def test_the_usual_reward_is_the_sum_that_it_says(happened: dict[str, Any], worth: float) -> None:
-    """Each part of the documented sum, by itself, worked out by hand."""
+def test_the_default_reward_is_the_documented_sum(happened: dict[str, Any], worth: float) -> None:
+    """Each part of the sum has its hand-computed value."""
     assert usual_reward(replace(QUIET, **happened)) == pytest.approx(worth)
 
 
 @pytest.mark.parametrize("goal", sorted(GOALS))
-def test_what_is_seen_lies_in_its_space(goal: str) -> None:
-    """For every goal protocol, with all that a manifest can ask for: the dictionary has the space's
-    names, and all of it is contained; numbers beyond the bounds are put at them."""
+def test_observations_lie_in_the_observation_space(goal: str) -> None:
+    """For every goal protocol and all optional sensors, the dictionary has the keys of the space,
+    its values are contained, and values beyond the bounds are clipped."""
     wide = CameraSpec(32, 24, labels=True, depth=True)
     manifest = Manifest(
         "all",
@@ -143,9 +142,9 @@ def test_what_is_seen_lies_in_its_space(goal: str) -> None:
     assert (seen["people"] == 1.0).all() and seen["people"].shape == (32, 5)
 
 
-def test_answers_are_commands_or_waypoints_of_the_manifest() -> None:
-    """A command is speed and yaw rate of the fastest robot; waypoints end with the followed one, in
-    its unit."""
+def test_actions_are_commands_or_waypoints_of_the_manifest() -> None:
+    """A command is speed and yaw rate within the limits of the fastest robot; waypoints end with
+    the followed one, in its unit."""
     space = action_space_of("command", BLIND, [COURIER, SCOUT])
     assert (space.low.tolist(), space.high.tolist()) == (
         [0.0, np.float32(-1.2)],
@@ -162,8 +161,8 @@ def test_answers_are_commands_or_waypoints_of_the_manifest() -> None:
 
 
 def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:
-    """`gymnasium.make` knows a suite for each id, and the id says which version of the suite that
-    is; no engine is started by making it."""
+    """`gymnasium.make` accepts an id for each suite, and the id ends with the suite's major
+    version."""
     assert {*ENV_IDS.values()} == {*SUITES}
     for env_id, name in ENV_IDS.items():
         assert env_id.endswith(f"-v{load_suite(name).version.split('.')[0]}")
@@ -174,7 +173,7 @@ def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("arguments", "message"),
     [
         ({"suite": "unlt"}, "unknown suite 'unlt'.*Did you mean unit"),
         ({"scenarios": ["straight-999999"]}, "unknown scenario 'straight-999999'"),
@@ -203,16 +202,18 @@ def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:
         "robot",
     ],
 )
-def test_what_cannot_be_is_refused_when_an_environment_is_made(
-    asked: dict[str, Any], told: str
+def test_invalid_arguments_are_refused_when_an_environment_is_made(
+    arguments: dict[str, Any], message: str
 ) -> None:
-    """One line says what was found and what may stand there."""
-    with pytest.raises((UsageError, SpecError), match=told):
-        cosim.make_env(**{"suite": "unit", "manifest": BLIND} | asked)
+    """One line names the invalid value and the valid ones."""
+    with pytest.raises((UsageError, SpecError), match=message):
+        cosim.make_env(**{"suite": "unit", "manifest": BLIND} | arguments)
 
 
-def test_without_gymnasium_one_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The extra is named."""
+def test_a_missing_gymnasium_is_named_with_its_installation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The message names the extra to install."""
     monkeypatch.delitem(sys.modules, "scenarios.tools.gym.environment", raising=False)
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(
@@ -221,8 +222,8 @@ def test_without_gymnasium_one_is_told_what_to_install(monkeypatch: pytest.Monke
         cosim.make_env("unit")
 
 
-def test_an_environment_without_a_render_mode_says_how_to_get_pictures() -> None:
-    """`render()` raises; the message names the mode and the call that sets it."""
+def test_render_without_a_render_mode_is_refused() -> None:
+    """`render()` raises an error with the mode and the call that sets it."""
     with (
         gymnasium.make("cosim/Unit-v2", manifest=BLIND) as env,
         pytest.raises(
@@ -233,16 +234,16 @@ def test_an_environment_without_a_render_mode_says_how_to_get_pictures() -> None
 
 
 @pytest.mark.engine
-def test_the_checker_of_gymnasium_is_content() -> None:
-    """`check_env` passes for what is seen by a camera with depth and a picture as a goal, rendering
-    too; it warns of nothing but that speeds are in their units."""
-    asked = {
+def test_check_env_of_gymnasium_passes() -> None:
+    """`check_env` passes for a camera with depth, a picture goal and rendering, and warns only of
+    spaces that are not normalized."""
+    arguments = {
         "suite": short_ways(),
         "manifest": SEES,
         "scenarios": ["way-1"],
         "render_mode": "rgb_array",
     }
-    env = gymnasium.make("cosim/Unit-v2", **asked).unwrapped
+    env = gymnasium.make("cosim/Unit-v2", **arguments).unwrapped
     with env, warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         check_env(env)
@@ -253,15 +254,17 @@ def test_the_checker_of_gymnasium_is_content() -> None:
             env.reset(options={"scene": "way-1"})
         with pytest.raises(UsageError, match=r"unknown scenario 'way-2'\. Valid choices: way-1"):
             env.reset(options={"scenario": "way-2"})
-    told = [str(one.message) for one in warned]
+    warnings_seen = [str(one.message) for one in warned]
     assert [
-        text for text in told if "we recommend using a symmetric and normalized space" not in text
+        text
+        for text in warnings_seen
+        if "we recommend using a symmetric and normalized space" not in text
     ] == []
     with pytest.raises(UsageError, match=r"call reset\(\) first"):
         env.step(env.action_space.sample())
 
 
-class Replays:
+class Replay:
     """A policy that gives the same commands as `commands`."""
 
     manifest = replace(SEES, odometry="wheel")
@@ -274,7 +277,7 @@ class Replays:
 
 
 def commands() -> list[np.ndarray]:
-    """What is driven: curves, at speeds that single precision has."""
+    """Return commands along curves, at speeds that single precision represents exactly."""
     return [np.float32([0.25 + 0.125 * (k % 7), 0.25 * (k % 3 - 1)]) for k in range(20)]
 
 
@@ -282,26 +285,26 @@ def commands() -> list[np.ndarray]:
 def test_the_same_commands_give_the_record_of_a_run_to_the_bit() -> None:
     """The last step of an environment has the state hash and measures of a run with the same
     commands."""
-    whole = short_ways(crowd=CrowdSpec(persons=12, vehicles=4, radius_m=60.0))
+    suite = short_ways(crowd=CrowdSpec(persons=12, vehicles=4, radius_m=60.0))
     options = EpisodeOptions(seed=11)
-    setup = RunSetup.of(options, suite_hash=whole.content_hash)
-    with cosim.make_env(whole, Replays.manifest, options=options) as env:
+    setup = RunSetup.of(options, suite_hash=suite.content_hash)
+    with cosim.make_env(suite, Replay.manifest, options=options) as env:
         seen, info = env.reset(options={"scenario": "way-3"})
-        seens = [seen]
+        observations = [seen]
         rewards = []
         gained_m = 0.0
         for command in commands():
             seen, reward, terminated, truncated, info = env.step(command)
-            seens.append(seen)
+            observations.append(seen)
             rewards.append(reward)
             gained_m += env.transition.progress_m
             if terminated or truncated:
                 break
-    asked: list[dict[str, Any]] = []
+    queried: list[dict[str, Any]] = []
     answers = iter(commands())
-    learned = LearnedPolicy(lambda seen: asked.append(seen) or next(answers), Replays.manifest)
-    for policy in (Replays(), learned):
-        record = run_episode(whole.scenarios[3], policy, options, setup=setup).record
+    learned = LearnedPolicy(lambda seen: queried.append(seen) or next(answers), Replay.manifest)
+    for policy in (Replay(), learned):
+        record = run_episode(suite.scenarios[3], policy, options, setup=setup).record
         assert info["record"] == msgspec.structs.replace(record, clock={})
     assert len(record.state_hash) > 10 and (terminated, truncated) == (
         record.ended == "failure",
@@ -310,16 +313,16 @@ def test_the_same_commands_give_the_record_of_a_run_to_the_bit() -> None:
     assert info["metrics"] == {
         name: value for name, value in record.measures.items() if value is not None
     }
-    for here, there in zip(seens, asked, strict=False):
-        assert all((here[name] == there[name]).all() for name in here)
-    assert len(asked) == len(seens) - 1 and gained_m > 0.2
+    for stepped, answered in zip(observations, queried, strict=False):
+        assert all((stepped[name] == answered[name]).all() for name in stepped)
+    assert len(queried) == len(observations) - 1 and gained_m > 0.2
 
 
 @pytest.mark.engine
-def test_a_seed_settles_scenarios_and_all_that_is_drawn() -> None:
-    """The same seed gives the same scenarios and observations in the same order, with noise on the
-    wheels; another seed others; a scenario that is named changes nothing of what follows. A user's
-    reward is what a step returns."""
+def test_a_seed_determines_scenarios_and_observations() -> None:
+    """The same seed gives the same scenarios and observations in the same order, with noisy
+    odometry, and another seed others. A named scenario does not change the following ones, and a
+    user's reward is returned by step."""
 
     def episodes(
         env: Any, seed: int, first: dict[str, str] | None = None
@@ -344,7 +347,7 @@ def test_a_failure_ends_a_short_way_and_is_counted_on_a_long_one() -> None:
     """A failure terminates a short way; on a long way the robot is reset with a penalty until the
     time truncates the episode."""
 
-    def off_the_walk(ends: bool) -> tuple[list[dict[str, Any]], list[float], bool, bool]:
+    def driven_off_the_sidewalk(ends: bool) -> tuple[list[dict[str, Any]], list[float], bool, bool]:
         way = short_ways(ends_on_failure=ends, time_limit_s=4.0)
         infos = []
         rewards = []
@@ -357,46 +360,46 @@ def test_a_failure_ends_a_short_way_and_is_counted_on_a_long_one() -> None:
                 rewards.append(reward)
         return infos, rewards, terminated, truncated
 
-    infos, rewards, *ends = off_the_walk(True)
+    infos, rewards, *ends = driven_off_the_sidewalk(True)
     assert ends == [True, False] and infos[-1]["failures"] == 1 and rewards[-1] < -8.0
     assert not infos[-1]["is_success"] and infos[-1]["record"].ended == "failure"
-    infos, rewards, *ends = off_the_walk(False)
-    back = [k for k, info in enumerate(infos) if info["put_back"]]
+    infos, rewards, *ends = driven_off_the_sidewalk(False)
+    resets = [k for k, info in enumerate(infos) if info["put_back"]]
     assert (
         ends == [False, True]
-        and back
-        and all(infos[k]["failures"] == 1 and rewards[k] < -8.0 for k in back)
+        and resets
+        and all(infos[k]["failures"] == 1 and rewards[k] < -8.0 for k in resets)
     )
     assert sum(info["failures"] for info in infos) == len(infos[-1]["record"].failures)
     assert infos[-1]["time_s"] == 4.0 and infos[-1]["record"].ended == "timeout"
 
 
 @pytest.mark.engine
-def test_several_at_once_see_what_each_sees_alone(tmp_path: Path) -> None:
-    """`AsyncVectorEnv` of four, each with engines of its own in a process of its own:
-    observations, rewards and ends are to the bit those of one environment after the other."""
+def test_vectorized_environments_equal_single_ones(tmp_path: Path) -> None:
+    """Four environments of an `AsyncVectorEnv`, in processes of their own, give the observations,
+    rewards and ends of single environments to the bit."""
     done = subprocess.run(
-        [*MODULE, "alike"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [*MODULE, "differences"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert done.stdout == "[]\n" and COUNT == 4, done.stderr
 
 
 @pytest.mark.engine
-def test_what_goes_wrong_in_one_of_them_is_told_and_nothing_outlives_them() -> None:
-    """An answer that is not a number comes out as the error that it is; when the process that made
-    the environments is killed theirs end too."""
-    told = subprocess.run(
-        [*MODULE, "told"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+def test_vectorized_environments_report_errors_and_end_with_their_parent() -> None:
+    """An action that is not finite raises its own error, and environments end when the process that
+    made them is killed."""
+    output = subprocess.run(
+        [*MODULE, "error"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     ).stdout
     assert (
         "PolicyError policy 'blind' answered Command(v_mps=nan, w_radps=0.0): both must be finite"
-        in told
+        in output
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([*MODULE, "killed"], text=True, **pipes) as made:
-        pids = [int(word) for word in made.stdout.readline().split()]
+    with subprocess.Popen([*MODULE, "killed"], text=True, **pipes) as parent:
+        pids = [int(word) for word in parent.stdout.readline().split()]
         assert len(pids) == 2 and all(map(still_runs, pids))
-        made.kill()
+        parent.kill()
     deadline = time.monotonic() + PATIENCE_S
     while any(map(still_runs, pids)) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -404,9 +407,9 @@ def test_what_goes_wrong_in_one_of_them_is_told_and_nothing_outlives_them() -> N
 
 
 @pytest.mark.engine
-def test_the_learner_of_the_readme_begins(tmp_path: Path) -> None:
-    """The example with PPO learns for one short rollout, writes its curve, and gives a policy that
-    answers in a run; it needs Stable-Baselines3."""
+def test_the_learner_of_the_readme_runs(tmp_path: Path) -> None:
+    """The PPO example learns for one short rollout, writes its curve, and returns a policy that
+    drives in a run. Skipped without Stable-Baselines3."""
     pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
     code = (
         "import runpy, pathlib, cosim;"

@@ -1,5 +1,5 @@
-"""Hostile policies, in the simulator's process and isolated: every episode gets its row, and
-nothing else breaks."""
+"""Hostile policies, in the simulator's process and isolated: every episode gets its row, and no
+other episode is affected."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from scenarios.ipc.sandbox import KINDS
 from scenarios.runs import run as suite_run
 from scenarios.runs.isolated_policy import isolated_caller
 from scenarios.tools.verify.doctor import small_scenario
-from tests.conftest import PATIENCE_S, ROOT, WIDE, Cosim, Said, without_lines
+from tests.conftest import PATIENCE_S, ROOT, WIDE, CliResult, Cosim, without_lines
 from tests.support import hostile
 from tests.support.hostile import ANSWER_S, BEHAVIOURS, DONE, FLOOD_BYTES, FORGED, START_S, Honest
 
 MODULE = "hostile_policy"
 SEED = 5
 MARK = "LC_HOSTILE_MARK"
-"""A variable that the sandbox passes on."""
+"""Environment variable that the sandbox passes on."""
 _WRITES = """
 import os, stat
 for i in range(3, 1024):
@@ -60,34 +60,27 @@ environment_slot.TICK_S = {tick_s}
 from cosim.__main__ import main
 main()
 """
-"""The command line with timeouts of ticks and, short, of the end of processes."""
+"""The command line with a timeout of ticks and a short timeout of ending processes."""
 
 
 class HostileRun(NamedTuple):
-    """One run of behaviours in a hosting.
-
-    folder: of the run
-    names: of the behaviours
-    lost: the scenarios of the attempts that ended with their process
-    mark: value of the variable MARK of every process of the run
-    """
+    """One run of behaviours in a hosting. folder: of the run; names: of the behaviours; lost:
+    scenarios of the attempts that ended with their process; mark: value of the variable MARK in
+    every process of the run."""
 
     folder: Path
     names: tuple[str, ...]
-    said: Said
+    output: CliResult
     records: dict[str, Record]
     lost: list[str]
     mark: str
 
 
 class HostingRuns(NamedTuple):
-    """The runs of a hosting, which run at the same time.
-
-    hanging: of behaviours that are ended by a timeout, which is short
-    seeing: of those that need a picture, and of an honest policy with a camera
-    harmful: of those that harm the run folder; in a sandbox, where none can, they are in `others`
-    others: of the others, whose timeouts are so long that a slow machine misses none
-    """
+    """The runs of a hosting, which run at the same time. hanging: behaviours that a short timeout
+    ends; seeing: those that need a picture, and an honest policy with a camera; harmful: those that
+    harm the run folder (in a sandbox they are in `others`); others: the others, with timeouts that
+    a slow machine does not miss."""
 
     others: HostileRun
     hanging: HostileRun
@@ -98,16 +91,16 @@ class HostingRuns(NamedTuple):
     def all(self) -> list[HostileRun]:
         return [run for run in self if run is not None]
 
-    def of(self, name: str) -> HostileRun:
+    def run_with(self, name: str) -> HostileRun:
         """Return the run of a behaviour."""
         return next(run for run in self.all if name in run.names)
 
 
 @cache
 def short_scenario() -> Scenario:
-    """A second in a small city without crowd and obstacles, so that its engines start fast."""
-    nobody = CrowdSpec(persons=0, vehicles=0)
-    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, crowd=nobody, obstacles=())
+    """Return a second in a small city without crowd and obstacles, whose engines start fast."""
+    empty = CrowdSpec(persons=0, vehicles=0)
+    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, crowd=empty, obstacles=())
 
 
 def named(name: str) -> Scenario:
@@ -129,7 +122,7 @@ def prepare(folder: Path, names: Sequence[str], mark: str) -> dict[str, str]:
 
 
 def run_behaviours(folder: Path, names: tuple[str, ...], *options: str, jobs: int) -> HostileRun:
-    """Run behaviours by some processes at a time; a run of hanging ones has short timeouts."""
+    """Run behaviours with a number of processes; runs of hanging behaviours have short timeouts."""
     mark = f"hostile-{uuid.uuid4()}"
     hangs = HANGING[0] in names
     answer_s, start_s = (ANSWER_S, START_S) if hangs else (PATIENCE_S, PATIENCE_S)
@@ -155,12 +148,12 @@ def run_behaviours(folder: Path, names: tuple[str, ...], *options: str, jobs: in
         timeout=PATIENCE_S,
         check=False,
     )
-    said = Said(done.returncode, done.stdout, done.stderr)
-    assert said.returncode in (ALL_SCORED, SOME_CRASHED), said
+    output = CliResult(done.returncode, done.stdout, done.stderr)
+    assert output.returncode in (ALL_SCORED, SOME_CRASHED), output
     records = {one.scenario.id: one for one in read_records(folder / "run")}
     log = map(json.loads, (folder / "log.jsonl").read_text().splitlines())
     lost = [one["scenario"] for one in log if one["event"] == "lost"]
-    return HostileRun(folder / "run", names, said, records, lost, mark)
+    return HostileRun(folder / "run", names, output, records, lost, mark)
 
 
 _ALWAYS = ("--log-json", "log.jsonl")
@@ -170,6 +163,7 @@ SIGHT = {
     "isolated": ("--camera", "bullet"),
 }
 SANDBOXED = {f"isolated: {kind}" for kind in KINDS}
+HARMLESS = {name: one for name, one in BEHAVIOURS.items() if one.in_process == DONE}
 HANGING = tuple(name for name, behaviour in BEHAVIOURS.items() if behaviour.hangs)
 HARMFUL = tuple(name for name, behaviour in BEHAVIOURS.items() if behaviour.harms_folder)
 SEEING = ("honest", *(name for name, behaviour in BEHAVIOURS.items() if behaviour.sees))
@@ -193,17 +187,17 @@ def hosting_runs(hosting: str, tmp_path_factory: pytest.TempPathFactory) -> Host
     ]
     runs += [] if isolated else [(("honest", *HARMFUL), 1, options)]
     with ThreadPoolExecutor(len(runs)) as pool:
-        begun = [
+        futures = [
             pool.submit(
                 run_behaviours, tmp_path_factory.mktemp("hostile"), names, *words, jobs=jobs
             )
             for names, jobs, words in runs
         ]
-    others, hanging, seeing, *harmful = [one.result() for one in begun]
+    others, hanging, seeing, *harmful = [one.result() for one in futures]
     return HostingRuns(others, hanging, seeing, *(harmful or [None]))
 
 
-def with_mark(mark: str) -> list[int]:
+def processes_with_mark(mark: str) -> list[int]:
     """Return the processes that have a mark in their environment."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
@@ -218,9 +212,10 @@ def with_mark(mark: str) -> list[int]:
 @pytest.mark.engine
 @pytest.mark.parametrize("name", BEHAVIOURS)
 def test_each_behaviour_has_its_outcome(hosting: str, hosting_runs: HostingRuns, name: str) -> None:
-    """An episode has crashed with the reason, or is to the bit that of an honest policy."""
+    """Each episode either crashes with the expected reason or equals that of an honest policy to
+    the bit."""
     behaviour = BEHAVIOURS[name]
-    run = hosting_runs.of(name)
+    run = hosting_runs.run_with(name)
     record = run.records[name]
     expected = behaviour.in_process if hosting == "in-process" else behaviour.isolated
     if expected == FORGED:
@@ -243,9 +238,8 @@ def test_each_behaviour_has_its_outcome(hosting: str, hosting_runs: HostingRuns,
         assert name not in run.lost and record.setup.policy_runs in SANDBOXED
 
 
-def test_the_table_is_complete() -> None:
-    """It has 59 behaviours, none of which is invalid anywhere, and those that a process alone
-    cannot prevent are named."""
+def test_the_table_has_59_behaviours() -> None:
+    """None is invalid anywhere, and only one forges a result in the simulator's process."""
     assert len(BEHAVIOURS) - 1 == 59
     assert [
         name
@@ -256,18 +250,20 @@ def test_the_table_is_complete() -> None:
 
 @pytest.mark.engine
 def test_a_run_of_hostile_policies_ends_in_order(hosting: str, hosting_runs: HostingRuns) -> None:
-    """The run has a row for every episode, exit code 1, no traceback, small logs with the begin and
-    the end of floods, and leaves no process."""
+    """The run has a row for every episode, the right exit code and no traceback, and leaves no
+    process. Its logs are small, with begin and end of floods."""
     for run in hosting_runs.all:
         crashed = [one for one in run.records.values() if one.status == "crashed"]
-        assert run.said.returncode == bool(crashed) and "Traceback" not in run.said.stderr, run.said
-        assert f"scheduled {len(run.names)}, scored {len(run.names)}" in run.said.stdout
+        assert run.output.returncode == bool(crashed) and "Traceback" not in run.output.stderr, (
+            run.output
+        )
+        assert f"scheduled {len(run.names)}, scored {len(run.names)}" in run.output.stdout
         table = pd.read_csv(run.folder / "results.csv", index_col="scenario", keep_default_na=False)
         assert list(table.index) == sorted(run.names)
         assert {float(one) for one in table["success"][table["status"] == "crashed"]} <= {0.0}
         for name, record in run.records.items():
             assert Record.load(run.folder / "episodes" / name / "record.json") == record
-        assert with_mark(run.mark) == []
+        assert processes_with_mark(run.mark) == []
     logs = [path.read_bytes() for path in (hosting_runs.others.folder / "logs").iterdir()]
     assert max(map(len, logs)) < FLOOD_BYTES / 2
     # Two floods may share a log, whose middle is left out.
@@ -279,20 +275,17 @@ def test_a_run_of_hostile_policies_ends_in_order(hosting: str, hosting_runs: Hos
 def test_a_policy_harms_no_other_episode_of_its_process(
     hosting: str, hosting_runs: HostingRuns
 ) -> None:
-    """An attempt fails only by what its own policy did."""
-    if hosting == "isolated":
-        return
-    assert {
-        name for name in hosting_runs.others.lost if BEHAVIOURS[name].in_process == DONE
-    } == set()
+    """No harmless episode was lost with its process."""
+    harmless = BEHAVIOURS if hosting == "isolated" else HARMLESS
+    assert harmless.keys() & {*hosting_runs.others.lost} == set()
 
 
 @pytest.mark.engine
 def test_pictures_are_stored_as_drawn(hosting: str, hosting_runs: HostingRuns) -> None:
-    """A policy that blackens its picture does not change the stored one; the record names the
+    """A policy that blackens its picture does not change the stored one, and the record names the
     renderer."""
     if hosting == "isolated":
-        return
+        pytest.skip("frames are stored in the simulator's process")
     assert hosting_runs.seeing.records["honest"].setup.renderer == renderer_of("bullet")
     episodes = hosting_runs.seeing.folder / "episodes"
     honest, blackened = (
@@ -304,19 +297,19 @@ def test_pictures_are_stored_as_drawn(hosting: str, hosting_runs: HostingRuns) -
 
 @pytest.mark.engine
 def test_a_run_states_the_sandbox_of_its_policy(hosting: str, hosting_runs: HostingRuns) -> None:
-    """Its specification and its output name the kind."""
+    """The run's specification and output name the kind of sandbox."""
     runs = read_spec(hosting_runs.others.folder).setup.policy_runs
     assert runs in (SANDBOXED if hosting == "isolated" else {"in-process"})
-    assert hosting == "in-process" or f"policy {runs}" in hosting_runs.others.said.stdout
+    assert hosting == "in-process" or f"policy {runs}" in hosting_runs.others.output.stdout
 
 
 @pytest.mark.engine
-def test_isolated_or_not_an_episode_is_the_same_to_the_bit(
+def test_an_isolated_episode_equals_one_in_the_simulators_process(
     hosting: str, hosting_runs: HostingRuns, tmp_path: Path
 ) -> None:
-    """In the simulator's process the same commands come out of the same pictures."""
+    """The same pictures give the same commands and the same state hash."""
     if hosting == "in-process":
-        return
+        pytest.skip("the isolated run is compared")
     suite = Suite(name="hostile", version="1", scenarios=(named("honest"),))
     table = suite_run.run(
         suite, Honest(), out=tmp_path / "run", options=EpisodeOptions(seed=SEED, camera="bullet")
@@ -329,7 +322,7 @@ def test_isolated_or_not_an_episode_is_the_same_to_the_bit(
 
 @pytest.mark.engine
 def test_a_killed_run_leaves_no_process(tmp_path: Path) -> None:
-    """The processes that a policy has started, in their own sessions, end with a killed run."""
+    """Processes that a policy has started, in sessions of their own, end with a killed run."""
     mark = f"hostile-{uuid.uuid4()}"
     words = ("--policy", f"{MODULE}:Leaves", "--seed", str(SEED), "--out", "leaves")
     run = subprocess.Popen(
@@ -344,12 +337,12 @@ def test_a_killed_run_leaves_no_process(tmp_path: Path) -> None:
         assert run.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
     # The run, the supervisor, the worker, and the two that were left.
-    while len(with_mark(mark)) < 5:
+    while len(processes_with_mark(mark)) < 5:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     run.kill()
     run.wait()
-    while with_mark(mark):
+    while processes_with_mark(mark):
         assert time.monotonic() < deadline, "processes are left"
         time.sleep(0.02)
 
@@ -357,8 +350,8 @@ def test_a_killed_run_leaves_no_process(tmp_path: Path) -> None:
 def test_an_isolated_policy_that_cannot_be_loaded_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
 ) -> None:
-    """An isolated policy that is missing, ends its process, writes to its socket, hangs or is
-    privileged is refused in a line."""
+    """A policy that is missing, ends its process, writes to its socket, hangs or is privileged is
+    refused in one line."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ends.py").write_text("import os\nos._exit(3)\n")
     (tmp_path / "writes.py").write_text(_WRITES)
@@ -374,7 +367,7 @@ def test_an_isolated_policy_that_cannot_be_loaded_is_refused(
             isolated_caller(name)
     with pytest.raises(UsageError, match=r"it gave no answer for 1 s: --start-timeout gives it"):
         isolated_caller(f"{hostile.__name__}:Hanging", start_s=1.0)
-    said = cosim("run", "unit", "--policy", "route", "--isolated", "--episodes", "1", cwd=tmp_path)
-    assert said.returncode == 2 and "needs privileged state" in said.stderr
+    done = cosim("run", "unit", "--policy", "route", "--isolated", "--episodes", "1", cwd=tmp_path)
+    assert done.returncode == 2 and "needs privileged state" in done.stderr
     with pytest.raises(UsageError, match="needs a policy by its name"):
         suite_run.run("unit", Honest(), host=PolicyHost(isolated="auto"))

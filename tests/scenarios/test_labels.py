@@ -1,4 +1,4 @@
-"""Labels of pictures against a street that is made by hand, and variety of collected scenarios."""
+"""Labels of pictures on a hand-made street, and variation of collected scenarios."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ GROUND = box(8.0, 0.0, 12.0, 40.0)
 
 
 def state(**changes: object) -> Privileged:
-    """The robot at (10, 5) looks north, along a sidewalk that is 4 m wide."""
+    """Return a robot at (10, 5) that looks north, along a sidewalk 4 m wide."""
     fields: dict[str, object] = {
         "robot": RobotState(Pose(10.0, 5.0, math.pi / 2.0)),
         "route": Polyline([(10.0, 0.0), (10.0, 40.0)]),
@@ -65,8 +65,8 @@ def rows(**changes: object) -> dict[str, np.ndarray]:
 
 
 def test_people_ahead_are_in_the_robots_axes_nearest_first() -> None:
-    """One walks to the right 4 m ahead and 1 m to the left, one holds out a hand 7 m ahead; those
-    behind and far away are missing."""
+    """One person walks to the right 4 m ahead and 1 m to the left, and one holds out a hand 7 m
+    ahead. People behind and far away are missing."""
     near = rows()["near"]
     np.testing.assert_allclose(
         near[:2],
@@ -80,7 +80,8 @@ def test_people_ahead_are_in_the_robots_axes_nearest_first() -> None:
 
 
 def test_free_distances_end_at_edges_people_and_vehicles() -> None:
-    """2 m to either edge; ahead the hand's owner; a van across the sidewalk is nearer; 0 outside."""
+    """Free distances are 2 m to either edge, end ahead at a person or a nearer van, and are 0
+    outside the ground."""
     half_m = COURIER.width_m / 2.0
     free = rows()["free"]
     assert free[LEFT] == pytest.approx(2.0) and free[RIGHT] == pytest.approx(2.0)
@@ -96,7 +97,8 @@ def test_free_distances_end_at_edges_people_and_vehicles() -> None:
 
 
 def test_the_signal_is_that_of_the_next_crossing() -> None:
-    """15 m ahead people must wait; then they may walk; none without a signal, or behind it."""
+    """A crossing 15 m ahead is red or green; there is no label without a signal, behind the
+    crossing, or far before it."""
     assert rows()["scene"].tolist() == [2.0, 0.0]
     walk = MappingProxyType({"x": Signal(walk=True)})
     assert signal_ahead(state(signals=walk)) == 1
@@ -114,8 +116,8 @@ def event_of(kind: str, **changes: object) -> Event:
 
 @pytest.mark.parametrize("kind", ["gesturing", "frontal", "obstructing", "queueing"])
 def test_the_event_is_that_of_the_nearest_directed_person_from_its_trigger_on(kind: str) -> None:
-    """Before the trigger an event has no label. A decoy in which nothing happens never has one; one
-    with the other side free has the label of its kind."""
+    """An event has no label before its trigger. A decoy without behaviour never has one; a mirrored
+    decoy has that of its kind."""
     person = event_person(state())
     assert person == "e1" and event_person(None) == ""
     event = event_of(kind, free_side=0 if EVENT_KINDS[kind].decoy else 1)
@@ -139,8 +141,8 @@ def test_the_event_is_that_of_the_nearest_directed_person_from_its_trigger_on(ki
 
 
 def test_weather_and_start_are_drawn_by_the_id_and_shared_with_the_decoy() -> None:
-    """All start aside of the route and turned, within limits; the route's end stays. Nothing
-    changes without the options, and an unknown weather is refused."""
+    """Each start is displaced and turned within limits, and the end of the route stays. Without the
+    options scenarios are unchanged; an unknown weather is refused."""
     ways = [short_way(f"s-{k}") for k in range(12)]
     asked = DemoOptions(astray=1.0, weathers=("clear", "rain"))
     made = varied(ways, asked, 0)

@@ -1,5 +1,5 @@
-"""Workers of other machines and a run's coordinator, over real Zenoh sessions, without engines: who
-gets which job, what becomes of results, and what is refused."""
+"""Workers of other machines and a run's coordinator, over real Zenoh sessions without engines: job
+assignment, results, and refusals."""
 
 from __future__ import annotations
 
@@ -87,14 +87,13 @@ GARBAGE = (
 
 
 @pytest.fixture(autouse=True)
-def _brief_partings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody here asks again when the run is over."""
+def _no_parting_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Skip the wait for late requests at the end of a run."""
     monkeypatch.setattr(remote, "PARTING_S", 0.0)
 
 
 class Run:
-    """A run that is coordinated in a thread of its own, in a folder of its own; killed by closing
-    its session."""
+    """A run that is coordinated in its own thread and folder; closing its session kills it."""
 
     def __init__(self, folder: Path, *, resumed: bool = False) -> None:
         self.folder = folder / "run"
@@ -108,7 +107,7 @@ class Run:
         assert self.opened.wait(PATIENCE_S)
 
     def over(self) -> dict[str, Record]:
-        """Wait until it is; its records."""
+        """Wait until the run is over, and return its records."""
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         return {record.scenario.id: record for record in read_records(self.folder)}
@@ -127,7 +126,7 @@ class Run:
         with (
             held,
             open_session(Connection(role="coordinator", listen=self.endpoint)) as hub,
-            suppress(_Killed),
+            suppress(_CoordinatorKilled),
         ):
             done = held.finished_ids()
             todo = [one for one in SUITE.scenarios if one.id not in done]
@@ -144,26 +143,26 @@ class Run:
                 self.error = error
 
 
-class _Killed(BaseException):
+class _CoordinatorKilled(BaseException):
     """The coordinator was killed."""
 
 
 def _killer(transport: remote.ZenohWorkers) -> Callable[[], None]:
-    """Make a transport raise in its thread when it waits next."""
+    """Make a transport raise an error in its thread at its next wait."""
     wait = transport.wait
     killed = threading.Event()
 
     def until_killed(timeout_s: float) -> None:
         wait(min(timeout_s, 0.05))
         if killed.is_set():
-            raise _Killed
+            raise _CoordinatorKilled
 
     transport.wait = until_killed  # type: ignore[method-assign]
     return killed.set
 
 
-class Hand:
-    """A worker that a test moves."""
+class ManualWorker:
+    """A worker that a test controls."""
 
     def __init__(self, endpoint: str) -> None:
         self.session = open_session(Connection(role="worker", connect=endpoint))
@@ -181,7 +180,7 @@ class Hand:
         )
 
     def job(self) -> str:
-        """Claim until there is a job. Returns its scenario."""
+        """Claim until there is a job, and return its scenario."""
         while not isinstance(reply := self.claim(), Assignment):
             assert reply == IDLE
         self.lease = reply.lease
@@ -203,9 +202,9 @@ class Hand:
         return self.report(said=(EpisodeProgress(self.scenario, 1.0, 4.5, 0),))
 
     def result(
-        self, *, of: str = "", ticks: int = 40, record: Record | None = None
+        self, *, scenario_id: str = "", ticks: int = 40, record: Record | None = None
     ) -> dict[str, object]:
-        name = of or self.scenario
+        name = scenario_id or self.scenario
         scenario = next(one for one in SUITE.scenarios if one.id == name)
         record = record or msgspec.structs.replace(
             Record.begun(scenario, DRIVER.manifest, SPEC.setup),
@@ -228,14 +227,15 @@ class Hand:
         return {"worker": self.name, "slot": 0}
 
     def status(self) -> RunStatus:
-        (told,) = self.session.query_all(keys.EVERY_RUN, timeout_s=PATIENCE_S).values()
-        return msgspec.json.decode(told, type=RunStatus)
+        (payload,) = self.session.query_all(keys.EVERY_RUN, timeout_s=PATIENCE_S).values()
+        return msgspec.json.decode(payload, type=RunStatus)
 
 
 @contextmanager
-def hands(run: Run, count: int) -> Iterator[list[Hand]]:
+def manual_workers(run: Run, count: int) -> Iterator[list[ManualWorker]]:
+    """Connect a number of workers to a run."""
     with ExitStack() as stack:
-        found = [Hand(run.endpoint) for _ in range(count)]
+        found = [ManualWorker(run.endpoint) for _ in range(count)]
         for one in found:
             stack.enter_context(one.session)
         yield found
@@ -245,7 +245,7 @@ def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
     """A job is claimed and delivered once; a second result changes nothing, and one that differs is
     logged as a conflict."""
     run = Run(tmp_path)
-    with hands(run, 2) as (one, other):
+    with manual_workers(run, 2) as (one, other):
         welcome = one.claim(ready=False)
         assert isinstance(welcome, Hello) and welcome.policy == "stop"
         first = one.job()
@@ -269,9 +269,9 @@ def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
 
 
 def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
-    """The job of a lost worker goes to another at once; the first result of either counts."""
+    """The job of a lost worker goes to another at once, and the first result of either counts."""
     run = Run(tmp_path)
-    with hands(run, 3) as (lost, other, third):
+    with manual_workers(run, 3) as (lost, other, third):
         first = lost.job()
         lost.session.close()
         assert other.job() == first
@@ -285,10 +285,10 @@ def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
     assert f"{lost.name}: lost" in run.log
 
 
-def test_who_comes_back_goes_on(tmp_path: Path) -> None:
+def test_a_reconnected_worker_keeps_its_job(tmp_path: Path) -> None:
     """A worker that reconnects keeps its job if no other has claimed it."""
     run = Run(tmp_path)
-    with hands(run, 1) as (one,):
+    with manual_workers(run, 1) as (one,):
         one.job()
         one.session.close()
         wait_until(lambda: f"{one.name}: lost" in run.log)
@@ -300,15 +300,15 @@ def test_who_comes_back_goes_on(tmp_path: Path) -> None:
         assert len(run.over()) == 2
 
 
-def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
+def test_a_restarted_coordinator_accepts_running_jobs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A restarted coordinator takes the leases and results of its workers."""
+    """A restarted coordinator accepts the leases and results of its workers."""
     monkeypatch.setattr(
         remote, "SETTLING_S", PATIENCE_S
-    )  # nothing can be given before both have told
+    )  # no job may be assigned before both have reported
     run = Run(tmp_path)
-    with hands(run, 2) as (one, other):
+    with manual_workers(run, 2) as (one, other):
         names = {one.job(), other.job()}
         run.kill()
         assert run.over() == {}
@@ -318,13 +318,13 @@ def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
         assert set(run.over()) == names
 
 
-def test_attempts_are_bounded_and_leaving_is_none(
+def test_attempts_are_bounded_and_leaving_is_not_an_attempt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A scenario crashes after two ended processes or eight lost workers; handing a job back costs
     no attempt."""
     run = Run(tmp_path)
-    with hands(run, 1) as (one,):
+    with manual_workers(run, 1) as (one,):
         poison = one.job()
         for _ in range(ATTEMPTS + 1):
             assert one.fail(AttemptFailure("handed_back")) == KEPT
@@ -335,7 +335,7 @@ def test_attempts_are_bounded_and_leaving_is_none(
         unlucky = one.job()
         assert unlucky != poison
         for losses in range(1, LOSSES):
-            with hands(run, 1) as (another,):
+            with manual_workers(run, 1) as (another,):
                 one.session.close()
                 assert another.job() == unlucky
             wait_until(lambda losses=losses: run.log.count("lost, with") > losses)
@@ -350,11 +350,13 @@ def test_attempts_are_bounded_and_leaving_is_none(
     )
 
 
-def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attempts_are_counted_across_coordinators(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Attempts of a scenario count across a restart of the coordinator."""
-    monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # nobody else works for it
+    monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # no other worker exists
     run = Run(tmp_path)
-    with hands(run, 1) as (one,):
+    with manual_workers(run, 1) as (one,):
         poison = one.job()
         one.fail()
         assert one.job() == poison
@@ -371,25 +373,25 @@ def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.Mo
     )
 
 
-def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
-    """Malformed, oversized and foreign messages are refused and change nothing."""
+def test_malformed_and_foreign_messages_are_refused(tmp_path: Path) -> None:
+    """Malformed, oversized and foreign messages are refused with a reason and change nothing."""
     run = Run(tmp_path)
-    with hands(run, 2) as (one, foe):
+    with manual_workers(run, 2) as (one, hostile):
         name = one.job()
         for act in ("claim", "report"):
             for payload in GARBAGE:
                 with pytest.raises(EngineError, match="not a"):
-                    foe.session.query(keys.job(foe.run, act), payload, timeout_s=PATIENCE_S)
+                    hostile.session.query(keys.job(hostile.run, act), payload, timeout_s=PATIENCE_S)
         with pytest.raises(EngineError, match="more than a message may have"):
-            foe.session.query(
-                keys.job(foe.run, "report"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S
+            hostile.session.query(
+                keys.job(hostile.run, "report"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S
             )
         with pytest.raises(EngineError, match="ask for exactly"):
-            foe.session.query("cosim/*/jobs/claim", b"", timeout_s=PATIENCE_S)
+            hostile.session.query("cosim/*/jobs/claim", b"", timeout_s=PATIENCE_S)
         with pytest.raises(TimeoutError):
-            foe.session.query(keys.job("another-run", "claim"), b"", timeout_s=0.2)
+            hostile.session.query(keys.job("another-run", "claim"), b"", timeout_s=0.2)
         for other in ({"libsumo": "0.1"}, {"metric schema": "0"}):
-            reply = foe.claim(**other)
+            reply = hostile.claim(**other)
             words = " ".join(*other.items())
             assert (
                 isinstance(reply, Reply)
@@ -397,23 +399,25 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
                 and f"{words} in place of" in reply.why
             )
         with pytest.raises(EngineError, match="damaged on its way"):
-            foe.report(**one.result() | {"digest": "0"})
+            hostile.report(**one.result() | {"digest": "0"})
         scenario = SUITE.scenarios[0]
-        strange = changed(
+        foreign_record = changed(
             Record.begun(scenario, DRIVER.manifest, SPEC.setup), suite_hash="another suite"
         )
-        reply = foe.deliver(of=name, record=strange)
+        reply = hostile.deliver(scenario_id=name, record=foreign_record)
         assert (
             isinstance(reply, Reply) and reply.kind == "turned_away" and "another run" in reply.why
         )
         unknown = msgspec.structs.replace(one.result()["done"], scenario="../../../etc")
         assert (
-            foe.report(scenario="../../../etc", lease=77, done=unknown, digest=digest_of(unknown))
+            hostile.report(
+                scenario="../../../etc", lease=77, done=unknown, digest=digest_of(unknown)
+            )
             == REFUSED
         )
-        foe.lease = 5
-        foe.scenario = name
-        assert foe.renew() == REVOKED and foe.fail() == KEPT
+        hostile.lease = 5
+        hostile.scenario = name
+        assert hostile.renew() == REVOKED and hostile.fail() == KEPT
         assert one.status().refused > 10 and one.status().finished == 0
         assert one.renew() == RENEWED and one.deliver() == KEPT
         one.job()
@@ -429,9 +433,9 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(
     def full(self: RunFolder, record: Record, *data: bytes) -> None:
         raise MachineError("cannot be written: no space left on device")
 
-    monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # nobody else works for it
+    monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # no other worker exists
     run = Run(tmp_path)
-    with hands(run, 1) as (one,):
+    with manual_workers(run, 1) as (one,):
         one.job()
         with monkeypatch.context() as patch:
             patch.setattr(RunFolder, "write_episode", full)
@@ -447,30 +451,28 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(
         assert len(run.over()) == 2
 
 
-def test_a_map_reaches_workers_that_lack_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_map_is_sent_to_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A missing map is sent in parts and stored only if its hash is right."""
-    there, here = tmp_path / "there", tmp_path / "here"
+    coordinator_cache, worker_cache = tmp_path / "coordinator", tmp_path / "worker"
     where = CityMap(
         map="mine",
         net_hash=net_xml_hash(net := b"<net>" + secrets.token_hex(3 << 20).encode() + b"</net>"),
     )
-    (there / "maps" / "mine").mkdir(parents=True)
-    (there / "maps" / "mine" / "net.xml").write_bytes(net)
-    (there / "maps" / "mine" / "about.json").write_bytes(b"{}")
+    (coordinator_cache / "maps" / "mine").mkdir(parents=True)
+    (coordinator_cache / "maps" / "mine" / "net.xml").write_bytes(net)
+    (coordinator_cache / "maps" / "mine" / "about.json").write_bytes(b"{}")
 
     def fetched(expected: str) -> None:
-        monkeypatch.setenv("COSIM_CACHE", str(there))
+        monkeypatch.setenv("COSIM_CACHE", str(coordinator_cache))
         nets = RunMaps()
         parts = 0
         last = False
         digest = nets.hash_of(where)
         wanted = MapDownload(where, expected)
         while not last:
-            monkeypatch.setenv("COSIM_CACHE", str(there))
+            monkeypatch.setenv("COSIM_CACHE", str(coordinator_cache))
             part = nets.part(digest, wanted.request)
-            monkeypatch.setenv("COSIM_CACHE", str(here))
+            monkeypatch.setenv("COSIM_CACHE", str(worker_cache))
             last = wanted.take(part)
             parts = parts + 1
         assert parts > 1
@@ -479,19 +481,21 @@ def test_a_map_reaches_workers_that_lack_it(
 
     with pytest.raises(EngineError, match=f"came with hash {where.net_hash} in place of wrong"):
         fetched("wrong")
-    assert is_missing(where) and not (here / "maps" / "mine").exists()
+    assert is_missing(where) and not (worker_cache / "maps" / "mine").exists()
     fetched(where.net_hash)
-    assert not is_missing(where) and (here / "maps" / "mine" / "net.xml").read_bytes() == net
+    assert (
+        not is_missing(where) and (worker_cache / "maps" / "mine" / "net.xml").read_bytes() == net
+    )
 
 
-def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
+def test_status_shows_lost_silent_and_working_workers(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`cosim status` shows lost, silent and working workers from the run folder or the address."""
+    """`cosim status` shows them from the run folder or the address."""
     monkeypatch.setattr(status, "SILENT_S", 0.0)
     monkeypatch.setattr(status, "_WRITTEN_EVERY_S", 0.0)
     run = Run(tmp_path)
-    with hands(run, 3) as (lost, one, silent):
+    with manual_workers(run, 3) as (lost, one, silent):
         lost.job()
         name = one.job()
         lost.session.close()
@@ -503,16 +507,16 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
                 and silent.name in (run.folder / "status.json").read_text()
             )
         )
-        told = cosim("status", str(run.folder)).stdout
-        assert told.startswith(
+        output = cosim("status", str(run.folder)).stdout
+        assert output.startswith(
             "s, policy stop: 0 of 2 episodes; 1 lost with their workers and run again"
         )
-        lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
+        lines = {line.split()[0]: line.split() for line in output.splitlines() if line.strip()}
         assert lines[lost.name][1] == "lost" and lines[silent.name][1] == "silent"
         monkeypatch.setattr(status, "SILENT_S", PATIENCE_S)
         assert one.renew() == RENEWED
-        told = cosim("status", "--connect", run.endpoint).stdout
-        lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
+        output = cosim("status", "--connect", run.endpoint).stdout
+        lines = {line.split()[0]: line.split() for line in output.splitlines() if line.strip()}
         assert lines[one.name][1] == "working" and lines[one.name][-5:] == [
             name,
             "at",
@@ -525,6 +529,6 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
     monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     assert cosim("status", str(run.folder)).stdout == "s, policy stop: 2 of 2 episodes\n"
     assert (
-        said := cosim("status", "--connect", run.endpoint)
-    ).returncode == 3 and "no hub answers" in said.stderr
-    assert (said := cosim("status")).returncode == 2 and "name a run folder" in said.stderr
+        result := cosim("status", "--connect", run.endpoint)
+    ).returncode == 3 and "no hub answers" in result.stderr
+    assert (result := cosim("status")).returncode == 2 and "name a run folder" in result.stderr

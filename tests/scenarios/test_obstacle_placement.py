@@ -1,5 +1,4 @@
-"""Obstacles drawn along a way: they stand where such things stand, leave a gap, and take the ways
-of nobody."""
+"""Obstacles drawn along a way: on sidewalks, with a gap for the robot, outside of people's ways."""
 
 from __future__ import annotations
 
@@ -50,13 +49,13 @@ def street() -> StreetMap:
 
 @cache
 def ways() -> tuple[Scenario, ...]:
-    """Long ways of a small city."""
+    """Return long ways of a small city."""
     graph = WalkGraph(street())
     return tuple(build_long_horizon(SMALL, street(), graph, seed, f"long-{seed}") for seed in SEEDS)
 
 
 def straight(**changed: object) -> Scenario:
-    """30 m of sidewalk 3.2 m wide, with nothing beside it."""
+    """Return 30 m of sidewalk 3.2 m wide, with nothing beside it."""
     route = tuple((float(x), 0.0) for x in range(6, 37, 2))
     known: dict[str, object] = {"id": "t", "suite": "t", "place": SMALL, "seed": 0, "route": route}
     ends: dict[str, object] = {"start": (6.0, 0.0, 0.0), "goal": (36.0, 0.0)}
@@ -64,8 +63,8 @@ def straight(**changed: object) -> Scenario:
 
 
 def eroded(scenario: Scenario, street_map: StreetMap) -> list[shapely.Geometry]:
-    """What is left of the way, by other means than the builder's: each obstacle and each edge grown
-    instead."""
+    """Return the ground that is left of the way, computed differently than by the builder: each
+    obstacle and each edge is grown."""
     around = shapely.buffer(LineString(scenario.route), 10.0)
     ground = without_barriers(street_map.walkable_near(around), scenario.barriers)
     half_m = 0.5 * (COURIER.width_m + TO_SPARE_M) - 1e-3
@@ -80,8 +79,8 @@ def eroded(scenario: Scenario, street_map: StreetMap) -> list[shapely.Geometry]:
 
 @pytest.mark.engine
 def test_a_gap_is_left_on_every_way() -> None:
-    """On random ways start and goal stay connected for a robot 0.5 m wider; a fence more across the
-    gap is refused."""
+    """On random ways start and goal stay connected for a robot 0.5 m wider, and fences across the
+    gap are refused."""
     for scenario in ways():
         prove_gap(scenario, street())
         ends = Point(scenario.start[:2]), Point(scenario.goal)
@@ -106,8 +105,8 @@ def test_a_gap_is_left_on_every_way() -> None:
 
 @pytest.mark.engine
 def test_obstacles_stand_on_sidewalks_and_on_nothing_else() -> None:
-    """None meets another, a prop, a house, a barrier, a driveway, a corner, a crossing, the start,
-    the goal or the place of an event; all of them lie on the walkable ground of a sidewalk."""
+    """Obstacles lie on the walkable ground of a sidewalk. They overlap neither each other nor
+    props, houses, barriers, driveways, corners, crossings, start, goal or events."""
     surface = StreetSurface(street(), SMALL.seed)
     for scenario in ways():
         around = shapely.buffer(LineString(scenario.route), 15.0)
@@ -132,9 +131,9 @@ def test_obstacles_stand_on_sidewalks_and_on_nothing_else() -> None:
 
 
 @pytest.mark.engine
-def test_who_follows_the_middle_of_the_way_hits_something() -> None:
-    """On every way something stands where a robot passes that keeps to the route; density is as it
-    is said; all kinds are drawn somewhere; the same seed gives the same."""
+def test_a_robot_that_follows_the_route_blindly_hits_an_obstacle() -> None:
+    """On every way an obstacle overlaps the swept route, the density is in its range, most kinds
+    are drawn, and the same seed gives the same obstacles."""
     kinds = set()
     found = 0
     length_m = 0.0
@@ -151,8 +150,8 @@ def test_who_follows_the_middle_of_the_way_hits_something() -> None:
 
 
 @pytest.mark.engine
-def test_obstacles_can_be_wanted_beside_the_way_alone() -> None:
-    """The band about the middle stays free, and the place of an event."""
+def test_obstacles_can_be_restricted_to_the_sides_of_the_way() -> None:
+    """The band about the middle stays free."""
     found = 0
     for way in ways():
         bare = msgspec.structs.replace(way, obstacles=())
@@ -165,8 +164,7 @@ def test_obstacles_can_be_wanted_beside_the_way_alone() -> None:
 
 
 def test_every_kind_is_drawn_and_narrows_the_way() -> None:
-    """On a sidewalk 3.2 m wide each kind comes up; construction sites are half as wide as it and
-    leave the gap."""
+    """On a sidewalk 3.2 m wide each kind is drawn, and construction sites leave the gap."""
     kinds = set()
     sites = 0
     for seed in range(25):
@@ -183,8 +181,8 @@ def test_every_kind_is_drawn_and_narrows_the_way() -> None:
     assert kinds == set(OBSTACLE_SIZES_M) and sites >= 2
 
 
-def test_a_way_that_is_no_wider_than_the_gap_gets_none() -> None:
-    """Where the robot could not pass anything, nothing is put."""
+def test_a_way_no_wider_than_the_gap_gets_no_obstacles() -> None:
+    """A way on which the robot could not pass an obstacle has none."""
     wide = cross_map()
     narrow = msgspec.structs.replace(straight(), robot="courier")
     thin = {name: _thinner(strip) for name, strip in wide.strips.items()}
@@ -201,17 +199,16 @@ def _thinner(strip):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.engine
-def test_people_go_round_what_is_put_in_their_way() -> None:
-    """Two seconds of a crowd: where somebody walked without obstacles, nobody does once bins stand
-    there."""
+def test_people_walk_round_obstacles() -> None:
+    """People who walk over a place without obstacles walk round bins at that place."""
     from scenarios.episodes.wiring import crowd_of
 
-    def tracks(one: Scenario) -> dict[str, list[tuple[float, float]]]:
+    def tracks(scenario: Scenario) -> dict[str, list[tuple[float, float]]]:
         found: dict[str, list[tuple[float, float]]] = {}
         reply = EventReply(episode="t", tick=0, states=(), actors=())
-        with crowd_of(one) as crowd:
+        with crowd_of(scenario) as crowd:
             for _ in range(40):
-                people = crowd.step(RobotState(one.start_pose), reply).people
+                people = crowd.step(RobotState(scenario.start_pose), reply).people
                 for name, (x_m, y_m) in zip(people.ids, people.xy.tolist(), strict=True):
                     found.setdefault(name, []).append((x_m, y_m))
         return found

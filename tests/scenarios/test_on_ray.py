@@ -1,4 +1,4 @@
-"""A run by a Ray cluster of several nodes."""
+"""Runs on a Ray cluster of several nodes."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ _WAITS = (
 
 @pytest.fixture(scope="module")
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[Any], Path]]:
-    """A head without CPUs and two nodes of one CPU, processes of this machine; and the file that is
-    waited for."""
+    """Return a head without CPUs, two nodes of one CPU each, and the file that the policy waits
+    for; all are processes of this machine."""
     go = tmp_path_factory.mktemp("ray") / "go"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COSIM_TEST_GO", str(go))
@@ -83,12 +83,11 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[
 
 
 @pytest.mark.engine
-def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
+def test_a_run_on_ray_equals_that_of_one_process_when_a_node_dies(
     tmp_path: Path, nodes: tuple[Any, list[Any], Path], cosim: Cosim
 ) -> None:
-    """A policy that only this machine has is sent there; a node is killed while both run an
-    episode: the episode that was lost is run again, and the tables are equal to the byte. Nodes of
-    other versions are refused."""
+    """The lost episode of a killed node is run again, and the tables are equal to the byte. The
+    policy is on this machine alone; nodes with other versions are refused."""
     cluster, (first, _), go = nodes
     (tmp_path / "only_here.py").write_text(POLICY)
     one = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
@@ -98,11 +97,11 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     def kill_one() -> None:
         while len([*go.parent.glob("begun-*")]) < 2:
             time.sleep(0.05)
-        begun = [int(path.name.split("-")[1]) for path in go.parent.glob("begun-*")]
+        pids = [int(path.name.split("-")[1]) for path in go.parent.glob("begun-*")]
         cluster.remove_node(first, allow_graceful=False)
         until_s = time.monotonic() + PATIENCE_S
         while (
-            all(map(still_runs, begun)) and time.monotonic() < until_s
+            all(map(still_runs, pids)) and time.monotonic() < until_s
         ):  # what ran there must not end first
             time.sleep(0.05)
         go.touch()
@@ -110,8 +109,8 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     killer = threading.Thread(target=kill_one, daemon=True)
     killer.start()
     words = ("run", "four.json", "--policy", "only_here:Waits", "--seed", "3", "--out")
-    said = cosim(*words, "ray", "--on", "ray", "--log-json", "log.jsonl", cwd=tmp_path)
-    assert "2 workers on Ray" in said.stderr and said.returncode == 0, said
+    done = cosim(*words, "ray", "--on", "ray", "--log-json", "log.jsonl", cwd=tmp_path)
+    assert "2 workers on Ray" in done.stderr and done.returncode == 0, done
     killer.join(PATIENCE_S)
     assert len([*go.parent.glob("begun-*")]) > SCENARIOS, (
         "the episode of the node that died was not run again"
@@ -134,9 +133,9 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     )
 
     spec = read_spec(tmp_path / "ray")
-    others = changed(spec, versions=spec.setup.versions | {"numpy": "0.1"})
+    other_versions = changed(spec, versions=spec.setup.versions | {"numpy": "0.1"})
     with ray_cluster("auto", "straight", print):
-        workers = RayWorkers(others, tmp_path, 1, 1, print)
+        workers = RayWorkers(other_versions, tmp_path, 1, 1, print)
         with pytest.raises(
             UsageError, match=r"node .* has numpy .* in place of 0\.1: install on the nodes"
         ):
@@ -144,18 +143,19 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
                 workers.wait(1.0)
 
 
-def test_what_is_no_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:
-    """A wrong word, and options of processes of this machine, in one line; and nothing is left."""
+def test_an_invalid_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:
+    """An unknown word, and options for local processes, are refused in one line, and no file is
+    left."""
     pytest.importorskip("ray", reason="Ray is not installed: the extra [ray]")
     words = ("run", "reactive", "--policy", "straight", "--episodes", "1")
-    said = cosim(*words, "--on", "spark", cwd=tmp_path)
+    done = cosim(*words, "--on", "spark", cwd=tmp_path)
     assert (
-        said.returncode == 2
-        and "--on spark: give ray, auto, or the address of a cluster" in said.stderr
+        done.returncode == 2
+        and "--on spark: give ray, auto, or the address of a cluster" in done.stderr
     )
-    said = cosim(*words, "--on", "ray", "--shared-renderer", cwd=tmp_path)
+    done = cosim(*words, "--on", "ray", "--shared-renderer", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "--shared-renderer needs processes of this machine" in said.stderr
+        done.returncode == 2 and "--shared-renderer needs processes of this machine" in done.stderr
     )
     with pytest.raises(UsageError, match="shared_renderer needs processes of this machine"):
         run("reactive", "straight", on="ray", shared_renderer=True, out=tmp_path / "run")
@@ -164,14 +164,14 @@ def test_what_is_no_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
-def test_without_ray_it_is_said_what_to_install(
+def test_a_missing_ray_is_named_with_its_installation(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In one line, before anything is loaded."""
+    """One line says what to install, before anything is loaded."""
     monkeypatch.setitem(sys.modules, "ray", None)
-    said = cosim("run", "reactive", "--policy", "straight", "--on", "ray", cwd=tmp_path)
+    done = cosim("run", "reactive", "--policy", "straight", "--on", "ray", cwd=tmp_path)
     assert (
-        said.returncode == 2
-        and "pip install -e '.[ray]' in the checkout" in said.stderr
+        done.returncode == 2
+        and "pip install -e '.[ray]' in the checkout" in done.stderr
         and not [*tmp_path.iterdir()]
     )

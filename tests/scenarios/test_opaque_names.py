@@ -1,5 +1,4 @@
-"""Nothing that a policy is told, and nothing that its process is called, names the scenario that it
-drives."""
+"""Neither the arguments of a policy nor its process reveal the name of its scenario."""
 
 from __future__ import annotations
 
@@ -26,9 +25,9 @@ BY = "gesturing-001"
 place."""
 
 
-def test_who_knows_the_name_solves_it_blind_and_a_run_does_not_tell_it() -> None:
-    """Told its name, as policies once were, the name reader stops before the hand; in a run, whose
-    seed is drawn, it does not: it drives on."""
+def test_a_policy_that_knows_the_name_solves_the_scenario_and_a_run_hides_it() -> None:
+    """With the name of its episode the name reader stops before the hand; in a run, which hides the
+    name, it drives on."""
     (scenario,) = (one for one in load_suite("reactive").scenarios if one.id == BY)
     policy = NameReader()
     with Episode(scenario, policy.manifest) as episode:
@@ -41,9 +40,9 @@ def test_who_knows_the_name_solves_it_blind_and_a_run_does_not_tell_it() -> None
     assert list(table["success"]) == [0.0]
 
 
-def test_counting_episodes_tells_a_policy_nothing() -> None:
-    """Of the two first of an event, gone through in the order of a seed, it takes each for the
-    other."""
+def test_counting_episodes_does_not_identify_them() -> None:
+    """When a seed reverses the order of an event's first two scenarios, the counting policy takes
+    each for the other."""
     first, second = (
         one
         for one in load_suite("reactive").scenarios
@@ -54,7 +53,7 @@ def test_counting_episodes_tells_a_policy_nothing() -> None:
     )
     taken: list[tuple[str, str]] = []
 
-    class Noting(Counter):
+    class RecordingCounter(Counter):
         def reset(self, episode_id: str, seed: int) -> None:
             super().reset(episode_id, seed)
             assert self.known is not None
@@ -62,7 +61,7 @@ def test_counting_episodes_tells_a_policy_nothing() -> None:
 
     short = [msgspec.structs.replace(one, time_limit_s=0.5) for one in (first, second)]
     suite = Suite(name="two", version="1", scenarios=tuple(short))
-    suite_run.run(suite, Noting(), options=EpisodeOptions(seed=seed))
+    suite_run.run(suite, RecordingCounter(), options=EpisodeOptions(seed=seed))
     names = {episode_id_of(seed, one).episode: one.id for one in (first, second)}
     assert (
         [names[called] for called, _ in taken]
@@ -71,12 +70,11 @@ def test_counting_episodes_tells_a_policy_nothing() -> None:
     )
 
 
-def test_nothing_that_a_policy_can_read_of_its_process_names_the_scenario(
+def test_nothing_that_a_policy_can_read_names_its_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Arguments of its calls and all that can be reached from an observation, privileged knowledge
-    too; arguments, environment, folder, files and threads of its process: no scenario, suite or
-    event in any of them."""
+    """Arguments of its calls, everything reachable from a privileged observation, and its process's
+    arguments, environment, folder, files and threads contain no scenario, suite or event."""
     monkeypatch.setenv(NOTES, str(tmp_path / "notes"))
     short: Scenario = msgspec.structs.replace(
         small_scenario(), time_limit_s=0.5, suite="quagga-suite"

@@ -1,5 +1,4 @@
-"""Scenarios of one's own in TOML files: what may stand in them, what becomes of it, and every
-refusal."""
+"""Users' scenarios in TOML files: valid fields, results, and every refusal."""
 
 from __future__ import annotations
 
@@ -35,23 +34,23 @@ def written(folder: Path, text: str) -> Path:
 
 def refusal(folder: Path, text: str) -> str:
     path = written(folder, text)
-    with pytest.raises(SpecError) as told:
+    with pytest.raises(SpecError) as refused:
         read_own(path)
-    assert str(told.value).startswith(f"{path}: ")
-    return str(told.value).removeprefix(f"{path}: ")
+    assert str(refused.value).startswith(f"{path}: ")
+    return str(refused.value).removeprefix(f"{path}: ")
 
 
-def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) -> None:
-    """Types, ranges, names and what contradicts itself: the field, what was found, what may stand
-    there."""
-    told = refusal(
+def test_all_faults_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
+    """Types, ranges, names and contradictions are reported with the field, the value and the valid
+    choices."""
+    message = refusal(
         tmp_path,
         'name = "a b"\nseed = "x"\nrobot = "tank"\nsizes = 1\n'
         '[place]\ncity = 1\nmap = "berlin-11"\n[way]\nkind = "strait"\nlenght_m = 40\n'
         '[[events]]\nkind = "fronal"\nat_m = "far"\n[[events]]\npeople = 0\n'
         '[crowd]\ngroups = 2\n[light]\nhour = 25\n[limits]\nends_at = "noon"\n',
     )
-    head, *faults = told.splitlines()
+    head, *faults = message.splitlines()
     assert head == f"{len(faults)} faults:"
     for fault in (
         "unknown field `sizes`. Valid choices: name, description, seed, seeds, robot,",
@@ -77,7 +76,7 @@ def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("[", "is no TOML: "),
         ('name = "a"\nname = "b"', "is no TOML: Cannot overwrite a value (at end"),
@@ -163,33 +162,34 @@ def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) ->
         "list-of-seeds",
     ],
 )
-def test_what_cannot_be_is_refused_with_its_remedy(tmp_path: Path, text: str, told: str) -> None:
-    """One fault of a file that is else sound."""
-    assert refusal(tmp_path, text).startswith(told)
+def test_a_single_fault_is_refused_with_its_remedy(tmp_path: Path, text: str, message: str) -> None:
+    """One fault of an otherwise valid file gives one message."""
+    assert refusal(tmp_path, text).startswith(message)
 
 
-def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
-    """Bytes, a folder, nothing, too much, brackets without end: one line each."""
+def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    """Invalid bytes, a folder, a missing file, a large file and endless brackets give one line
+    each."""
     path = tmp_path / "own.toml"
-    for data, told in (
+    for data, message in (
         (b'name = "\xff"', "is no UTF-8 text, line 1"),
         (b"#" * 1_000_001, "holds more than 1000000 bytes"),
         (b"a = " + b"[" * 100_000, "is n"),
     ):
         path.write_bytes(data)
-        with pytest.raises(SpecError, match=told):
+        with pytest.raises(SpecError, match=message):
             read_own(path)
-    for nowhere, told in (
+    for missing, message in (
         (tmp_path, "is no file"),
         (tmp_path / "b.toml", "`cosim scenario new .*b.toml` writes one"),
     ):
-        with pytest.raises(SpecError, match=told):
-            read_own(nowhere)
+        with pytest.raises(SpecError, match=message):
+            read_own(missing)
 
 
 def test_a_list_in_place_of_a_value_is_a_sweep(tmp_path: Path) -> None:
-    """Each value with each of the others, as often as there are seeds; points and fields of single
-    events as well."""
+    """Each value is combined with each other one and each seed; points and fields of single events
+    can be swept as well."""
     text = (
         f'name = "s"\nseed = 7\nseeds = 2\n{CITY}[way]\nstart = [120, 131]\ngoal = [[345, '
         f"300], [250, 240]]\n"
@@ -212,8 +212,8 @@ def test_a_list_in_place_of_a_value_is_a_sweep(tmp_path: Path) -> None:
     assert last.at == {"way.goal": [250, 240], "events[0].speed_mps": 1.5, "crowd.density": 2.5}
 
 
-def test_the_template_shows_every_field_there_is() -> None:
-    """Who reads it knows all that may stand in a file."""
+def test_the_template_shows_every_field() -> None:
+    """Every field of a scenario file is in the template, except three rare ones."""
     lines = [line.removeprefix("# ") for line in TEMPLATE.read_text().splitlines()]
     shown = {line.split(" ")[0] for line in lines}
 
@@ -231,7 +231,7 @@ def test_the_template_shows_every_field_there_is() -> None:
 
 
 def test_the_file_in_the_documents_can_be_read(tmp_path: Path) -> None:
-    """What it shows is a sweep over density, on a map's file beside it."""
+    """The documented file is a sweep over density on a map file beside it."""
     own = read_own(written(tmp_path, blocks("toml", "docs/scenarios.md")[0].text))
     assert [axis.field for axis in own.axes] == ["crowd.density"]
     assert Path(own.variants[0].own.place.file).parent == tmp_path
@@ -242,8 +242,8 @@ def on_tiny(**way: Any) -> Scenario:
 
 
 def test_the_way_between_two_points_leads_over_the_crossing() -> None:
-    """From the middle of the nearest sidewalk to that of the other, by the crossing that joins
-    them."""
+    """It leads from the middle of the nearest sidewalk to that of the other, over the crossing that
+    joins them."""
     over = on_tiny(start=(-40.0, 6.0), goal=(30.0, -7.0))
     assert over.start[:2] == (-40.0, 5.0) and over.goal == (30.0, -6.5)
     assert [(crossing.id, crossing.signalised) for crossing in over.crossings] == [(":c0", False)]
@@ -255,7 +255,7 @@ def test_the_way_between_two_points_leads_over_the_crossing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("way", "told"),
+    ("way", "message"),
     [
         (
             {"start": (-40, 30), "goal": (30, 5)},
@@ -269,21 +269,21 @@ def test_the_way_between_two_points_leads_over_the_crossing() -> None:
     ],
     ids=["far", "one-spot", "no-signals"],
 )
-def test_a_way_that_is_not_there_is_refused(way: dict[str, Any], told: str) -> None:
-    """With what is there instead."""
-    with pytest.raises(SpecError, match=told):
+def test_an_impossible_way_is_refused(way: dict[str, Any], message: str) -> None:
+    """The message says what was found at the place."""
+    with pytest.raises(SpecError, match=message):
         on_tiny(**way)
 
 
-def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
-    """The reason, and the stretches of this way that do."""
+def test_an_event_that_does_not_fit_is_refused_with_places_that_do() -> None:
+    """The message has the reason, and the stretches of the way where the event fits."""
     street = tiny_map()
     over = on_tiny(start=(-60.0, 5.0), goal=(60.0, -6.5))
 
     def at(kind: str, at_m: float | None) -> Any:
         return event_along(0, OwnEvent(kind=kind, at_m=at_m), over, street, COURIER)
 
-    for kind, at_m, told in (
+    for kind, at_m, message in (
         (
             "frontal",
             5.0,
@@ -300,7 +300,7 @@ def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
     ):
         with pytest.raises(SpecError) as error:
             at(kind, at_m)
-        assert told in str(error.value), error.value
+        assert message in str(error.value), error.value
     crossing = at("ped_crossing", None)
     frontal = at("frontal", 30.0)
     assert np.hypot(crossing.x_m, crossing.y_m) < 2.0 and crossing.half_length_m > 2.0
@@ -315,9 +315,9 @@ def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
 
 
 @pytest.mark.engine
-def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cosim: Cosim) -> None:
-    """`new`, `check`, `draw`, `run`: from nothing to a picture and a table, with latency; a name
-    that is taken is refused."""
+def test_a_new_file_can_be_checked_drawn_and_run(tmp_path: Path, cosim: Cosim) -> None:
+    """`new`, `check`, `draw` and `run` lead to pictures and a table, with latency, and an existing
+    file is not overwritten."""
     done = cosim("scenario", "new", "mine.toml", cwd=tmp_path)
     assert done.returncode == 0 and (tmp_path / "mine.toml").read_text().count('name = "mine"') == 1
     again, done = (
@@ -364,9 +364,9 @@ def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cos
 
 
 @pytest.mark.engine
-def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim: Cosim) -> None:
-    """Events, things, their room: each with its place in the file; sound files are told of all the
-    same."""
+def test_misfits_of_all_files_are_reported(tmp_path: Path, cosim: Cosim) -> None:
+    """Events and obstacles that do not fit are named with their place in the file, and valid files
+    are reported as well."""
     (tmp_path / "sound.toml").write_text(SHORT)
     (tmp_path / "odd.toml").write_text(
         SHORT + '[[events]]\nkind = "frontal"\nat_m = 2\n[[events]]\nkind = "ped_crossing"\n'
@@ -384,7 +384,7 @@ def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim
     files = ("odd.toml", "sound.toml", "blocked.toml", "narrow.toml")
     done = cosim("scenario", "check", *files, cwd=tmp_path)
     assert done.returncode == 2 and "sound.toml: 1 scenario" in done.stdout
-    for told in (
+    for message in (
         "odd.toml: events[0]: at_m 2 does not do for 'frontal'",
         "odd.toml: events[1]: 'ped_crossing' needs a crossing without signals",
         "odd.toml: obstacles.placed[0]: at_m 99 is past the goal: the way is 30.0 m long",
@@ -393,7 +393,7 @@ def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim
         "narrow.toml: its obstacles leave no gap of ",
         "blocked.toml: event 'e0': people of 'queueing' must be 2 to 5, not 9",
     ):
-        assert told in done.stderr, done.stderr
+        assert message in done.stderr, done.stderr
     drawn = cosim("scenario", "draw", "odd.toml", "-o", "odd.png", cwd=tmp_path)
     assert (
         drawn.returncode == 2
@@ -403,10 +403,8 @@ def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim
 
 
 @pytest.mark.engine
-def test_whether_a_scenario_can_be_solved_is_driven_by_the_oracle(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """`check --drive` says in what time, or where the oracle fails; then the exit code is 1."""
+def test_check_drive_solves_scenarios_with_the_oracle(tmp_path: Path, cosim: Cosim) -> None:
+    """`check --drive` gives the time of the oracle, or its failure with exit code 1."""
     near = SHORT.replace("length_m = 30", "length_m = 10")
     (tmp_path / "near.toml").write_text(near)
     (tmp_path / "hasty.toml").write_text(near + "[limits]\ntime_s = 2\n")
@@ -446,14 +444,14 @@ OTHERS: dict[str, bytes] = {
         ("packed", ".osm"),
     ],
 )
-def test_of_a_file_that_is_no_map_nothing_is_printed(
+def test_the_content_of_a_file_that_is_no_map_is_not_printed(
     tmp_path: Path, cosim: Cosim, name: str, ending: str
 ) -> None:
-    """Text, other XML, packed data: it is said that it is no map, with its path and no byte of
-    it."""
+    """Text, other XML and packed data are refused with the path of the file and none of its
+    bytes."""
     (tmp_path / f"other{ending}").write_bytes(OTHERS[name])
     own = f'name = "mine"\n[place]\nfile = "other{ending}"\n[way]\nkind = "straight"\n'
     (tmp_path / "mine.toml").write_text(own)
-    said = cosim("scenario", "check", "mine.toml", cwd=tmp_path)
-    assert said.returncode == 2 and f"place.file: {tmp_path}/other{ending}: " in said.stderr, said
-    assert "hunter2" not in said.stderr + said.stdout and "Traceback" not in said.stderr, said
+    done = cosim("scenario", "check", "mine.toml", cwd=tmp_path)
+    assert done.returncode == 2 and f"place.file: {tmp_path}/other{ending}: " in done.stderr, done
+    assert "hunter2" not in done.stderr + done.stdout and "Traceback" not in done.stderr, done

@@ -1,4 +1,5 @@
-"""How long a run takes: what is said before it starts, and what is learned from runs."""
+"""Estimates of a run's duration: the announcement before it starts, and the stored durations of
+runs."""
 
 from __future__ import annotations
 
@@ -30,15 +31,15 @@ GL = "gl: llvmpipe"
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache, on a machine of two cores."""
+    """Return an empty cache, on a machine of two cores."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(pace.os, "sched_getaffinity", lambda _: {0, 1})
     return tmp_path / "cache"
 
 
 def episodes(count: int, **changes: object) -> list[EpisodeDuration]:
-    """Episodes of `route` over 100 m in 75 s of simulated time, 6 simulated seconds a second, set
-    up in 4 s."""
+    """Return durations of `route` over 100 m in 75 s of simulated time, at 6 simulated seconds a
+    second, with a set-up of 4 s."""
     one = EpisodeDuration(
         machine=pace.machine(),
         policy="route",
@@ -54,29 +55,27 @@ def episodes(count: int, **changes: object) -> list[EpisodeDuration]:
     return [msgspec.structs.replace(one, **changes)] * count
 
 
-def of(
+def estimate_of(
     known: list[EpisodeDuration], policy: str = "route", jobs: int = 1, compared: bool = False
 ) -> Estimate:
     return estimate(long_ways()[:12], known, policy, GL, jobs, compared, cores=2)
 
 
-def test_an_estimate_holds_what_the_same_policy_took() -> None:
-    """12 episodes of 4.8 km at 0.125 s a metre and 4 s each come to 653 s: that lies inside, and
-    the span is fair."""
+def test_an_estimate_covers_the_measured_time_of_the_same_policy() -> None:
+    """12 episodes of 4.8 km at 0.125 s a metre and 4 s each take 653 s. This lies in a span of less
+    than a factor of three."""
     true_s = 12 * 4.0 + 0.125 * sum(s.route_line.length_m for s in long_ways()[:12])
-    found = of(episodes(5))
+    found = estimate_of(episodes(5))
     assert found.low_s < true_s < found.high_s and found.high_s < 3.0 * found.low_s
     assert found.basis == "measured in 5 episodes of 'route' on this machine"
 
 
-def test_without_the_same_policy_the_machines_speed_counts_and_the_policy_is_said_to_be_unknown() -> (
-    None
-):
-    """Wider than of its own episodes, and of nothing measured at all wider still; each says what it
-    rests on."""
-    own = of(episodes(5))
-    others = of(episodes(5), policy="mine:Mine")
-    nothing = of([])
+def test_an_estimate_of_an_unknown_policy_is_wider() -> None:
+    """It is wider than one of the policy's own episodes, and one without measurements is wider
+    still; each states its basis."""
+    own = estimate_of(episodes(5))
+    others = estimate_of(episodes(5), policy="mine:Mine")
+    nothing = estimate_of([])
     assert others.high_s / others.low_s > own.high_s / own.low_s
     assert nothing.high_s / nothing.low_s > others.high_s / others.low_s
     assert "simulates 6.0 s a second" in others.basis and "0.9 to 1.4 m/s" in others.basis
@@ -86,22 +85,22 @@ def test_without_the_same_policy_the_machines_speed_counts_and_the_policy_is_sai
     assert "if it stands still" in nothing.basis and "longer if it thinks long" in nothing.basis
 
 
-def test_what_was_measured_otherwise_does_not_count() -> None:
-    """Another renderer, a comparison, short episodes, fewer than three: none of them is taken for
-    the same."""
+def test_durations_under_other_conditions_do_not_count() -> None:
+    """Another renderer, a comparison, short episodes, and fewer than three episodes are not
+    used."""
     for other in (
         episodes(9, renderer="bullet-tiny"),
         episodes(9, compared=True),
         episodes(2),
     ):
-        assert "nothing is measured" in of(other).basis
-    assert "simulates" in of(episodes(9, short=True)).basis
+        assert "nothing is measured" in estimate_of(other).basis
+    assert "simulates" in estimate_of(episodes(9, short=True)).basis
 
 
-def test_two_processes_take_about_half_and_ten_on_two_cores_no_less() -> None:
-    """The span of two holds half of the time; cores are the limit, and so is the longest
-    episode."""
-    one, two, ten = (of(episodes(5), jobs=jobs) for jobs in (1, 2, 10))
+def test_processes_divide_the_time_up_to_the_number_of_cores() -> None:
+    """Two processes take about half of the time, ten on two cores take as long as two, and the
+    longest episode is a lower limit."""
+    one, two, ten = (estimate_of(episodes(5), jobs=jobs) for jobs in (1, 2, 10))
     assert two.low_s < 0.55 * one.low_s < 0.65 * two.high_s and ten == two
     assert makespan([10.0, 1.0, 1.0], 2) == 10.0 and makespan([1.0, 1.0, 10.0], 2) == 11.0
     assert makespan([], 2) == 0.0
@@ -109,26 +108,24 @@ def test_two_processes_take_about_half_and_ten_on_two_cores_no_less() -> None:
 
 @pytest.mark.parametrize("known", [[], episodes(5)], ids=["unknown", "measured"])
 @pytest.mark.parametrize("pace_x", [1.0, 2.0])
-def test_what_is_held_to_real_time_takes_that_time(
-    known: list[EpisodeDuration], pace_x: float
-) -> None:
-    """At 0.75 s a metre 12 episodes of 4.8 km take an hour of real time, whatever the machine can
-    do.
-
-    Two processes take half of that, and four on two cores a quarter, as they wait."""
+def test_a_paced_run_takes_its_real_time(known: list[EpisodeDuration], pace_x: float) -> None:
+    """At 0.75 s a metre 12 episodes of 4.8 km take an hour of real time on any machine. Two
+    processes take half of that, and four on two cores a quarter."""
     for jobs in (1, 2, 4):
         true_s = makespan([0.75 * s.route_line.length_m / pace_x for s in long_ways()[:12]], jobs)
         found = pace.paced_estimate(
-            of(known, jobs=jobs), long_ways()[:12], known, "route", jobs, pace_x
+            estimate_of(known, jobs=jobs), long_ways()[:12], known, "route", jobs, pace_x
         )
         assert found.low_s < 1.1 * true_s and 0.9 * true_s < found.high_s < 3.0 * true_s
         assert f"held to {pace_x:g} x real time" in found.basis
-    assert pace.paced_estimate(of(known), long_ways()[:12], known, "route", 1, 100.0) == of(known)
+    assert pace.paced_estimate(
+        estimate_of(known), long_ways()[:12], known, "route", 1, 100.0
+    ) == estimate_of(known)
 
 
-def test_the_line_says_episodes_way_limit_and_time() -> None:
-    """One line: 12 episodes of 4.8 km, 6 h 40 min simulated at most, with one process and with as
-    many as cores."""
+def test_the_announcement_has_episodes_length_limit_and_time() -> None:
+    """One line says: 12 episodes of 4.8 km, 6 h 40 min simulated at most, and the time with one
+    process and with one a core."""
     line = announcement(long_ways()[:12], "route", GL, 1, False)
     assert line.startswith(
         "12 episodes, 4.8 km of route, at most 6 h 40 min of simulated time. About "
@@ -138,8 +135,8 @@ def test_the_line_says_episodes_way_limit_and_time() -> None:
     assert announcement(long_ways()[:1], "route", GL, 1, False).startswith("1 episode, 482 m")
 
 
-def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
-    """The record of an episode that took 20 s, 4 of them to set up."""
+def save_finished_episode(folder: RunFolder, scenario: Scenario, status: str) -> None:
+    """Save the record of an episode that took 20 s, 4 of them to set up."""
     record = msgspec.structs.replace(
         record_of(scenario, Manifest("route"), renderer=GL),
         status=status,
@@ -156,16 +153,18 @@ def run_of(path: Path) -> RunFolder:
     return RunFolder.create(path, spec_of(suite, "route", versions=versions(), renderer=GL), suite)
 
 
-def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path) -> None:
-    """What was finished counts, what crashed or never ran does not; the next estimate rests on
-    it."""
+def test_durations_of_an_interrupted_run_are_stored(tmp_path: Path, cache: Path) -> None:
+    """Finished episodes count, crashed and unstarted ones do not, and the next estimate uses
+    them."""
     with (
         run_of(tmp_path / "run") as held,
         pytest.raises(KeyboardInterrupt),
         recording_durations(held, long_ways()[:6], 2),
     ):
         for scenario in long_ways()[:4]:
-            finished(held, scenario, "crashed" if scenario is long_ways()[:12][0] else "done")
+            save_finished_episode(
+                held, scenario, "crashed" if scenario is long_ways()[:12][0] else "done"
+            )
         raise KeyboardInterrupt
     known = load_durations()
     assert [(m.route_m, m.jobs, m.work_s, m.setup_s, m.simulated_s) for m in known] == [
@@ -176,25 +175,25 @@ def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path
     )
 
 
-def test_a_run_that_is_held_to_real_time_is_not_remembered(tmp_path: Path, cache: Path) -> None:
-    """It took as long as it was to take, and the next estimate does not rest on that."""
+def test_durations_of_a_paced_run_are_not_stored(tmp_path: Path, cache: Path) -> None:
+    """Its durations say nothing of the machine's speed."""
     with run_of(tmp_path / "run") as held:
-        finished(held, long_ways()[:12][0], "done")
+        save_finished_episode(held, long_ways()[:12][0], "done")
         with recording_durations(held, long_ways()[:12], 1, 1.0):
             pass
     assert load_durations() == []
 
 
-def test_what_is_remembered_stays_small_and_survives_damage(tmp_path: Path, cache: Path) -> None:
-    """Lines of other machines and of nonsense are passed over, old ones go; a cache that cannot be
-    written is none."""
+def test_stored_durations_are_bounded_and_survive_damage(tmp_path: Path, cache: Path) -> None:
+    """Lines of other machines and damaged lines are ignored, old ones are dropped, and a cache that
+    cannot be written is ignored."""
     cache.mkdir()
     path = cache / pace.FILE
     line = msgspec.json.encode(episodes(1, machine="another")[0])
     path.write_bytes(b"nonsense\n\xff\n" + (line + b"\n") * (2 * pace.EPISODES_KEPT))
     assert load_durations() == []
     with run_of(tmp_path / "run") as held:
-        finished(held, long_ways()[:12][0], "done")
+        save_finished_episode(held, long_ways()[:12][0], "done")
         with recording_durations(held, long_ways()[:12], 1):
             pass
         assert (

@@ -1,4 +1,4 @@
-"""Routes drawn on maps leave people and the robot room to pass one another."""
+"""Routes drawn on maps leave people and the robot room to pass each other."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from tests.scenarios.test_scenarios import cross_map
 
 
 def test_a_drawn_crowd_fits_beside_the_robot() -> None:
-    """The narrower the sidewalks, the fewer people walk; where nobody can pass the robot nobody
-    walks."""
+    """Fewer people walk on narrower sidewalks, and none where nobody can pass the robot."""
     for width_m, density, groups in ((3.2, 22.0, 0.3), (2.0, 15.0, 0.0), (1.5, 0.0, 0.0)):
         street_map = cross_map(width_m)
         route = Polyline([(-30, 0), (30, 0)])
@@ -40,15 +39,15 @@ def test_a_drawn_crowd_fits_beside_the_robot() -> None:
 
 
 def test_people_need_a_stripe_beside_the_robot() -> None:
-    """The courier covers two stripes of 0.64 m with its gaps, the narrower scout one."""
+    """The courier covers two stripes of 0.64 m with its gaps, and the narrower scout covers one."""
     assert passing_width_m(COURIER) == pytest.approx(3 * 0.64)
     assert passing_width_m(ROBOTS["scout"]) == pytest.approx(2 * 0.64)
 
 
 @pytest.mark.engine
 def test_routes_on_maps_keep_to_wide_sidewalks() -> None:
-    """Of a net whose sidewalks are mostly narrower than 1.9 m routes use the wider ones, and people
-    walk there."""
+    """On a net with mostly sidewalks below 1.9 m, routes use the wider ones, and people walk
+    there."""
     suite = suite_on_map("long-horizon", "sumo-fokr-bs-demo", 0, 3)
     _, street_map = place(suite.scenarios[0].place)
     for scenario in suite.scenarios:
@@ -63,7 +62,7 @@ def test_routes_on_maps_keep_to_wide_sidewalks() -> None:
 
 @pytest.mark.engine
 def test_obstacles_on_maps_leave_room_for_a_person_beside_the_robot() -> None:
-    """Obstacles drawn for maps leave such a gap; those of the suites leave the robot's alone."""
+    """Obstacles drawn for maps leave this gap; those of the suites only leave the robot's."""
     where = resolve_place("sumo-fkk-in", 0.0)
     _, street_map = place(where)
     suites, maps = (

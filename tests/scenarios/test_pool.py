@@ -1,5 +1,5 @@
-"""Environment processes: those that cannot begin, die or say nothing, and what is told of them,
-once."""
+"""Environment processes that cannot start, die or do not respond, and what is reported about
+them."""
 
 from __future__ import annotations
 
@@ -87,13 +87,17 @@ CANNOT_BEGIN = {
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Path:
-    """A folder with the policies."""
+def policy_folder(tmp_path: Path) -> Path:
+    """Return a folder with the policies."""
     (tmp_path / "mine.py").write_text(MODULES["mine"])
     return tmp_path
 
 
-def run(cosim: Cosim, desk: Path, name: str, suite: str = "reactive") -> tuple[int, str]:
+def run_policy(
+    cosim: Cosim, policy_folder: Path, name: str, suite: str = "reactive"
+) -> tuple[int, str]:
+    """Run a policy that cannot start, and return exit code and error output; no episode may have a
+    record."""
     patience_s = "1" if name == "Hangs" else str(PATIENCE_S)
     words = (
         "--policy",
@@ -105,43 +109,48 @@ def run(cosim: Cosim, desk: Path, name: str, suite: str = "reactive") -> tuple[i
         "--out",
         "run",
     )
-    said = cosim("run", suite, *words, cwd=desk)
-    assert "Traceback" not in said.stderr and not list(desk.glob("run/episodes/*/record.json"))
-    assert "crashed" not in said.stdout + said.stderr
-    return said.returncode, said.stderr
+    done = cosim("run", suite, *words, cwd=policy_folder)
+    assert "Traceback" not in done.stderr and not list(
+        policy_folder.glob("run/episodes/*/record.json")
+    )
+    assert "crashed" not in done.stdout + done.stderr
+    return done.returncode, done.stderr
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", CANNOT_BEGIN)
 def test_a_policy_that_a_process_cannot_load_ends_the_run(
-    cosim: Cosim, desk: Path, name: str
+    cosim: Cosim, policy_folder: Path, name: str
 ) -> None:
-    """It was loaded when the run began, and is not in its processes: wrong use, once, and no
-    episode has crashed."""
-    code, said = run(cosim, desk, name)
-    assert (code, said.count("error:")) == (2, 1) and CANNOT_BEGIN[name][1] in said
+    """A policy that loads at the start of the run but not in its processes is reported once, with
+    exit code 2 and without crashed episodes."""
+    code, errors = run_policy(cosim, policy_folder, name)
+    assert (code, errors.count("error:")) == (2, 1) and CANNOT_BEGIN[name][1] in errors
 
 
 @pytest.mark.engine
-def test_an_engine_that_cannot_be_imported_ends_the_run(fresh_cosim: Cosim, desk: Path) -> None:
-    """What a process lacks is told once, with the remedy."""
-    (desk / "libsumo.py").write_text(MODULES["libsumo"])
+def test_an_engine_that_cannot_be_imported_ends_the_run(
+    fresh_cosim: Cosim, policy_folder: Path
+) -> None:
+    """The missing library is reported once, with exit code 3."""
+    (policy_folder / "libsumo.py").write_text(MODULES["libsumo"])
     write_suite(
-        Suite(name="walked", version="1", scenarios=(small_scenario(),)), desk / "walked.json"
+        Suite(name="walked", version="1", scenarios=(small_scenario(),)),
+        policy_folder / "walked.json",
     )
     path = os.pathsep.join(
-        [str(desk), os.environ.get("PYTHONPATH", str(Path(__file__).parents[2]))]
+        [str(policy_folder), os.environ.get("PYTHONPATH", str(Path(__file__).parents[2]))]
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", path)
-        code, said = run(fresh_cosim, desk, "Mine", "walked.json")
-    assert (code, said.count("error:")) == (3, 1)
-    assert "SUMO cannot be loaded: libX11.so.6: cannot open shared object" in said
+        code, errors = run_policy(fresh_cosim, policy_folder, "Mine", "walked.json")
+    assert (code, errors.count("error:")) == (3, 1)
+    assert "SUMO cannot be loaded: libX11.so.6: cannot open shared object" in errors
 
 
 @pytest.mark.parametrize("printed", [0, 10, 100, 101, 150, 200, 201, 1000])
 def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> None:
-    """Short ones are whole; of longer ones the first and the last 100 bytes or more are kept, in
+    """Short logs are complete; longer ones have the first and the last 100 bytes or more, in
     order."""
     text = bytes(i % 251 for i in range(printed))
     with (tmp_path / "log").open("wb") as file:
@@ -149,20 +158,20 @@ def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> 
         for start in range(0, printed, 30):
             log.write(text[start : start + 30])
         log.close()
-    kept = (tmp_path / "log").read_bytes()
+    stored = (tmp_path / "log").read_bytes()
     if printed <= 200:
-        assert kept == text
+        assert stored == text
         return
-    first, gap, last = kept.partition(b" bytes were printed here and left out]\n")
+    first, gap, last = stored.partition(b" bytes were printed here and left out]\n")
     first, _, left_out = first.rpartition(b"\n[")
-    assert text.startswith(first or kept) and text.endswith(last) and len(kept) < 300
+    assert text.startswith(first or stored) and text.endswith(last) and len(stored) < 300
     assert not gap or (len(first), len(first) + int(left_out) + len(last)) == (100, printed)
     assert not gap or 100 <= len(last) < 130
 
 
 @pytest.mark.parametrize("ended", ["worker", "supervisor"])
 def test_a_nested_supervisor_stores_the_end_of_its_log(tmp_path: Path, ended: str) -> None:
-    """Whether the worker that started it is killed or the run ends, the last output is stored."""
+    """The last output is stored whether the worker that started it is killed or the run ends."""
     log = tmp_path / "log"
     process = ChildProcess(log, "tests.support.nested:starts_another", "worker")
     worker = int(process.wire.receive(PATIENCE_S))
@@ -191,21 +200,21 @@ def test_a_nested_supervisor_stores_the_end_of_its_log(tmp_path: Path, ended: st
 def test_a_first_answer_may_take_longer(
     doing: PolicyCall, answer_s: float, start_s: float, overdue: bool
 ) -> None:
-    """The first answer has its own timeout, and none runs before a query."""
-    asked = PendingCallMemory.new()
-    assert asked.pending_call is None
-    asked.starts(doing, 64)
+    """The first answer has its own timeout, and no timeout runs before a query."""
+    memory = PendingCallMemory.new()
+    assert memory.pending_call is None
+    memory.starts(doing, 64)
     time.sleep(0.001)
-    pending_call = asked.pending_call
+    pending_call = memory.pending_call
     assert pending_call is not None and pending_call.overdue(Patience(answer_s, start_s)) is overdue
     assert pending_call.when == ("act at 3.20 s" if "act" in doing else doing)
-    asked.stops()
-    assert asked.pending_call is None
-    asked.close()
+    memory.stops()
+    assert memory.pending_call is None
+    memory.close()
 
 
-class Fake:
-    """A process that says what a test has prepared, and then nothing; or it ends."""
+class FakeProcess:
+    """A process that sends prepared messages, and then stays silent or ends."""
 
     log = "worker-0.log"
     kind = "environment"
@@ -230,7 +239,7 @@ class Fake:
         self._ends = ends
 
     def give(self, job: Job) -> None:
-        """It does not listen."""
+        """Ignores the job."""
 
     def listen(self, handle: MessageHandler) -> bool:
         messages = self._messages
@@ -240,10 +249,10 @@ class Fake:
         return not self._ends
 
     def hang_up(self) -> None:
-        """It does not mind."""
+        """Does nothing."""
 
     def wake(self) -> None:
-        """It does not sleep."""
+        """Does nothing."""
 
     def kill(self, *, wait: bool = True) -> None:
         self.killed = True
@@ -252,10 +261,10 @@ class Fake:
         return "the environment process ended with exit code 7"
 
 
-class Prepared:
-    """A transport to one slot, for processes that a test has made."""
+class FakeTransport:
+    """A transport to one slot with prepared processes."""
 
-    def __init__(self, *fakes: Fake) -> None:
+    def __init__(self, *fakes: FakeProcess) -> None:
         self.waiting = iter(fakes)
 
     def room(self, busy: int) -> int:
@@ -265,7 +274,7 @@ class Prepared:
         return ()
 
     def start(self, hello: Hello) -> EnvironmentSlot:
-        def start(hello: Hello) -> Fake:
+        def start(hello: Hello) -> FakeProcess:
             fake = next(self.waiting)
             fake.repeats = hello.repeat
             return fake
@@ -273,7 +282,7 @@ class Prepared:
         return EnvironmentSlot(start, hello)
 
     def wait(self, timeout_s: float) -> None:
-        """They have said everything."""
+        """Returns at once."""
 
 
 SCENARIO = Scenario(
@@ -287,23 +296,23 @@ SCENARIO = Scenario(
 )
 
 
-def pooled(
-    folder: Path, *fakes: Fake, renderer: SharedRenderer | None = None, **named: float
+def record_by(
+    folder: Path, *fakes: FakeProcess, renderer: SharedRenderer | None = None, **named: float
 ) -> Record:
-    """The record of one scenario, run by these workers, one after the other."""
-    (record,) = all_pooled(folder, (SCENARIO,), *fakes, renderer=renderer, **named)
+    """Return the record of one scenario, run by these workers one after the other."""
+    (record,) = records_by(folder, (SCENARIO,), *fakes, renderer=renderer, **named)
     return record
 
 
-def all_pooled(
+def records_by(
     folder: Path,
     scenarios: tuple[Scenario, ...],
-    *fakes: Fake,
+    *fakes: FakeProcess,
     renderer: SharedRenderer | None = None,
     **named: float,
 ) -> list[Record]:
-    """The same of several scenarios."""
-    transport = Prepared(*fakes)
+    """Return the records of several scenarios, run by these workers one after the other."""
+    transport = FakeTransport(*fakes)
     suite = Suite(name="s", version="1", scenarios=scenarios)
     driver = load_policy("stop")
     spec = spec_of(suite, "stop", seed=seed_in_order(scenarios))
@@ -319,12 +328,12 @@ def all_pooled(
 def test_an_engine_that_hangs_is_tried_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A process that says nothing, while its policy has nothing to answer, is killed; the second
-    time it is a crash."""
+    """A process that is silent while its policy has nothing to answer is killed, and the second
+    time is a crash."""
     monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
     monkeypatch.setattr(environment_slot, "TICK_S", 0.0)
-    fakes = (Fake(Ready()), Fake(Ready()))
-    record = pooled(tmp_path, *fakes)
+    fakes = (FakeProcess(Ready()), FakeProcess(Ready()))
+    record = record_by(tmp_path, *fakes)
     assert (
         record.reason.startswith("the environment process showed no sign of life, 2 times")
         and record.ticks == 0
@@ -333,39 +342,44 @@ def test_an_engine_that_hangs_is_tried_again(
 
 
 def test_a_policy_that_hangs_is_not_tried_again(tmp_path: Path) -> None:
-    """It is told once, with the policy, the time, and where."""
-    record = pooled(tmp_path, Fake(Ready(), asks="act"), answer_s=0.0)
+    """The reason names the policy, the timeout, and the call."""
+    record = record_by(tmp_path, FakeProcess(Ready(), asks="act"), answer_s=0.0)
     assert record.reason == "policy 'stop' gave no answer for 0 s in act at 3.20 s of s-0"
 
 
-def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """While a policy has time left to answer, its process may say nothing for as long as it
-    likes."""
+def test_a_process_may_be_silent_while_its_policy_answers(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Silence ends the process only after the timeout of the policy."""
     monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
     monkeypatch.setattr(environment_slot, "TICK_S", 0.0)
-    slow = Fake(Ready(), asks="act")
+    slow = FakeProcess(Ready(), asks="act")
     began = time.monotonic()
-    record = pooled(tmp_path, slow, answer_s=0.2)
+    record = record_by(tmp_path, slow, answer_s=0.2)
     assert time.monotonic() - began > 0.2 and "gave no answer for 0.2 s" in record.reason
 
 
-@pytest.mark.parametrize("came", ["half", "another"])
-def test_a_damaged_record_is_a_crash(tmp_path: Path, came: str) -> None:
-    """A worker that reports an episode as done with half a record, or another one's, has not
+@pytest.mark.parametrize("damage", ["half", "another"])
+def test_a_damaged_record_is_a_crash(tmp_path: Path, damage: str) -> None:
+    """A worker that reports an episode as done with half a record, or another episode's, has not
     finished it."""
     other = msgspec.structs.replace(SCENARIO, id="s-1")
-    whole = record_of(other, load_policy("stop").manifest).encoded()
-    done = Done("s-0", "done", whole[: len(whole) // 2] if came == "half" else whole)
-    record = pooled(tmp_path, Fake(Ready(), done))
+    record_bytes = record_of(other, load_policy("stop").manifest).encoded()
+    done = Done(
+        "s-0", "done", record_bytes[: len(record_bytes) // 2] if damage == "half" else record_bytes
+    )
+    record = record_by(tmp_path, FakeProcess(Ready(), done))
     assert record.status == "crashed" and record.reason == "its record was damaged when it arrived"
 
 
-def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
-    """A worker needs no folder: the run's own process writes the bytes, and a frame."""
+def test_received_records_logs_and_frames_are_written_unchanged(tmp_path: Path) -> None:
+    """A worker needs no folder: the run's own process writes the bytes of the record, the log and a
+    frame."""
     data = record_of(SCENARIO, load_policy("stop").manifest).encoded()
     log = os.urandom(3_000_000)
-    record = pooled(
-        tmp_path, Fake(Ready(), FrameDrawn("s-0", 5, b"png"), Done("s-0", "crashed", data, log))
+    record = record_by(
+        tmp_path,
+        FakeProcess(Ready(), FrameDrawn("s-0", 5, b"png"), Done("s-0", "crashed", data, log)),
     )
     folder = tmp_path / "run" / "episodes" / "s-0"
     assert (folder / "trajectory.npz").read_bytes() == log and (
@@ -380,16 +394,16 @@ def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
     [(True, "invalid"), (False, "crashed")],
     ids=["a fault of an engine", "anything else"],
 )
-def test_who_ends_its_process_gains_nothing_and_who_loses_it_to_an_engine_nothing_either(
+def test_an_ended_process_is_invalid_only_after_a_fault_of_an_engine(
     tmp_path: Path, in_engine: bool, status: str
 ) -> None:
-    """Twice lost to a fault of compiled code while nothing was asked of the policy: the simulator
-    owes the episode. However else a process ends, its policy may have ended it: that has failed."""
+    """Two faults of compiled code outside of policy calls make the episode invalid; any other end
+    of a process is a crash."""
     dies = [
-        Fake(Ready(), EpisodeProgress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine)
+        FakeProcess(Ready(), EpisodeProgress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine)
         for _ in range(2)
     ]
-    (record,) = all_pooled(tmp_path, (SCENARIO,), *dies)
+    (record,) = records_by(tmp_path, (SCENARIO,), *dies)
     assert record.status == status and record.reason.startswith(
         "the environment process ended with exit code 7, 2"
     )
@@ -425,22 +439,22 @@ DIED = "the environment process ended with exit code 7, 2 times: the"
         "killed-there-twice",
     ],
 )
-def test_a_replay_without_the_policy_finds_who_ended_a_process(
+def test_a_replay_without_the_policy_decides_who_ended_a_process(
     tmp_path: Path, replays: list[tuple[int, str]], status: str, reason: str, in_engine: bool
 ) -> None:
-    """After the last attempt its commands are simulated again: dead at the same tick is the
-    simulator's fault; alive is the policy's, and the record keeps what was driven. A replay that
-    was killed says nothing until a second one dies there, too."""
+    """The commands of the last attempt are simulated again: death at the same tick is the
+    simulator's fault, survival the policy's. A killed replay counts only if a second one dies
+    there, too."""
     driven = Driven(7, False, COMMANDS)
     record = record_of(SCENARIO, load_policy("stop").manifest)
     again = [
-        Fake(ends=True, in_engine=end == "fault", driven=Driven(ticks))
+        FakeProcess(ends=True, in_engine=end == "fault", driven=Driven(ticks))
         if end
-        else Fake(Repeated("s-0", msgspec.structs.replace(record, ticks=ticks).encoded()))
+        else FakeProcess(Repeated("s-0", msgspec.structs.replace(record, ticks=ticks).encoded()))
         for ticks, end in replays
     ]
     dies = [
-        Fake(
+        FakeProcess(
             Ready(),
             EpisodeProgress("s-0", 1.0, 1.0, 0),
             ends=True,
@@ -449,7 +463,7 @@ def test_a_replay_without_the_policy_finds_who_ended_a_process(
         )
         for _ in range(2)
     ]
-    found = pooled(tmp_path, *dies, *again)
+    found = record_by(tmp_path, *dies, *again)
     assert found.status == status and found.reason.startswith(reason), found.reason
     assert [fake.repeats for fake in dies] == [None, None]
     assert all(fake.repeats.commands == COMMANDS for fake in again if fake.repeats is not None)
@@ -465,36 +479,35 @@ def test_a_replay_without_the_policy_finds_who_ended_a_process(
 def test_an_error_that_the_policy_may_have_caused_is_replayed(
     tmp_path: Path, error: str, ticks: int, status: str
 ) -> None:
-    """An engine error that a process reports is the simulator's only if it comes again without the
-    policy."""
+    """A reported engine error is the simulator's only if it occurs again without the policy."""
     failed = msgspec.structs.replace(
         record_of(SCENARIO, load_policy("stop").manifest), status="invalid", reason="gone"
     ).encoded()
     done = Done("s-0", "invalid", failed, again=True)
-    replay = Fake(Repeated("s-0", failed, error), driven=Driven(ticks))
-    twice = Again(Ready(), done, done)
+    replay = FakeProcess(Repeated("s-0", failed, error), driven=Driven(ticks))
+    twice = OneMessageAtATime(Ready(), done, done)
     twice.driven = Driven(7, False, COMMANDS)
-    record = pooled(tmp_path, twice, replay)
+    record = record_by(tmp_path, twice, replay)
     assert record.status == status and record.reason.startswith("gone, 2 times: the"), record.reason
 
 
 def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
-    """One error is forgotten; after the second the episode is invalid, with its reason."""
+    """One error is ignored; after the second the episode is invalid, with its reason."""
     failed = msgspec.structs.replace(
         record_of(SCENARIO, load_policy("stop").manifest), status="invalid", reason="gone"
     )
     fine = Done("s-0", "done", msgspec.structs.replace(failed, status="done", reason="").encoded())
-    once = Again(Ready(), Done("s-0", "invalid", failed.encoded(), again=True), fine)
-    assert all_pooled(tmp_path / "once", (SCENARIO,), once)[0].status == "done"
-    twice = Again(Ready(), *[Done("s-0", "invalid", failed.encoded(), again=True)] * 2)
-    (record,) = all_pooled(tmp_path / "twice", (SCENARIO,), twice)
+    once = OneMessageAtATime(Ready(), Done("s-0", "invalid", failed.encoded(), again=True), fine)
+    assert records_by(tmp_path / "once", (SCENARIO,), once)[0].status == "done"
+    twice = OneMessageAtATime(Ready(), *[Done("s-0", "invalid", failed.encoded(), again=True)] * 2)
+    (record,) = records_by(tmp_path / "twice", (SCENARIO,), twice)
     assert (
         record.status == "invalid" and record.reason == "gone, 2 times; see logs/ in the run folder"
     )
 
 
-class DiesIdle(Fake):
-    """It ends once it has said everything."""
+class DiesWhenDone(FakeProcess):
+    """A process that ends after its last message."""
 
     def listen(self, handle: MessageHandler) -> bool:
         left = bool(self._messages)
@@ -502,8 +515,8 @@ class DiesIdle(Fake):
         return left
 
 
-def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_path: Path) -> None:
-    """It was handed one before its end was known, and began nothing: the episode has both of its
+def test_a_process_that_died_between_episodes_costs_no_attempt(tmp_path: Path) -> None:
+    """An episode that was given to a process just before its end was noticed has both of its
     attempts left."""
     manifest = load_policy("stop").manifest
     second = msgspec.structs.replace(SCENARIO, id="s-1")
@@ -515,14 +528,18 @@ def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_p
         )
         for one in (SCENARIO, second)
     )
-    fakes = (DiesIdle(Ready(), done), Fake(Ready(), ends=True), Fake(Ready(), again))
-    assert [one.status for one in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == [
+    fakes = (
+        DiesWhenDone(Ready(), done),
+        FakeProcess(Ready(), ends=True),
+        FakeProcess(Ready(), again),
+    )
+    assert [one.status for one in records_by(tmp_path, (SCENARIO, second), *fakes)] == [
         "invalid",
         "invalid",
     ]
 
 
-def test_an_episode_finished_before_its_process_died_is_kept(tmp_path: Path) -> None:
+def test_an_episode_finished_before_its_process_died_counts(tmp_path: Path) -> None:
     """A process that dies after sending its record has finished the episode; one that dies before
     has not, and the episode is run again."""
     second = msgspec.structs.replace(SCENARIO, id="s-1")
@@ -537,41 +554,41 @@ def test_an_episode_finished_before_its_process_died_is_kept(tmp_path: Path) -> 
         for one in (SCENARIO, second)
     )
     fakes = (
-        Fake(Ready(), first_done, ends=True),
-        Fake(Ready(), ends=True),
-        Fake(Ready(), second_done),
+        FakeProcess(Ready(), first_done, ends=True),
+        FakeProcess(Ready(), ends=True),
+        FakeProcess(Ready(), second_done),
     )
-    assert [record.ticks for record in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == [9, 9]
+    assert [record.ticks for record in records_by(tmp_path, (SCENARIO, second), *fakes)] == [9, 9]
 
 
-class Ended(SharedRenderer):
-    """A renderer whose end a test has prepared; None: it goes on."""
+class EndedRenderer(SharedRenderer):
+    """A renderer with a prepared end; None: it continues."""
 
     def __init__(self, end: RendererEnd | None) -> None:
         self.at = RendererAddress(address="nowhere", asks=True)
         self.end = end
 
     def check(self) -> None:
-        """It has ended already."""
+        """Does nothing."""
 
     def end_of(self, number: int) -> RendererEnd | None:
         return self.end
 
     def episode_ended(self) -> None:
-        """It does not count."""
+        """Does nothing."""
 
 
 HUNG = RendererEnd("the renderer process was ended", 60.0)
-DIED = RendererEnd("the renderer process ended with exit code 7")
+RENDERER_DIED = RendererEnd("the renderer process ended with exit code 7")
 
 
 @pytest.mark.parametrize(
-    ("end", "asked", "lost", "reason"),
+    ("end", "pending_call", "lost", "reason"),
     [
-        (DIED, "", 5, ""),
-        (DIED, "act at 3.20 s", 1, ""),
+        (RENDERER_DIED, "", 5, ""),
+        (RENDERER_DIED, "act at 3.20 s", 1, ""),
         (
-            DIED,
+            RENDERER_DIED,
             "act at 3.20 s",
             2,
             "the renderer process ended with exit code 7, 2 times; see logs/ in the run folder",
@@ -595,25 +612,25 @@ DIED = RendererEnd("the renderer process ended with exit code 7")
         "connection",
     ],
 )
-def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
-    tmp_path: Path, end: RendererEnd | None, asked: str, lost: int, reason: str
+def test_a_renderer_that_died_for_another_episode_costs_no_attempt(
+    tmp_path: Path, end: RendererEnd | None, pending_call: str, lost: int, reason: str
 ) -> None:
-    """It is run again as often as that happens; a policy that takes the renderer down when it is
-    asked for the episode has used up an attempt of it, and one that does not answer all of them."""
+    """The episode is run again each time. A policy that kills the renderer in a call for the
+    episode costs an attempt, and one that hangs costs all of them."""
     data = msgspec.structs.replace(
         record_of(SCENARIO, load_policy("stop").manifest), status="invalid"
     ).encoded()
-    losses = [LostRenderer("s-0", 1, asked)] * lost
+    losses = [LostRenderer("s-0", 1, pending_call)] * lost
     over = () if reason else (Done("s-0", "done", data),)
-    fakes = Again(Ready(), *losses, *over)
-    record = pooled(tmp_path, fakes, renderer=Ended(end))
+    fakes = OneMessageAtATime(Ready(), *losses, *over)
+    record = record_by(tmp_path, fakes, renderer=EndedRenderer(end))
     assert record.status == ("crashed" if reason else "invalid") and record.reason.startswith(
         reason
     )
 
 
-class Again(Fake):
-    """It says one thing after another, one for each time that it is listened to."""
+class OneMessageAtATime(FakeProcess):
+    """A process that sends one message each time it is polled."""
 
     def listen(self, handle: MessageHandler) -> bool:
         if self._messages:
@@ -622,37 +639,37 @@ class Again(Fake):
         return True
 
 
-def test_processes_that_never_come_up_end_the_run(tmp_path: Path) -> None:
-    """Twice in a row: the machine's fault, told with the log."""
+def test_processes_that_never_start_end_the_run(tmp_path: Path) -> None:
+    """Two processes in a row that end before they are ready are reported as the machine's fault,
+    with the log."""
     with pytest.raises(
         MachineError,
         match=r"ended with exit code 7 before it was ready, 2 times: see worker-0\.log",
     ):
-        pooled(tmp_path, Fake(ends=True), Fake(ends=True))
+        record_by(tmp_path, FakeProcess(ends=True), FakeProcess(ends=True))
 
 
 def test_a_job_of_any_length_reaches_a_worker_that_listens_late() -> None:
-    """More than a socket holds is posted without waiting, and arrives whole, in order, as it is
-    taken."""
+    """More than a socket buffers is posted without waiting, and arrives complete and in order."""
     ours, theirs = socket.socketpair()
     run = MessageSocket(ours)
     worker = MessageSocket(theirs)
     jobs = [os.urandom(3_000_000), b"the next"]
     for job in jobs:
         run.post(job)
-    heard: list[bytes] = []
-    while len(heard) < len(jobs):
-        heard += worker.received()
+    received: list[bytes] = []
+    while len(received) < len(jobs):
+        received += worker.received()
         run.flush()
-    assert heard == jobs
+    assert received == jobs
     worker.close()
     with pytest.raises(OSError):
         run.post(jobs[0])
     run.close()
 
 
-class Notes(Fake):
-    """It runs whatever it is given, at once, and notes it."""
+class RecordingProcess(FakeProcess):
+    """A process that finishes each job at once and records it."""
 
     def __init__(self) -> None:
         super().__init__(Ready())
@@ -664,9 +681,9 @@ class Notes(Fake):
         self._messages = (*self._messages, Done(job.scenario.id, "crashed", done.encoded()))
 
 
-def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_path: Path) -> None:
-    """A run goes through its scenarios in the order of the names that its policy is told: another
-    one for each seed, always the same for one. Every job carries the run's seed."""
+def test_the_order_of_episodes_depends_on_the_seed_alone(tmp_path: Path) -> None:
+    """A run takes its scenarios in the order of their episode names: each seed has one order, and
+    every job carries the run's seed."""
     suite = Suite(
         name="s",
         version="1",
@@ -675,11 +692,11 @@ def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_pat
     orders = {}
     for seed in (1, 2, 1):
         folder = tmp_path / f"{seed}-{len(orders)}"
-        notes = Notes()
+        notes = RecordingProcess()
         spec = spec_of(suite, "stop", seed=seed)
         hello = Hello("stop", load_policy("stop").manifest, "")
         with RunFolder.create(folder, spec, suite) as held:
-            pool.run_all(held, suite.scenarios, hello, Prepared(notes), handle=lambda _: None)
+            pool.run_all(held, suite.scenarios, hello, FakeTransport(notes), handle=lambda _: None)
         assert {job.setup.seed for job in notes.given} == {seed}
         order = [job.scenario.id for job in notes.given]
         assert orders.setdefault(seed, order) == order

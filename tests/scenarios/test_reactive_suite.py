@@ -44,8 +44,8 @@ replace = msgspec.structs.replace
 
 
 @cache
-def drawn(kind: str, seed: int = 0) -> Scenario:
-    """A scenario of a kind with the wanted length, position and sides."""
+def reactive_scenario(kind: str, seed: int = 0) -> Scenario:
+    """Return a scenario of a kind with the wanted length, position and sides."""
     _, street_map = place(SMALL)
     graph = WalkGraph(street_map)
     return build_reactive(EVENT_KINDS[kind], SMALL, street_map, graph, seed, kind, wanted=WANTED)
@@ -53,10 +53,10 @@ def drawn(kind: str, seed: int = 0) -> Scenario:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_a_reactive_scenario_is_as_wanted_and_no_straight_lane_is_free(kind: str) -> None:
-    """Length, position and sides are those drawn before the place; 2 to 4 obstacles block nine
-    lanes, leave the gap, and are clear of start and goal."""
+    """Length, position and sides are those of its slot; 2 to 4 obstacles block nine lanes, leave
+    the gap, and are clear of start and goal."""
     _, street_map = place(SMALL)
-    scenario = drawn(kind)
+    scenario = reactive_scenario(kind)
     (event,) = scenario.events
     assert scenario.route_line.length_m == pytest.approx(WANTED.length_m, abs=0.01)
     assert event_share(scenario, EVENT_KINDS[kind]) == pytest.approx(WANTED.share, abs=0.03)
@@ -72,20 +72,20 @@ def test_a_reactive_scenario_is_as_wanted_and_no_straight_lane_is_free(kind: str
     assert again == scenario
 
 
-def test_a_free_lane_is_found_out() -> None:
-    """Without one of its obstacles a lane of the scenario is free."""
+def test_a_free_lane_is_found() -> None:
+    """A lane is free without one of the obstacles."""
     _, street_map = place(SMALL)
-    scenario = drawn("lateral")
+    scenario = reactive_scenario("lateral")
     fewer = replace(scenario, obstacles=scenario.obstacles[:1])
     (words,) = straight_lanes(fewer, street_map)
     assert "straight lanes are free" in words
     assert "lanes" in {fault.claim for fault in faults_in_places([fewer], [], None)}
 
 
-def test_a_way_that_solves_event_and_decoy_is_found_out() -> None:
-    """Without the fences of its gate one way passes the people on both sides."""
+def test_a_path_that_solves_event_and_decoy_is_found() -> None:
+    """Without the fences of the gate one path passes the people on both sides."""
     _, street_map = place(SMALL)
-    found = [drawn("obstructing", seed) for seed in range(4)]
+    found = [reactive_scenario("obstructing", seed) for seed in range(4)]
     scenario = next(s for s in found if any(one.kind == "fence" for one in s.obstacles))
     assert list(common_ways(scenario, street_map)) == []
     (event,) = scenario.events
@@ -99,15 +99,15 @@ def test_a_way_that_solves_event_and_decoy_is_found_out() -> None:
 
 @pytest.mark.parametrize("sidewalk_half_m", [1.0, 1.3, 1.6, 2.24, 2.88])
 def test_fences_close_a_sidewalk_to_the_gate(sidewalk_half_m: float) -> None:
-    """Nothing but the gate is wider than 0.1 m, and no fence leaves the sidewalk."""
+    """Only the gate is wider than 0.1 m, and no fence leaves the sidewalk."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         gate = drawn_gate((0.95, 1.15), sidewalk_half_m, Pose(0.0, 0.0, 0.0), rng, COURIER)
-        whole = shapely.box(-1.0, -sidewalk_half_m, 1.0, sidewalk_half_m)
+        sidewalk = shapely.box(-1.0, -sidewalk_half_m, 1.0, sidewalk_half_m)
         grounds = [footprint(one) for one in gate.fences]
         bands = [shapely.box(-1.0, g.bounds[1], 1.0, g.bounds[3]) for g in grounds]
         assert all(abs(y) <= sidewalk_half_m for band in bands for y in band.bounds[1::2])
-        left = shapely.get_parts(whole.difference(shapely.union_all(bands)))
+        left = shapely.get_parts(sidewalk.difference(shapely.union_all(bands)))
         wide = [one.bounds for one in left if one.bounds[3] - one.bounds[1] > 0.1]
         low_m, high_m = gate.left_m - gate.half_m, gate.left_m + gate.half_m
         assert len(wide) == 1 and wide[0][1::2] == pytest.approx((low_m, high_m), abs=0.01)
@@ -119,8 +119,8 @@ def test_fences_close_a_sidewalk_to_the_gate(sidewalk_half_m: float) -> None:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_a_decoy_equals_its_scenario_but_for_the_response(kind: str) -> None:
-    """It ends at the goal; its free side is the other one, or nothing happens in it."""
-    scenario = drawn(kind)
+    """A decoy ends at the goal, and its free side is the other one or its people do not act."""
+    scenario = reactive_scenario(kind)
     decoy = decoy_of(scenario)
     (event,), (other,) = scenario.events, decoy.events
     mirrored = EVENT_KINDS[kind].decoy is None
@@ -132,8 +132,8 @@ def test_a_decoy_equals_its_scenario_but_for_the_response(kind: str) -> None:
 
 
 def test_a_decoy_with_a_person_inside_an_obstacle_is_refused() -> None:
-    """Before the expert drives; the claim finds the person, too, in the decoy alone."""
-    event = drawn("ped_crossing")
+    """It is refused before the expert drives, and the claim finds the person in the decoy alone."""
+    event = reactive_scenario("ped_crossing")
     decoy = decoy_of(event)
     ((x_m, y_m),) = EVENT_KINDS["ped_crossing"].stays_of(decoy.events[0], 0)
     thing = Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)
@@ -147,13 +147,13 @@ def test_a_decoy_with_a_person_inside_an_obstacle_is_refused() -> None:
 
 
 def test_limits_follow_from_the_experts_time_and_the_robots_speed() -> None:
-    """1.5 times and 3 s for events, 1.3 times for decoys, in whole ticks; a faster robot has
-    less time, and a long route keeps its limit."""
-    scenario, decoy = drawn("lateral"), decoy_of(drawn("lateral"))
+    """Limits are 1.5 times and 3 s for events and 1.3 times for decoys, in whole ticks. A faster
+    robot has less time, and a long route keeps its limit."""
+    scenario, decoy = reactive_scenario("lateral"), decoy_of(reactive_scenario("lateral"))
     assert limited(scenario, 10.01, None).time_limit_s == 18.05
     quick = limited(decoy, 10.0, 1.25)
     assert (quick.time_limit_s, quick.go_on_mps) == (16.0, 0.75)
-    assert limited(decoy_of(drawn("queueing")), 10.0, 1.25).go_on_mps == 0.0
+    assert limited(decoy_of(reactive_scenario("queueing")), 10.0, 1.25).go_on_mps == 0.0
     faster = SCOUT.cruise_mps / COURIER.cruise_mps
     scout = quick.driven_by("scout")
     assert (scout.time_limit_s, scout.go_on_mps) == (12.0, 0.75 * faster)
@@ -165,14 +165,14 @@ def test_limits_follow_from_the_experts_time_and_the_robots_speed() -> None:
 
 @pytest.mark.parametrize("redraw", [0, 1])
 def test_the_slots_spread_lengths_positions_and_sides_evenly(redraw: int) -> None:
-    """In each split every kind has the same lengths and positions, and each side half of the
-    times; lengths, positions and sides are not correlated. A redraw is no exception."""
+    """In each split every kind has the same lengths and positions, and each side half of the time,
+    without correlations; also in a redraw."""
     slots = recipe_of("reactive", redraw).slots
     slots = [slot for slot in slots if slot.wanted and not slot.decoy_of]
     for kind in EVENT_KINDS:
         for split, count in (("val", 80), ("test", 20)):
-            those = [s.wanted for s in slots if s.structure == kind and s.split == split]
-            wanted = np.array([one for one in those if one is not None])
+            wanted_rows = [s.wanted for s in slots if s.structure == kind and s.split == split]
+            wanted = np.array([one for one in wanted_rows if one is not None])
             assert len(wanted) == count
             lengths_m = 12.0 + 18.0 * (np.arange(count) + 0.5) / count
             assert np.allclose(np.sort(wanted[:, 0]), lengths_m, atol=0.01)
@@ -184,7 +184,8 @@ def test_the_slots_spread_lengths_positions_and_sides_evenly(redraw: int) -> Non
 
 @pytest.mark.engine
 def test_a_pair_is_built_and_proved_together(tmp_path: Path) -> None:
-    """Asked for an event, its decoy is built too; both proofs hold, and their limits follow."""
+    """A request for an event also builds its decoy; both proofs hold, and the limits follow from
+    them."""
     out = tmp_path / "reactive.json"
     suite, proofs = build_suite("reactive", out, only=["obstructing-001"])
     assert [one.id for one in suite.scenarios] == ["obstructing-001", "obstructing-001-decoy"]
@@ -197,8 +198,8 @@ def test_a_pair_is_built_and_proved_together(tmp_path: Path) -> None:
 
 
 def test_a_redraw_has_the_same_slots_with_other_draws(tmp_path: Path) -> None:
-    """Names, places and splits are equal; seeds, lengths and sides are not. The shipped file is
-    not replaced."""
+    """Names, places and splits are equal; seeds, lengths and sides are not. The shipped file is not
+    replaced."""
     for name, shipped in RECIPES.items():
         again = [recipe_of(name, number) for number in (1, 2)]
         for slots in zip(shipped.slots, *(one.slots for one in again), strict=True):
@@ -227,11 +228,11 @@ def test_cheats_are_driven_on_a_redraw(
     monkeypatch: pytest.MonkeyPatch,
     request: pytest.FixtureRequest,
 ) -> None:
-    """A pair of `overtaking` is drawn with other seeds and keeps its claims; who never slows down
-    solves at most its decoy. One cheat is driven, two with --whole."""
+    """A pair of `overtaking` is drawn with other seeds and keeps its claims, and cheats are
+    evaluated on it: one by default, two with --whole."""
     out = tmp_path / "redraw.json"
-    said = cosim("suite", "build", "reactive", str(out), "--redraw", "1", "--only", "*taking-7002")
-    assert said.returncode == 0 and "version 2.0-redraw-1" in said.stdout, said.stderr
+    done = cosim("suite", "build", "reactive", str(out), "--redraw", "1", "--only", "*taking-7002")
+    assert done.returncode == 0 and "version 2.0-redraw-1" in done.stdout, done.stderr
     suite = read_suite(out)
     shipped = {one.id: one for one in load_suite("reactive").scenarios}
     assert [one.id for one in suite.scenarios] == ["overtaking-7002", "overtaking-7002-decoy"]
@@ -241,8 +242,8 @@ def test_cheats_are_driven_on_a_redraw(
     more = ("stop-every-2-m",) if request.config.getoption("--whole") else ()
     cheats = {name: CHEATS[name] for name in ("swerve-left", *more)}
     monkeypatch.setattr(measure, "CHEATS", cheats)
-    said = cosim("bench", "exploit", "--cheats", "--suite", str(out), "--out", str(tmp_path / "e"))
-    assert said.returncode == 0 and "swerve-left" in said.stdout, said.stderr
+    done = cosim("bench", "exploit", "--cheats", "--suite", str(out), "--out", str(tmp_path / "e"))
+    assert done.returncode == 0 and "swerve-left" in done.stdout, done.stderr
     assert len((tmp_path / "e" / "evaluations.jsonl").read_text().splitlines()) == 2 * len(cheats)
 
 
@@ -256,8 +257,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.mark.engine
-def test_a_swerve_away_from_who_cuts_in_solves_the_decoy_alone(number: str, cheat: str) -> None:
-    """It reaches both goals without a failure, but did not give way in the event."""
+def test_a_swerve_instead_of_giving_way_solves_only_the_decoy(number: str, cheat: str) -> None:
+    """It reaches both goals without a failure, but does not give way in the event."""
     name = f"overtaking-{number}"
     ids = (name, name + DECOY)
     twins = [one for one in load_suite("reactive").scenarios if one.id in ids]

@@ -1,4 +1,4 @@
-"""`cosim bench realism`: people in pictures, and how boxes and classes are counted."""
+"""`cosim bench realism`: people in pictures, and counts of boxes and classes."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ from tests.support.follow_weights import make_weights
 BLANK = np.zeros((288, 512), dtype=np.uint8)
 
 
-class Named(Things):
-    """Calls everything a thing."""
+class SameName(Things):
+    """Names whatever a box shows "thing"."""
 
     def __init__(self) -> None:
         pass
@@ -58,8 +58,8 @@ class Named(Things):
 
 
 def test_boxes_are_counted() -> None:
-    """A box finds one person of each size at most. A box is false where no person is, not on people
-    of whom little is seen, nor on pixels of people."""
+    """A box finds one person of each size at most. A box is false where there is no person, except
+    on mostly hidden people and on pixels of people."""
     people = np.array([[10, 10, 40, 90], [100, 10, 115, 50], [200, 10, 230, 30], [300, 0, 340, 90]])
     seen = SeenPeople(people.astype(float), np.array([True, True, True, False]))
     labels = BLANK.copy()
@@ -75,7 +75,7 @@ def test_boxes_are_counted() -> None:
     frame = Frame(np.zeros((288, 512, 3), dtype=np.uint8), labels)
     counts = Realism("here")
     found, false = count_boxes(
-        counts, "YOLOX-nano", boxes, Picture(frame, seen, Named(), (ALL, "fog"))
+        counts, "YOLOX-nano", boxes, Picture(frame, seen, SameName(), (ALL, "fog"))
     )
     assert found.tolist() == [True, False, False, True]
     assert false.tolist() == [False, False, False, False, True, True]
@@ -84,8 +84,8 @@ def test_boxes_are_counted() -> None:
         assert got.people == {"taller than 60 px": [1, 1], "24 to 60 px": [0, 1]}
         assert (got.boxes, got.false) == (6, {"thing": 2})
     none = SeenPeople(np.zeros((0, 4)), np.zeros(0, dtype=bool))
-    count_boxes(counts, "YOLOX-nano", boxes[4:5], Picture(frame, none, Named(), (ALL,)))
-    count_boxes(counts, "YOLOX-nano", np.zeros((0, 4)), Picture(frame, seen, Named(), (ALL,)))
+    count_boxes(counts, "YOLOX-nano", boxes[4:5], Picture(frame, none, SameName(), (ALL,)))
+    count_boxes(counts, "YOLOX-nano", np.zeros((0, 4)), Picture(frame, seen, SameName(), (ALL,)))
     got = counts.detected["YOLOX-nano"][ALL]
     assert (got.boxes, got.false) == (7, {"thing": 3})
     assert got.people["taller than 60 px"] == [1, 2]
@@ -94,7 +94,8 @@ def test_boxes_are_counted() -> None:
 
 
 def test_boxes_of_fastest_det_are_decoded() -> None:
-    """A sure person in a cell is one box around it; other classes and unsure cells are none."""
+    """A certain person in neighbouring cells is one box; other classes and uncertain cells are
+    none."""
     output = np.zeros((85, 22, 22), dtype=np.float32)
     output[:, 5, 10] = output[:, 5, 11] = output[:, 20, 3] = output[:, 1, 1] = 0.01
     output[[0, 5], 5, 10] = 0.9
@@ -111,16 +112,16 @@ def test_boxes_of_fastest_det_are_decoded() -> None:
     )
 
 
-def test_the_number_expected_of_real_people_follows_their_heights() -> None:
-    """Heights below the least class count 0; each other one counts the recall of its class."""
+def test_the_expected_number_of_detections_follows_the_heights() -> None:
+    """Heights below the least class count 0, and each other one counts the recall of its class."""
     one = DETECTORS["YOLOX-nano"]
     heights = np.array([10.0, *REAL_HEIGHTS_PX, 300.0])
     assert one.expected(heights) == pytest.approx(sum(one.real_recall) + one.real_recall[-1])
     assert all(len(other.real_recall) == len(REAL_HEIGHTS_PX) for other in DETECTORS.values())
 
 
-def test_routes_of_the_splits_are_of_their_split() -> None:
-    """No route on which looks are tuned is in a city of the held-out ones."""
+def test_routes_of_each_split_are_in_cities_of_that_split() -> None:
+    """No route for tuning is in a held-out city."""
     by_id = {one.id: one for one in load_suite(CITY).scenarios}
     places = {}
     for split, ids in CITY_ROUTES.items():
@@ -130,8 +131,8 @@ def test_routes_of_the_splits_are_of_their_split() -> None:
 
 
 def test_classes_are_compared_by_pixels() -> None:
-    """Half of the picture is sky to both, a quarter to the network alone: IoU 2/3; road and
-    sidewalk are one class."""
+    """Where the network sees sky on three quarters of the picture and the labels on half, IoU is
+    2/3; road and sidewalk are one class."""
     kinds = np.full((128, 256), 10)
     kinds[96:, :128], kinds[96:, 128:] = 0, 1
     labels = np.full((288, 512), LABELS["sky"], dtype=np.uint8)
@@ -147,8 +148,8 @@ def test_classes_are_compared_by_pixels() -> None:
 
 @pytest.mark.engine
 def test_people_are_found_in_the_labels() -> None:
-    """Drawn people get boxes of their own height, also one before the other; one who is hidden
-    behind another is not counted."""
+    """Drawn people get boxes of their own height, also one in front of another, and a hidden person
+    is not counted."""
     surface = surface_of_place(City(seed=7, size_m=300.0))
     strip = max(
         (one for one in surface.street_map.strips.values() if one.kind == "sidewalk"),
@@ -176,7 +177,7 @@ def test_people_are_found_in_the_labels() -> None:
 
 
 @pytest.mark.engine
-def test_umbrellas_are_not_counted_to_people() -> None:
+def test_boxes_of_people_exclude_umbrellas() -> None:
     """In rain, the box of a person with an umbrella ends near the head, as detectors' boxes do."""
     surface = surface_of_place(City(seed=7, size_m=300.0))
     strip = max(
@@ -201,17 +202,17 @@ def test_umbrellas_are_not_counted_to_people() -> None:
         robot: RobotState = world.place(Pose(x0, y0, heading))
         frame = camera.render(robot, Street(0, people))
         taken = robot_shot(surface, COURIER, CAMERA, robot)
-    whole = seen_people(frame, people, taken).boxes[0]
+    with_umbrella = seen_people(frame, people, taken).boxes[0]
     (box,) = seen_people(frame, people, taken, heads_m).boxes
     metre = (box[3] - box[1]) / stature_m(name, Age.ADULT)
     assert heads_m[0] == pytest.approx(surface.heights(at[None])[0] + stature_m(name, Age.ADULT))
-    assert box[3] == whole[3] and whole[1] < box[1] - 0.15 * metre
-    assert box[2] - box[0] < whole[2] - whole[0]
+    assert box[3] == with_umbrella[3] and with_umbrella[1] < box[1] - 0.15 * metre
+    assert box[2] - box[0] < with_umbrella[2] - with_umbrella[0]
 
 
 @pytest.mark.engine
 def test_what_a_false_box_shows_is_named() -> None:
-    """Boxes on a tree's crown, on its trunk and on the sky are told apart."""
+    """Boxes on a tree's crown, on its trunk and on the sky have different names."""
     surface = surface_of_place(City(seed=7, size_m=300.0))
     tree, foot_m = next(
         (prop, z)

@@ -1,4 +1,4 @@
-"""Recipes for clusters, tried as far as one machine allows."""
+"""Recipes for clusters, tested as far as one machine allows."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 RECIPES = Path(__file__).parents[2] / "scenarios/runs/recipes"
 
 
-def test_a_task_of_the_slurm_array_runs_its_shard_and_goes_on_with_it(tmp_path: Path) -> None:
-    """With what Slurm sets for each of three tasks; one that is queued again resumes."""
+def test_a_task_of_the_slurm_array_runs_and_resumes_its_shard(tmp_path: Path) -> None:
+    """Each of three tasks runs its shard with Slurm's variables, and a requeued task resumes."""
     (tmp_path / "bin").mkdir()
     stub = tmp_path / "bin/cosim"
     stub.write_text('#!/bin/sh\necho "$@"\n')
@@ -31,18 +31,18 @@ def test_a_task_of_the_slurm_array_runs_its_shard_and_goes_on_with_it(tmp_path: 
             command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
         ).stdout
 
-    said = [task(number).split() for number in (1, 2, 3)]
-    assert [words[words.index("--shard") + 1] for words in said] == ["1/3", "2/3", "3/3"]
-    assert " ".join(said[1]) == (
+    commands = [task(number).split() for number in (1, 2, 3)]
+    assert [words[words.index("--shard") + 1] for words in commands] == ["1/3", "2/3", "3/3"]
+    assert " ".join(commands[1]) == (
         "run reactive --policy orca --seed 7 --shard 2/3 --jobs 4 --out out/shard-2 --split test"
     )
     (tmp_path / "out/shard-2").mkdir()
     (tmp_path / "out/shard-2/run.json").touch()
-    assert task(2).split() == [*said[1], "--resume"]
+    assert task(2).split() == [*commands[1], "--resume"]
 
 
-def test_the_unit_of_a_worker_is_one_that_systemd_takes(tmp_path: Path) -> None:
-    """With a program where it looks for one."""
+def test_systemd_accepts_the_unit_of_a_worker(tmp_path: Path) -> None:
+    """`systemd-analyze verify` reports no fault of the unit."""
     if (verify := shutil.which("systemd-analyze")) is None:
         pytest.skip("there is no systemd-analyze")
     unit = (RECIPES / "cosim-worker.service").read_text()

@@ -1,5 +1,4 @@
-"""Policies that are served from an environment of their own, with nothing in it but what
-`policy_server.py` needs."""
+"""Policies served from a separate environment that has only what `policy_server.py` needs."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ NEEDS = ("eclipse-zenoh>=1.10,<2", "msgspec", "numpy")
 
 
 def example() -> str:
-    """The complete example of docs/hosting.md."""
+    """Return the complete example of docs/hosting.md."""
     (block,) = blocks("python", "docs/hosting.md")
     return block.text
 
@@ -51,16 +50,15 @@ def free_endpoint() -> str:
 
 
 def three_packages(folder: Path) -> list[str]:
-    """A Python that has nothing but the three packages that are needed. Returns how it is
-    called."""
-    beside = folder / "packages"
-    beside.mkdir()
+    """Return the command of a Python that has only the three required packages."""
+    packages = folder / "packages"
+    packages.mkdir()
     site = Path(np.__file__).parents[1]
     for name in ("zenoh", "msgspec", "numpy", "numpy.libs"):
         if (site / name).exists():
-            (beside / name).symlink_to(site / name)
+            (packages / name).symlink_to(site / name)
     start = (
-        f"import sys; sys.path[:0] = [{str(folder)!r}, {str(beside)!r}]; import runpy; sys.argv "
+        f"import sys; sys.path[:0] = [{str(folder)!r}, {str(packages)!r}]; import runpy; sys.argv "
         f"= sys.argv[1:]; "
     )
     return [
@@ -73,25 +71,25 @@ def three_packages(folder: Path) -> list[str]:
 
 
 @contextmanager
-def running(words: list[str], folder: Path) -> Iterator[None]:
-    """A process that is started again whenever it has ended, until the block ends."""
+def restarting(words: list[str], folder: Path) -> Iterator[None]:
+    """Run a process that is restarted whenever it ends, until the block ends."""
     ended = threading.Event()
-    now: list[subprocess.Popen[bytes]] = []
+    current: list[subprocess.Popen[bytes]] = []
 
-    def keep() -> None:
+    def restart() -> None:
         while not ended.is_set():
             with (folder / "printed").open("ab") as printed:
-                now[:] = [subprocess.Popen(words, cwd=folder, stdout=printed, stderr=printed)]
-            now[0].wait()
+                current[:] = [subprocess.Popen(words, cwd=folder, stdout=printed, stderr=printed)]
+            current[0].wait()
 
-    thread = threading.Thread(target=keep)
+    thread = threading.Thread(target=restart)
     thread.start()
     try:
         yield
     finally:
         ended.set()
         while thread.is_alive():
-            for process in now:
+            for process in current:
                 process.kill()
             thread.join(0.1)
 
@@ -105,8 +103,8 @@ def seen_at(tick: int, driver: RemoteCaller) -> Observation:
     )
 
 
-def found(name: str, endpoint: str, printed: Path) -> RemoteCaller:
-    """The driver of a policy, as soon as it is served."""
+def driver_when_served(name: str, endpoint: str, printed: Path) -> RemoteCaller:
+    """Return the driver of a policy as soon as it is served."""
     for _ in range(int(PATIENCE_S / 10)):
         try:
             return remote_caller(
@@ -119,7 +117,8 @@ def found(name: str, endpoint: str, printed: Path) -> RemoteCaller:
 
 
 def pythons(request: pytest.FixtureRequest, folder: Path) -> Iterator[list[str]]:
-    """Environments to serve from: with --whole one of every other Python that there is."""
+    """Yield commands of Python environments to serve from; with --whole one of every other
+    installed version."""
     yield three_packages(folder)
     for name in OTHERS if request.config.getoption("--whole") else ():
         if (python := shutil.which(name)) is not None and not subprocess.run(
@@ -139,23 +138,23 @@ def pythons(request: pytest.FixtureRequest, folder: Path) -> Iterator[list[str]]
 def test_the_example_of_the_documents_serves_from_a_clean_environment(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """At most ten lines, run as they are written but for the port, where there is no cosim: asked
-    as any policy. With --whole in every other Python from 3.9 on."""
+    """The documented example has at most ten lines and serves a policy without cosim. With --whole
+    it runs in every other installed Python from 3.9 on."""
     assert len([line for line in example().splitlines() if line.strip()]) <= 10
     shutil.copy(SERVER, tmp_path)
     for python in pythons(request, tmp_path):
         endpoint = free_endpoint()
         assert "tcp/127.0.0.1:7449" in example()
         (tmp_path / "mine.py").write_text(example().replace("tcp/127.0.0.1:7449", endpoint))
-        with running([*python, "mine.py"], tmp_path):
-            driver = found("zenoh:mine", endpoint, tmp_path / "printed")
+        with restarting([*python, "mine.py"], tmp_path):
+            driver = driver_when_served("zenoh:mine", endpoint, tmp_path / "printed")
             driver.reset("k1", 1)
             assert [driver.act(seen_at(tick, driver)) for tick in (0, 4)] == [Command(1.0, 0.0)] * 2
             driver.close()
 
 
-def test_the_file_that_is_copied_can_be_read_by_python_3_9() -> None:
-    """Its grammar is that of 3.9, and it imports nothing of ours."""
+def test_policy_server_is_valid_python_3_9() -> None:
+    """The file has the grammar of 3.9 and imports no package of this project."""
     module = ast.parse(SERVER.read_text(), feature_version=(3, 9))
     names = {
         alias.name
@@ -178,42 +177,38 @@ def one_second(name: str) -> Scenario:
 
 
 @pytest.mark.engine
-def test_nobody_waits_for_a_server_that_hangs_to_hear_of_the_end(tmp_path: Path) -> None:
-    """Its policy never answers: that the episode has ended is told, and what comes next is not held
-    up."""
+def test_a_hanging_server_does_not_delay_the_end_of_an_episode(tmp_path: Path) -> None:
+    """The message that an episode has ended returns while an answer is still pending."""
     shutil.copy(SERVER, tmp_path)
     shutil.copy(ROOT / "tests" / "support" / "served_policies.py", tmp_path)
     endpoint = free_endpoint()
 
-    def asked() -> None:
+    def query() -> None:
         with suppress(PolicyServerLost):
             driver.act(seen_at(0, driver))
 
-    with running(
+    with restarting(
         [*three_packages(tmp_path), "served_policies.py", "Stuck", "stuck", endpoint], tmp_path
     ):
-        driver = found("zenoh:stuck", endpoint, tmp_path / "printed")
+        driver = driver_when_served("zenoh:stuck", endpoint, tmp_path / "printed")
         driver.reset("k1", 1)
-        asking = threading.Thread(target=asked, daemon=True)
-        asking.start()
-        while asking.is_alive() and not (tmp_path / "asked").exists():
-            asking.join(0.02)
-        telling = threading.Thread(target=driver.ended, daemon=True)
-        telling.start()
-        telling.join(PATIENCE_S)
-        assert not telling.is_alive() and asking.is_alive()
-    asking.join(PATIENCE_S)
+        querying = threading.Thread(target=query, daemon=True)
+        querying.start()
+        while querying.is_alive() and not (tmp_path / "asked").exists():
+            querying.join(0.02)
+        ending = threading.Thread(target=driver.ended, daemon=True)
+        ending.start()
+        ending.join(PATIENCE_S)
+        assert not ending.is_alive() and querying.is_alive()
+    querying.join(PATIENCE_S)
     driver.close()
 
 
 @pytest.mark.engine
-def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(
-    tmp_path: Path, cosim: Cosim
-) -> None:
-    """kill -9 in the third question: another server drives it from its start, to the hash of a
-    policy that drives in the simulator's process; the second time the episode has crashed. Rows and
-    run.json say `remote`, and the record how long answers took. One that never answers has crashed
-    at once."""
+def test_an_episode_of_a_killed_server_is_run_again(tmp_path: Path, cosim: Cosim) -> None:
+    """After kill -9 in the third query another server repeats the episode with the state hash of a
+    local policy, and a second loss is a crash. Records have `remote` and answer times; a policy
+    that never answers has crashed."""
     shutil.copy(SERVER, tmp_path)
     shutil.copy(ROOT / "tests" / "support" / "served_policies.py", tmp_path)
     suite = Suite(
@@ -232,19 +227,19 @@ def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(
         "--out",
         "run",
     )
-    with running(
+    with restarting(
         [*three_packages(tmp_path), "served_policies.py", "Dying", "dying", endpoint], tmp_path
     ):
-        found("zenoh:dying", endpoint, tmp_path / "printed").close()
-        said = cosim("run", "three.json", *words, "--answer-timeout", "5", cwd=tmp_path)
+        driver_when_served("zenoh:dying", endpoint, tmp_path / "printed").close()
+        done = cosim("run", "three.json", *words, "--answer-timeout", "5", cwd=tmp_path)
     a, b, c = sorted(read_records(tmp_path / "run"), key=lambda record: record.scenario.id)
-    here = suite_run.run(
+    local = suite_run.run(
         Suite(name="three", version="1", scenarios=(one_second("a"),)),
         Honest(),
         options=EpisodeOptions(seed=seed),
     )
-    assert (a.status, [a.state_hash]) == ("done", here["state_hash"].tolist()), (
-        a.reason + said.stderr
+    assert (a.status, [a.state_hash]) == ("done", local["state_hash"].tolist()), (
+        a.reason + done.stderr
     )
     assert b.status == "crashed" and "of policy 'dying' is gone, 2 times" in b.reason
     assert (
@@ -259,6 +254,6 @@ def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(
     )
     assert (
         a.clock["answer_p95_ms"] >= a.clock["answer_median_ms"] > 0.0
-        and "policy remote" in said.stdout
+        and "policy remote" in done.stdout
     )
-    assert said.returncode == 1 and (tmp_path / "thirds").stat().st_size == 5
+    assert done.returncode == 1 and (tmp_path / "thirds").stat().st_size == 5

@@ -1,4 +1,4 @@
-"""Residents: the behaviour graph of a street, and the people who live on it."""
+"""Residents: the behaviour graph of a street, and its people."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ TICK_MS = 50
 
 
 class Town(NamedTuple):
-    """A place with its graph, and what stands in it."""
+    """A place with its behaviour graph and obstacles."""
 
     map: StreetMap
     route: tuple[tuple[float, float], ...]
@@ -55,8 +55,8 @@ class Town(NamedTuple):
 
 @cache
 def town(seed: int, style: str = "mixed") -> Town:
-    """A small city, or the imported map, with a route along its longest sidewalk and a fence in the
-    middle of it."""
+    """Return a small city, or the imported map, with a route along its longest sidewalk and a fence
+    in the middle of it."""
     if style == "imported":
         street_map = read_net(next(iter(sorted(IMPORTED.glob("*.net.xml.gz")))))
     else:
@@ -97,12 +97,12 @@ def towns() -> list[Town]:
 
 
 def arcs(graph: BehaviorGraph) -> Floats:
-    """(A, 2, 2) ends of the ways."""
+    """Return (A, 2, 2) ends of the paths."""
     pairs = np.column_stack(graph.arcs.nonzero())
     return graph.xy[pairs]
 
 
-class Nobody:
+class NoEvents:
     """A director without events."""
 
     def react(self, query: EventQuery) -> EventReply:
@@ -134,19 +134,20 @@ class Moment(NamedTuple):
     residents: tuple[Resident, ...]
 
 
-def lived(
-    of: Town, seconds: float, seed: int = 7, count: int = 8, v_mps: float = 0.8
+def simulated(
+    place: Town, seconds: float, seed: int = 7, count: int = 8, v_mps: float = 0.8
 ) -> list[Moment]:
-    """Residents around a robot that drives along the route, and two who stand in their way."""
-    line = Polyline(of.route)
+    """Simulate residents around a robot that drives along the route, and two people who stand in
+    their way."""
+    line = Polyline(place.route)
     shown = NO_PEOPLE
     moments = []
-    still = of.graph.xy[[0, of.graph.waypoints // 2]]
-    director = Residents(Nobody(), of.graph, count, seed, lambda: shown)
+    still = place.graph.xy[[0, place.graph.waypoints // 2]]
+    director = Residents(NoEvents(), place.graph, count, seed, lambda: shown)
     for tick in range(round(seconds * 1000 / TICK_MS)):
         x, y, heading = line.at(min(v_mps * tick * TICK_MS / 1000, line.length_m))
-        asked = query(tick, x, y, heading, v_mps)
-        actors = sorted(director.react(asked).actors, key=lambda actor: actor.id)
+        robot_query = query(tick, x, y, heading, v_mps)
+        actors = sorted(director.react(robot_query).actors, key=lambda actor: actor.id)
         shown = People.of(
             ("c1", "c2", *(a.id for a in actors)),
             [*still.tolist(), *((a.x_m, a.y_m) for a in actors)],
@@ -157,13 +158,13 @@ def lived(
             kind=[0, 0, *(a.kind for a in actors)],
             age=[0, 0, *(a.age for a in actors)],
         )
-        moments.append(Moment(asked, shown, director.here))
+        moments.append(Moment(robot_query, shown, director.here))
     return moments
 
 
-def test_waypoints_are_on_walkable_ground_and_clear_of_what_stands_there() -> None:
-    """In three cities and on an imported map, by a person's radius; so is every way between
-    them."""
+def test_waypoints_and_paths_are_walkable_and_clear_of_obstacles() -> None:
+    """In three cities and on an imported map, waypoints and the paths between them keep a person's
+    radius."""
     for one in towns():
         graph = one.graph
         assert graph.waypoints > 50 and np.isfinite(graph.xy).all()
@@ -185,8 +186,8 @@ def test_waypoints_are_on_walkable_ground_and_clear_of_what_stands_there() -> No
         )
 
 
-def test_no_way_leads_over_a_road_or_a_crossing() -> None:
-    """Ways stay off every lane, and touch crossings where they join their corners at most."""
+def test_paths_avoid_roads_and_crossings() -> None:
+    """Paths stay off every lane and off the middle of every crossing."""
     for one in towns():
         lines = shapely.linestrings(arcs(one.graph))
         area = LineString(one.route).buffer(90.0)
@@ -205,8 +206,8 @@ def test_no_way_leads_over_a_road_or_a_crossing() -> None:
         assert not len(shapely.STRtree(middles).query(lines, predicate="intersects")[0])
 
 
-def test_nobody_passes_a_fence() -> None:
-    """No way crosses the fence in the middle of the sidewalk, which has waypoints on both sides."""
+def test_no_path_crosses_a_fence() -> None:
+    """The sidewalk has waypoints on both sides of the fence and no path across it."""
     one = town(*CITIES[0])
     (fence,) = one.barriers
     assert not shapely.intersects(outline(fence), shapely.linestrings(arcs(one.graph))).any()
@@ -218,9 +219,9 @@ def test_nobody_passes_a_fence() -> None:
     assert (ahead[near] > 0.5).any() and (ahead[near] < -0.5).any()
 
 
-def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
-    """A resident sits with its back to a bench, looks into a window and waits facing a road, and
-    leaves 0.6 m on both sides of the middle of the sidewalk free."""
+def test_residents_face_their_activity_and_leave_the_middle_free() -> None:
+    """Residents sit with the back to a bench, look into a window, and wait facing a road. They
+    leave 0.6 m on both sides of the sidewalk's middle free."""
     seen = set()
     for one in towns():
         area = LineString(one.route).buffer(90.0)
@@ -259,26 +260,27 @@ def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
     assert seen == {"bench", "window", "stop"}
 
 
-def test_where_no_shelter_stands_nobody_waits_for_a_bus() -> None:
-    """What there is to do comes from what stands there: no props and no houses, nothing to do."""
+def test_residents_wait_for_a_bus_only_at_shelters() -> None:
+    """Activities come from props and houses: without them there are none."""
     one = town(*CITIES[0])
     assert list(spots(one.map, (), ())) == []
     ground = StreetSurface(one.map, CITIES[0][0])
     shelters = {
         p.id for p in ground.standing(LineString(one.route).buffer(90.0)) if p.kind == "shelter"
     }
-    assert {s.thing.rpartition("/")[0] for s in one.graph.spots if s.what == "stop"} <= shelters
+    stops = {s.thing.rpartition("/")[0] for s in one.graph.spots if s.what == "stop"}
+    assert stops and stops <= shelters
 
 
 @pytest.fixture(scope="module")
 def three_minutes() -> list[Moment]:
-    """Of residents of the first city, around a slow robot."""
-    return lived(town(*CITIES[0]), 180.0, v_mps=0.2)
+    """Return three minutes of residents of the first city, around a slow robot."""
+    return simulated(town(*CITIES[0]), 180.0, v_mps=0.2)
 
 
-def test_a_resident_walks_idles_and_does_something(three_minutes: list[Moment]) -> None:
-    """In three minutes all three states are seen; speeds and stays are those of the table, and who
-    sits faces right."""
+def test_residents_walk_idle_and_interact(three_minutes: list[Moment]) -> None:
+    """In three minutes all three states occur, speeds and stays are those of the table, and
+    interacting residents are at their spots."""
     one = town(*CITIES[0])
     moments = three_minutes
     states = {(r.number, r.phase) for m in moments for r in m.residents}
@@ -288,16 +290,16 @@ def test_a_resident_walks_idles_and_does_something(three_minutes: list[Moment]) 
         >= 4
     )
     for moment in moments:
-        for one_of in moment.residents:
+        for resident in moment.residents:
             assert (
-                SPEED_MPS[0] <= one_of.speed_mps <= SPEED_MPS[1]
-                and one_of.shown_mps <= one_of.speed_mps + 1e-6
+                SPEED_MPS[0] <= resident.speed_mps <= SPEED_MPS[1]
+                and resident.shown_mps <= resident.speed_mps + 1e-6
             )
-            assert one_of.stay_s <= max(high for _, high in STAY_RANGES_S.values())
-            if one_of.phase == "interacting" and one_of.since_tick is not None:
-                spot = one.graph.spot(one_of.goal)
-                assert spot is not None and one_of.heading_rad == spot.heading_rad
-                assert (one_of.x_m, one_of.y_m) == (spot.x_m, spot.y_m)
+            assert resident.stay_s <= max(high for _, high in STAY_RANGES_S.values())
+            if resident.phase == "interacting" and resident.since_tick is not None:
+                spot = one.graph.spot(resident.goal)
+                assert spot is not None and resident.heading_rad == spot.heading_rad
+                assert (resident.x_m, resident.y_m) == (spot.x_m, spot.y_m)
 
 
 def test_speeds_are_those_of_the_motion(three_minutes: list[Moment]) -> None:
@@ -317,14 +319,14 @@ def test_speeds_are_those_of_the_motion(three_minutes: list[Moment]) -> None:
     assert treads > 50
 
 
-def test_residents_keep_out_of_things_people_and_the_robot() -> None:
-    """Residents never overlap an object, a person or the robot."""
+def test_residents_overlap_no_object_person_or_robot() -> None:
+    """Residents keep their distance from each of them in every tick."""
     for city in CITIES[:2]:
         one = town(*city)
         tree = shapely.STRtree(list(one.things))
-        for moment in lived(one, 75.0, count=12):
-            if not len(moment.people) > 2:
-                continue
+        moments = [moment for moment in simulated(one, 75.0, count=12) if len(moment.people) > 2]
+        assert moments
+        for moment in moments:
             xy = moment.people.xy[2:]
             assert not len(
                 tree.query(
@@ -338,10 +340,10 @@ def test_residents_keep_out_of_things_people_and_the_robot() -> None:
             assert np.hypot(*(xy - robot).T).min() > PERSON_RADIUS_M + 0.27
 
 
-def test_they_come_and_go_out_of_sight() -> None:
-    """After the first tick nobody appears within 35 m of the robot, beyond 60 m, or vanishes within
-    70 m."""
-    moments = lived(town(*CITIES[1]), 150.0, v_mps=1.5)
+def test_residents_appear_and_vanish_out_of_sight() -> None:
+    """After the first tick no resident appears within 35 m of the robot or beyond 60 m, or vanishes
+    within 70 m."""
+    moments = simulated(town(*CITIES[1]), 150.0, v_mps=1.5)
     before: dict[int, Resident] = {r.number: r for r in moments[0].residents}
     assert before
     for moment in moments[1:]:
@@ -360,8 +362,8 @@ def test_they_come_and_go_out_of_sight() -> None:
         before = here
 
 
-def test_the_same_seed_lives_the_same_life_in_another_process() -> None:
-    """Positions of every tick are the same bits, under another salt of Python's hashes; another
+def test_the_same_seed_gives_the_same_residents_in_another_process() -> None:
+    """Positions of every tick have the same bits under another salt of Python's hashes, and another
     seed differs."""
     code = "from tests.scenarios.test_residents import trace; print(trace(7))"
     environment = os.environ | {
@@ -375,16 +377,16 @@ def test_the_same_seed_lives_the_same_life_in_another_process() -> None:
 
 
 def trace(seed: int) -> str:
-    """A hash of a minute of residents."""
+    """Return a hash of 40 s of residents."""
     import hashlib
 
-    told = b"".join(m.people.xy.tobytes() for m in lived(town(*CITIES[0]), 40.0, seed))
-    return hashlib.sha256(told).hexdigest()
+    positions = b"".join(m.people.xy.tobytes() for m in simulated(town(*CITIES[0]), 40.0, seed))
+    return hashlib.sha256(positions).hexdigest()
 
 
-def test_a_crowd_without_residents_is_what_it_was() -> None:
-    """Specs that do not ask for residents keep their hashes; those that do, come back from their
-    file."""
+def test_suites_with_residents_have_another_version_and_survive_their_file() -> None:
+    """Residents change version and hash of a suite, are read back from its file, and have a valid
+    range."""
     shipped = load_suite("long-horizon")
     settled = with_crowd(shipped, residents=8)
     assert settled.version != shipped.version and settled.content_hash != shipped.content_hash
@@ -397,8 +399,8 @@ def test_a_crowd_without_residents_is_what_it_was() -> None:
 
 @pytest.mark.engine
 def test_an_episode_with_residents_is_replayed_and_compared() -> None:
-    """They are among the people, the replay has the recorded state hash, and so has the
-    counterfactual's."""
+    """Residents are among the people, and both the replay and the comparison without the robot
+    reproduce them."""
     from cosim.episode.loop import Step
     from cosim.place.walk_graph import WalkGraph
     from cosim.policies.load import load_policy
@@ -411,8 +413,8 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
     crowd = CrowdSpec(persons=10, radius_m=50.0, vehicles=4, residents=6)
-    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 1, "lived-in")
-    scenario = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=3.0)
+    drawn = build_long_horizon(city, street_map, WalkGraph(street_map), 1, "lived-in")
+    scenario = msgspec.structs.replace(drawn, crowd=crowd, time_limit_s=3.0)
     names: set[str] = set()
 
     def watch(step: Step, verdict: Verdict) -> None:

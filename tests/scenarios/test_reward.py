@@ -1,4 +1,4 @@
-"""Rewards of an episode, against cases worked out by hand."""
+"""Rewards of an episode, against hand-computed cases."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ TIME = -0.2 * 0.05
 
 
 def record_with(**changes: object) -> Record:
-    begun = record_of(load_suite("unit").scenarios[0], load_policy("stop").manifest)
-    return msgspec.structs.replace(begun, **changes)
+    record = record_of(load_suite("unit").scenarios[0], load_policy("stop").manifest)
+    return msgspec.structs.replace(record, **changes)
 
 
 def test_only_new_ground_counts_and_failures_cost_more_than_they_save() -> None:
-    """Driving back and forth, and being put ahead after a failure, are no progress. The tick of a
-    failure and of a red light has its cost; a reset is in no other tick."""
+    """Driving back and forth and resets ahead are no progress, and only the tick of a failure or
+    red light has its cost."""
     resets = np.full(8, np.nan)
     resets[4] = 5.0
     log = log_with(
@@ -66,8 +66,8 @@ def test_only_new_ground_counts_and_failures_cost_more_than_they_save() -> None:
     ids=["success", "timeout", "broken rule"],
 )
 def test_an_end_has_its_reward(changes: dict[str, object], tick: int, reward: float) -> None:
-    """A success at the last tick; a timeout as much as a failure; a broken rule where the person
-    was passed."""
+    """A success is rewarded at the last tick, a timeout costs as much as a failure, and a broken
+    rule costs where the person was passed."""
     log = log_with(6, reset_s_m=np.full(6, np.nan))
     wanted = np.full(6, TIME)
     wanted[tick] += reward

@@ -1,5 +1,5 @@
-"""A third robot, larger and slower than the shipped ones, made here of a row and a URDF: everything
-follows it."""
+"""A third robot, larger and slower than the shipped ones, defined here by a row and a URDF: every
+part uses its row."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ URDF = """<robot name="barrow">
 
 @pytest.fixture
 def barrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
-    """The third robot: a row in the table, and its URDF. Nothing else is told of it."""
+    """Add the third robot: a row in the table and its URDF, without any other change."""
     spots = {"fl": (0.3, 0.33), "rl": (-0.3, 0.33), "fr": (0.3, -0.33), "rr": (-0.3, -0.33)}
     wheels = "".join(WHEEL.format(name=name, x=x, y=y) for name, (x, y) in spots.items())
     (tmp_path / "barrow.urdf").write_text(URDF.format(wheels=wheels))
@@ -103,8 +103,8 @@ def barrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
     return row
 
 
-class Seeing:
-    """A policy whose camera sits on a mast."""
+class MastCamera:
+    """A policy with a camera on a mast."""
 
     manifest = Manifest("seeing", camera=CameraSpec(mount="rail"))
 
@@ -117,10 +117,11 @@ class Seeing:
 EVERY = pytest.mark.parametrize("robot", [*ROBOTS.values(), BARROW], ids=[*ROBOTS, "barrow"])
 
 
-def seen(
+def observation_on_route(
     robot: Robot, others: People = NO_PEOPLE, heading_rad: float = 0.0, v_mps: float = 0.0
 ) -> Observation:
-    """A robot on a straight route along the x axis; the walkway is free 1.7 m to either side."""
+    """Return an observation of a robot on a straight route along the x axis; the walkway is free
+    1.7 m to either side."""
     state = RobotState(Pose(5.0, 0.0, heading_rad), v_mps)
     free = box(-2.0, -1.7, 60.0, 1.7)
     known = Privileged(
@@ -134,7 +135,7 @@ def standing(x_m: float, y_m: float) -> People:
 
 
 @EVERY
-def test_the_disks_that_policies_plan_with_hold_the_robot(robot: Robot) -> None:
+def test_planning_disks_enclose_the_robot(robot: Robot) -> None:
     """Every point of its outline lies in the two disks of its body and in the one around it, and
     these are tight."""
     disks = BodyDisks.of(robot)
@@ -148,9 +149,9 @@ def test_the_disks_that_policies_plan_with_hold_the_robot(robot: Robot) -> None:
 
 
 @EVERY
-def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -> None:
-    """Alone on a straight way each takes up its share of the pace; off its way it turns as fast as
-    the robot can."""
+def test_policies_use_the_pace_and_turning_rate_of_their_robot(robot: Robot) -> None:
+    """Alone on a straight way each policy drives at its share of the pace, and off its way it turns
+    at the robot's limit."""
     paces = {
         "route": 1.0,
         "orca": 28 / 30,
@@ -160,20 +161,23 @@ def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -
     for name, share in paces.items():
         policy = POLICIES[name]()
         policy.reset("t", 0)
-        command = command_of(policy.act(seen(robot)), rule=WaypointRule(), robot=robot)
+        command = command_of(
+            policy.act(observation_on_route(robot)), rule=WaypointRule(), robot=robot
+        )
         assert command.v_mps == pytest.approx(share * robot.cruise_mps, rel=1e-3), name
         policy.reset("t", 0)
-        turned = policy.act(seen(robot, heading_rad=-1.0))
+        turned = policy.act(observation_on_route(robot, heading_rad=-1.0))
         assert isinstance(turned, Command) and (
             name == "straight" or turned.w_radps == robot.w_max_radps
         ), name
 
 
-def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earlier() -> None:
-    """Past somebody beside the way, before a person, before a crossing at red."""
+def test_larger_robots_keep_larger_distances() -> None:
+    """A wider robot passes people at a larger distance, and a longer one stops earlier before
+    people and red signals."""
     for small, large in itertools.pairwise((SCOUT, COURIER, BARROW)):
         beside = standing(8.0, 0.62 + BodyDisks.of(small).radius_m)
-        known = seen(small, beside).privileged
+        known = observation_on_route(small, beside).privileged
         assert known is not None
         here = PathState(
             SampledPath(known.route), known.route_s_m, DistanceField(known.free, known.route)
@@ -195,15 +199,15 @@ def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earl
 
 
 def test_answers_are_clipped_to_the_robot_that_drives() -> None:
-    """A command and a waypoint beyond what the third robot can."""
+    """A command and waypoints beyond the third robot's limits are clipped to them."""
     for answer in (Command(9.0, -9.0), np.array([[2.0, -9.0]] * 3)):
-        told = command_of(answer, rule=WaypointRule(), robot=BARROW)
-        assert (told.v_mps, told.w_radps) == (1.0, -0.4)
+        command = command_of(answer, rule=WaypointRule(), robot=BARROW)
+        assert (command.v_mps, command.w_radps) == (1.0, -0.4)
 
 
-def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:
-    """The same policy sees from another height on each robot; a mount may be named, or be a place
-    on any robot."""
+def test_a_camera_is_at_the_mount_of_its_robot(barrow: Robot) -> None:
+    """The same policy sees from another height on each robot; a mount is a name, or a place on any
+    robot."""
     surface = StreetSurface(tiny_map(), 1)
     state = RobotState(Pose(-40.0, 100.0, 0.0))
     for robot in (COURIER, SCOUT, barrow):
@@ -218,8 +222,8 @@ def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=lambda robot: robot.name)
 def test_the_mounts_of_a_robot_are_on_it(robot: Robot) -> None:
-    """Every robot has "front"; each mount is over the robot's outline and within reach of a mast,
-    and one on the left looks to the left: its eye and its heading are those of the row."""
+    """Every robot has "front", each mount is over the outline at a low height, and pictures from a
+    mount have its heading and tilt."""
     surface = StreetSurface(tiny_map(), 1)
     state = RobotState(Pose(-40.0, 100.0, 0.3))
     assert "front" in robot.mounts
@@ -237,13 +241,12 @@ def test_the_mounts_of_a_robot_are_on_it(robot: Robot) -> None:
 def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(
     barrow: Robot, tmp_path: Path
 ) -> None:
-    """No episode crashes over it, no folder is made; with the robot that has it the run may
-    begin."""
-    policy = Seeing()
+    """No run folder is made, and the robot with this mount is accepted."""
+    policy = MastCamera()
     for name in ("courier", "scout"):
         mounts = ", ".join(sorted(ROBOTS[name].mounts))
-        said = f"unknown camera mount of robot '{name}' 'rail'. Valid choices: {mounts}."
-        with pytest.raises(UsageError, match=re.escape(said)):
+        message = f"unknown camera mount of robot '{name}' 'rail'. Valid choices: {mounts}."
+        with pytest.raises(UsageError, match=re.escape(message)):
             run(
                 "reactive",
                 policy,
@@ -252,15 +255,15 @@ def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(
                 options=EpisodeOptions(robot=name),
             )
     assert not (tmp_path / "run").exists()
-    whole = with_robot(load_suite("reactive"), barrow.name)
+    suite = with_robot(load_suite("reactive"), barrow.name)
     spec = run_spec(
-        whole, whole.scenarios[:1], "p", PolicyCaller.of(policy), EpisodeOptions(camera="bullet")
+        suite, suite.scenarios[:1], "p", PolicyCaller.of(policy), EpisodeOptions(camera="bullet")
     )
     assert spec.robots == {"barrow": robot_hash(barrow)}
 
 
 def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> None:
-    """0.35 m beside the route: the courier passes, the third robot does not."""
+    """At a barrier 0.35 m beside the route the courier passes and the third robot does not."""
     fence = barrier(x_m=-20.0, y_m=1.0, heading_rad=0.0, length_m=1.3, strip="west", end=0)
     fine = from_west_to_east(barriers=(fence,))
     assert list(misfits([fine], crossroads())) == []
@@ -270,18 +273,19 @@ def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> No
 
 
 def test_another_robot_is_another_run_of_the_same_suite(tmp_path: Path) -> None:
-    """The suite's own robot changes nothing; a run is not resumed or merged with another robot."""
+    """The suite's own robot changes nothing, and a run is neither resumed nor merged with another
+    robot."""
     shipped = load_suite("long-horizon")
-    whole = with_robot(shipped, "scout")
-    assert (whole.version, {s.robot for s in whole.scenarios}) == (shipped.version, {"scout"})
-    assert content_hash(whole.scenarios[0]) != content_hash(shipped.scenarios[0])
+    by_scout = with_robot(shipped, "scout")
+    assert (by_scout.version, {s.robot for s in by_scout.scenarios}) == (shipped.version, {"scout"})
+    assert content_hash(by_scout.scenarios[0]) != content_hash(shipped.scenarios[0])
     assert with_robot(shipped, "courier") is with_robot(shipped, "") is shipped
     none = Suite(name="s", version="1", scenarios=())
     spec = spec_of(none)
     with RunFolder.create(tmp_path / "run", spec, none):
         pass
     with pytest.raises(
-        RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, now asked"
+        RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, and this command has"
     ):
         RunFolder.resume(tmp_path / "run", changed(spec, robots={"scout": "h"}))
     parts = [run_of(tmp_path / name, ["goal"], robot=name) for name in ("courier", "scout")]
@@ -291,38 +295,39 @@ def test_another_robot_is_another_run_of_the_same_suite(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_runs_by_two_robots_have_the_suite_hash_of_the_shipped_scenarios(tmp_path: Path) -> None:
-    """Folder and records of both have the same suite hash, and scenarios with limits of their
-    robot."""
+    """Folders and records of both runs have the same suite hash, and scenarios with the limits of
+    their robot."""
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=1.0, ends_on_failure=True)
     suite = Suite(name="s", version="1", scenarios=(scenario,))
     for robot in ("", "scout"):
         options = EpisodeOptions(robot=robot, seed=1)
         run(suite, "straight", out=tmp_path / f"run{robot}", options=options)
-        whole = read_verified_run(tmp_path / f"run{robot}")
-        assert whole.spec.setup.suite_hash == suite.content_hash
-        assert whole.spec.suite_version == "1" and [*whole.spec.robots] == [robot or "courier"]
-        (record,) = whole.records.values()
+        verified = read_verified_run(tmp_path / f"run{robot}")
+        assert verified.spec.setup.suite_hash == suite.content_hash
+        assert verified.spec.suite_version == "1" and [*verified.spec.robots] == [
+            robot or "courier"
+        ]
+        (record,) = verified.records.values()
         assert record.setup.suite_hash == suite.content_hash
-        assert whole.scenarios[scenario.id] == scenario.driven_by(robot)
+        assert verified.scenarios[scenario.id] == scenario.driven_by(robot)
 
 
-def test_an_edited_robot_is_another_one(barrow: Robot, tmp_path: Path) -> None:
-    """A number of its row and a word of its URDF are in its hash, which a resumed run is held
-    against."""
-    again = dataclasses.replace(barrow, urdf=str(tmp_path / "again.urdf"))
-    Path(again.urdf).write_bytes(urdf_path(barrow).read_bytes())
-    as_it_was = robot_hash(again)
+def test_an_edited_robot_has_another_hash(barrow: Robot, tmp_path: Path) -> None:
+    """The hash covers the numbers of its row and the text of its URDF."""
+    copy = dataclasses.replace(barrow, urdf=str(tmp_path / "again.urdf"))
+    Path(copy.urdf).write_bytes(urdf_path(barrow).read_bytes())
+    unchanged = robot_hash(copy)
     assert (
-        robot_hash(dataclasses.replace(again, v_max_mps=again.v_max_mps + 0.1))
-        != as_it_was
-        == robot_hash(again)
+        robot_hash(dataclasses.replace(copy, v_max_mps=copy.v_max_mps + 0.1))
+        != unchanged
+        == robot_hash(copy)
     )
-    Path(again.urdf).write_bytes(urdf_path(barrow).read_bytes() + b"<!-- heavier -->")
-    assert robot_hash(again) != as_it_was
+    Path(copy.urdf).write_bytes(urdf_path(barrow).read_bytes() + b"<!-- heavier -->")
+    assert robot_hash(copy) != unchanged
 
 
 def test_a_replay_that_differs_names_an_edited_robot(barrow: Robot, tmp_path: Path) -> None:
-    """With the hash of the run, and the hash of its row and files now."""
+    """The message has the hash of the run, and the current hash of the row and files."""
     folder = run_of(tmp_path / "run", ["goal"], robot=barrow.name)
     episode = load_recorded(folder, "s-000")
     for recorded, why in (
@@ -333,15 +338,14 @@ def test_a_replay_that_differs_names_an_edited_robot(barrow: Robot, tmp_path: Pa
         assert re.search(why, str(error))
 
 
-def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
-    cosim: Cosim, tmp_path: Path
-) -> None:
-    """By `run` and `look`, before anything is read or written; `list` names them."""
+def test_an_unknown_robot_is_refused_with_the_known_ones(cosim: Cosim, tmp_path: Path) -> None:
+    """`run` and `look` refuse it before they read or write a file, and `list` names the known
+    robots."""
     for words in (("run", "reactive", "--out", "run"), ("look", "lh-011-00")):
-        said = cosim(*words, "--robot", "tank", cwd=tmp_path)
+        done = cosim(*words, "--robot", "tank", cwd=tmp_path)
         assert (
-            said.returncode == 2
-            and f"unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}." in said.stderr
+            done.returncode == 2
+            and f"unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}." in done.stderr
         )
     assert not list(tmp_path.iterdir())
     assert "robot   scout  0.50 x 0.40 m, travels at 2 m/s" in cosim("list").stdout
@@ -355,9 +359,9 @@ def test_a_faulty_row_of_the_robot_table_does_not_hide_the_rest_of_the_list(
     monkeypatch.setattr(table, "ROBOTS", {"tank": faulty, **ROBOTS})
     with pytest.raises(SpecError, match="robot 'tank': length_m"):
         print_names(Console(width=200))
-    said = capsys.readouterr().out
-    assert "robot   tank  cannot be used" in said
-    assert "robot   scout  0.50" in said and "goal    final_point" in said
+    output = capsys.readouterr().out
+    assert "robot   tank  cannot be used" in output
+    assert "robot   scout  0.50" in output and "goal    final_point" in output
 
 
 WHEELED = [name for name, one in ROBOTS.items() if isinstance(one.drive, Skid)]
@@ -366,9 +370,9 @@ WHEELED = [name for name, one in ROBOTS.items() if isinstance(one.drive, Skid)]
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", [*WHEELED, "barrow"])
-def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
-    """Its collision body fills the outline, its wheels stand where they should, its mass is where
-    it should be."""
+def test_a_urdf_matches_its_row(name: str, barrow: Robot) -> None:
+    """The collision body fills the outline, and wheels and centre of mass are where the row
+    says."""
     from physics.dynamics.bullet import p
 
     robot = table.robot_called(name)
@@ -401,8 +405,8 @@ def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("name", [*WHEELED, "barrow"])
 def test_every_robot_reaches_its_limits_upright(name: str, barrow: Robot) -> None:
-    """At its pace, at its highest speed in a curve, and turning on the spot: within 5 % of the
-    command."""
+    """At its pace, at its highest speed in a curve, and turning in place, speeds are within 5 % of
+    the command."""
     from physics.dynamics.world import BulletWorld
 
     robot = table.robot_called(name)
@@ -425,9 +429,8 @@ def test_every_robot_reaches_its_limits_upright(name: str, barrow: Robot) -> Non
 
 
 @pytest.mark.engine
-def test_a_third_robot_runs_an_episode_and_everything_follows_it(barrow: Robot) -> None:
-    """Two seconds in a small city, by an option: what engines, referee and policy know of the robot
-    is the row."""
+def test_an_episode_uses_the_row_of_its_robot_everywhere(barrow: Robot) -> None:
+    """In two seconds in a small city, engines, referee and policy use the values of the row."""
     import libsumo
 
     from scenarios.episodes.episode import Episode
@@ -465,11 +468,11 @@ def test_a_third_robot_runs_an_episode_and_everything_follows_it(barrow: Robot) 
 
 
 @pytest.mark.engine
-def test_the_one_way_is_proved_for_the_robot_that_shall_drive_it(
+def test_a_route_is_wide_enough_for_its_robot(
     barrow: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A way built for the third robot is wide enough for it; for one as wide as the sidewalks there
-    is none."""
+    """A route that is built for the third robot is wide enough for it, and a robot as wide as the
+    sidewalks has no route."""
     from scenarios.suites import long_horizon
 
     where = small_scenario().place

@@ -1,4 +1,4 @@
-"""Episodes driven by a ROS 2 node in a process of its own."""
+"""Episodes driven by a ROS 2 node in another process."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ SEEDED = EpisodeOptions(seed=1)
 NAME = "straight-001"
 
 
-class Same:
-    """The rule of the node, in this process."""
+class LocalRule:
+    """The rule of the node as a policy of this process."""
 
     manifest: ClassVar = Manifest(
         "same", rate_hz=10.0, camera=None, goal="route_point", odometry="exact"
@@ -59,7 +59,7 @@ class Same:
 
 @contextmanager
 def node_at(endpoint: str) -> Iterator[None]:
-    """A node in a process of its own, started before the run."""
+    """Run a node in another process, started before the run."""
     words = [sys.executable, "-m", "tests.support.ros2_peer", endpoint]
     with subprocess.Popen(words, cwd=ROOT) as process:
         try:
@@ -70,68 +70,71 @@ def node_at(endpoint: str) -> Iterator[None]:
 
 @contextmanager
 def idle_at(endpoint: str) -> Iterator[None]:
-    """A node that joins the run, and publishes /cmd_vel without sending anything."""
-    there: list[Peer] = []
-    joins = threading.Thread(
-        target=lambda: there.append(Peer(endpoint, name="idle", reads=False)), daemon=True
+    """Run a node that joins the run and publishes /cmd_vel without sending a command."""
+    peers: list[Peer] = []
+    joining = threading.Thread(
+        target=lambda: peers.append(Peer(endpoint, name="idle", reads=False)), daemon=True
     )
-    joins.start()
+    joining.start()
     try:
         yield
     finally:
-        for one in there:
+        for one in peers:
             one.close()
 
 
 @pytest.fixture(scope="module")
-def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the rule as a policy of this process."""
+def local_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run of the rule as a policy of this process."""
     folder = tmp_path_factory.mktemp("runs") / "here"
-    run("unit", Same(), scenarios=[NAME], options=SEEDED, out=folder)
+    run("unit", LocalRule(), scenarios=[NAME], options=SEEDED, out=folder)
     return folder
 
 
-def test_a_node_drives_as_the_same_rule_in_this_process(here: Path, tmp_path: Path) -> None:
-    """Two runs of a node in its own process have the state hash and the commands of the rule as a
-    policy of this process, say how they waited, and end soon after their last episode. A second
-    publisher, which is silent, is shown."""
+def test_a_node_drives_like_the_same_rule_in_this_process(local_run: Path, tmp_path: Path) -> None:
+    """Two runs of a node have the state hash and the commands of the local rule, and end soon after
+    their last episode. A second, silent publisher is reported."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     at = Connection(role="coordinator", listen=endpoint, guests=("ros2",))
     host = PolicyHost(ros2=Ros2Settings(connection=at, camera="none", odometry="exact"))
     chosen = {"scenarios": [NAME], "options": SEEDED}
     with node_at(endpoint):
         for name in ("one", "two"):
-            told: list[tuple[Message, float]] = []
+            received: list[tuple[Message, float]] = []
 
-            def tell(message: Message, told: list[tuple[Message, float]] = told) -> None:
-                told.append((message, time.monotonic()))
+            def record_message(
+                message: Message, received: list[tuple[Message, float]] = received
+            ) -> None:
+                received.append((message, time.monotonic()))
 
             with idle_at(endpoint) if name == "two" else nullcontext():
-                table = run("unit", "ros2:", host=host, out=tmp_path / name, tell=tell, **chosen)  # type: ignore[arg-type]
+                table = run(
+                    "unit", "ros2:", host=host, out=tmp_path / name, tell=record_message, **chosen
+                )  # type: ignore[arg-type]
                 over_s = time.monotonic()
-            (done_s,) = [at_s for message, at_s in told if isinstance(message, Done)]
+            (done_s,) = [at_s for message, at_s in received if isinstance(message, Done)]
             assert over_s - done_s < 0.9 * ENDING_S, "its process was killed"
-            reasons = [message.reason for message, _ in told if isinstance(message, Waits)]
+            reasons = [message.reason for message, _ in received if isinstance(message, Waits)]
             assert sum("two publishers of /cmd_vel" in one for one in reasons) == (name == "two")
             assert table["policy_runs"].tolist() == ["ros2, next"]
             assert table["status"].tolist() == ["done"], table["reason"].tolist()
-    folders = [run / "episodes" / NAME for run in (here, tmp_path / "one", tmp_path / "two")]
+    folders = [run / "episodes" / NAME for run in (local_run, tmp_path / "one", tmp_path / "two")]
     logs = [Log.load(folder / "trajectory.npz") for folder in folders]
     assert all((one.command == logs[0].command).all() for one in logs)
     assert len({Record.load(folder / "record.json").state_hash for folder in folders}) == 1
 
 
-def test_a_bag_is_the_episode_as_a_node_gets_it(here: Path, tmp_path: Path) -> None:
-    """Its counts and stamps are those of the log, /clock rises before stamps of its time, every
-    picture has a transform of its time, and two exports are equal to the byte."""
+def test_a_bag_equals_the_messages_of_a_node(local_run: Path, tmp_path: Path) -> None:
+    """Counts and stamps are those of the log, /clock precedes stamps of its time, every picture has
+    a transform, and two exports are equal to the byte."""
     picture = CameraSpec(64, 40)
     for name in ("a", "b"):
-        count = write_bag(here, NAME, tmp_path / name, picture=picture, camera="bullet")
+        count = write_bag(local_run, NAME, tmp_path / name, picture=picture, camera="bullet")
     files = sorted(file.name for file in (tmp_path / "a").iterdir())
     assert files == ["bag.mcap", "metadata.yaml"]
     for name in files:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-    log = Log.load(here / "episodes" / NAME / "trajectory.npz")
+    log = Log.load(local_run / "episodes" / NAME / "trajectory.npz")
     times: dict[str, list[int]] = {}
     speeds = []
     with Reader(tmp_path / "a") as bag:
@@ -150,4 +153,4 @@ def test_a_bag_is_the_episode_as_a_node_gets_it(here: Path, tmp_path: Path) -> N
     assert speeds == list(map(tuple, log.answers[:, 2:].tolist()))
     assert times["/clock"] == [messages.stamp_ns(tick) for tick in range(len(times["/clock"]))]
     with pytest.raises(UsageError, match="is there already"):
-        write_bag(here, NAME, tmp_path / "a")
+        write_bag(local_run, NAME, tmp_path / "a")

@@ -1,4 +1,4 @@
-"""The sandbox of isolated policies, tried from the inside, in both kinds."""
+"""The sandbox of isolated policies, attacked from inside, in both kinds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.support.graphs import bundle, tiny_graph
 NO_FILE = {"ENOENT", "EACCES"}
 NO_WRITE = {"ENOENT", "EACCES", "EROFS", "EPERM"}
 OWN_FILE = {"done", None}
-"""Where the same user has made the folder: a file of that name in the sandbox's own /tmp."""
+"""If the same user has made the folder: a file of that name in the sandbox's own /tmp."""
 NO_PROCESS = {"ESRCH", "EPERM"}
 NO_SOCKET = {"EPERM"}
 DENIED = {"EPERM"}
@@ -94,8 +94,8 @@ OUTCOMES: dict[str, object] = {
     "core": 0,
     "signal all": {"done", "ESRCH"},
 }
-"""What comes of each attempt of `tests/support/sandbox_probe.py`: a value, or a set of
-those that either kind may give."""
+"""Expected result of each attempt of `tests/support/sandbox_probe.py`: a value, or the set of
+results that either kind of sandbox may give."""
 
 _FILLS = """
 from cosim.core.state import Command
@@ -115,7 +115,7 @@ class Fills:
 
 @pytest.fixture(params=KINDS)
 def kind(request: pytest.FixtureRequest) -> Isolation:
-    """A kind of sandbox that the kernel offers."""
+    """Return a kind of sandbox that the kernel offers."""
     one: Isolation = request.param
     if why := sandbox_lacks(one):
         pytest.skip(f"this kernel offers no {one}: {why}")
@@ -123,8 +123,8 @@ def kind(request: pytest.FixtureRequest) -> Isolation:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the policy of the probe, a run inside, and files beside it."""
+def policy_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with the probe policy, a run inside, and adjacent files."""
     own = tmp_path / "own"
     (own / "runs/now").mkdir(parents=True)
     (own / "runs/now/run.json").write_text("{}")
@@ -143,13 +143,13 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def listeners(desk: Path) -> Iterator[dict[str, object]]:
-    """Sockets that a policy must not reach."""
+def listeners(policy_folder: Path) -> Iterator[dict[str, object]]:
+    """Open sockets that a policy must not reach."""
     with ExitStack() as stack:
         tcp = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
         for how, address in (
-            (socket.SOCK_STREAM, str(desk / "stream")),
-            (socket.SOCK_DGRAM, str(desk / "datagram")),
+            (socket.SOCK_STREAM, str(policy_folder / "stream")),
+            (socket.SOCK_DGRAM, str(policy_folder / "datagram")),
             (socket.SOCK_STREAM, f"\0cosim-{os.getpid()}"),
         ):
             end = stack.enter_context(socket.socket(socket.AF_UNIX, how))
@@ -160,8 +160,8 @@ def listeners(desk: Path) -> Iterator[dict[str, object]]:
                 Path(address).chmod(0o777)
         yield {
             "port": tcp.getsockname()[1],
-            "socket": str(desk / "stream"),
-            "datagram": str(desk / "datagram"),
+            "socket": str(policy_folder / "stream"),
+            "datagram": str(policy_folder / "datagram"),
             "abstract": f"cosim-{os.getpid()}",
         }
 
@@ -172,32 +172,38 @@ def users_of_policies() -> set[int]:
 
 
 def test_a_policy_in_a_sandbox_reaches_nothing_outside(
-    kind: Isolation, desk: Path, listeners: dict[str, object], capfd: pytest.CaptureFixture[str]
+    kind: Isolation,
+    policy_folder: Path,
+    listeners: dict[str, object],
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """Files, processes, sockets, signals, memory and limits: each attempt fails as the table
-    says, and nothing outside has changed."""
-    data = desk / "data.txt"
+    """Every attempt on files, processes, sockets, signals, memory and limits fails as the table
+    says, and nothing outside changes."""
+    data = policy_folder / "data.txt"
     host = PolicyHost(
-        isolated=kind, data=(str(data),), hidden=(str(desk / "own/runs/now"),), memory_gb=2.0
+        isolated=kind,
+        data=(str(data),),
+        hidden=(str(policy_folder / "own/runs/now"),),
+        memory_gb=2.0,
     )
-    mode = (desk / "outside.txt").stat().st_mode
+    mode = (policy_folder / "outside.txt").stat().st_mode
     driver = isolated_caller("probe:Probe", host=host)
     user = max(users_of_policies())
     victim = subprocess.Popen(["sleep", "600"], user=user if os.getuid() == 0 else None)
     targets = {
-        "outside": str(desk / "outside.txt"),
+        "outside": str(policy_folder / "outside.txt"),
         "data": str(data),
-        "run": str(desk / "own/runs/now"),
+        "run": str(policy_folder / "own/runs/now"),
         "suite": str(ROOT / "scenarios/suites/reactive.json"),
         "tests": str(ROOT / "tests/conftest.py"),
-        "cwd": str(desk),
+        "cwd": str(policy_folder),
         "parent": os.getpid(),
         "victim": victim.pid,
         "secrets": ["COSIM_CACHE", "SECRET_TOKEN", "PYTEST_CURRENT_TEST"],
         "user": user,
         **listeners,
     }
-    (desk / "own/targets.json").write_text(json.dumps(targets))
+    (policy_folder / "own/targets.json").write_text(json.dumps(targets))
     try:
         driver.reset("e1", 1)
         assert driver.runs == f"isolated: {kind}"
@@ -206,8 +212,8 @@ def test_a_policy_in_a_sandbox_reaches_nothing_outside(
         alive = victim.poll() is None
         victim.kill()
         victim.wait()
-    said = capfd.readouterr().err
-    (line,) = (one for one in said.splitlines() if one.startswith("PROBED "))
+    errors = capfd.readouterr().err
+    (line,) = (one for one in errors.splitlines() if one.startswith("PROBED "))
     found = json.loads(line.removeprefix("PROBED "))
     wrong = {
         name: found.get(name)
@@ -215,25 +221,25 @@ def test_a_policy_in_a_sandbox_reaches_nothing_outside(
         if not (found.get(name) in one if isinstance(one, set) else found.get(name) == one)
     }
     assert not wrong and found.keys() == OUTCOMES.keys()
-    outside = desk / "outside.txt"
+    outside = policy_folder / "outside.txt"
     assert alive and (outside.read_text(), outside.stat().st_mode) == ("a secret", mode)
-    assert [path.name for path in (desk / "own/runs/now").iterdir()] == ["run.json"]
+    assert [path.name for path in (policy_folder / "own/runs/now").iterdir()] == ["run.json"]
 
 
-def test_the_error_of_a_missing_file_names_the_remedy(kind: Isolation, desk: Path) -> None:
+def test_the_error_of_a_missing_file_names_the_remedy(kind: Isolation, policy_folder: Path) -> None:
     """The error names `--policy-data`, with which the policy loads."""
     host = PolicyHost(isolated=kind)
     with pytest.raises(UsageError, match=r"outside\.txt.*--policy-data PATH"):
         isolated_caller("probe:Lost", host=host)
-    given = msgspec.structs.replace(host, data=(str(desk / "outside.txt"),))
+    given = msgspec.structs.replace(host, data=(str(policy_folder / "outside.txt"),))
     isolated_caller("probe:Lost", host=given).close()
 
 
 def test_a_policy_that_fills_its_descriptors_gets_a_new_process(
-    kind: Isolation, desk: Path
+    kind: Isolation, policy_folder: Path
 ) -> None:
     """Its process ends after the episode, also where /proc cannot be read."""
-    (desk / "own/fills.py").write_text(_FILLS)
+    (policy_folder / "own/fills.py").write_text(_FILLS)
     driver = isolated_caller("fills:Fills", host=PolicyHost(isolated=kind))
     spent = []
     for files in (0, 600):
@@ -247,7 +253,7 @@ def test_a_policy_that_fills_its_descriptors_gets_a_new_process(
 def test_a_bundle_loads_in_a_sandbox(
     kind: Isolation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An ONNX bundle, by a relative name: the same graph as outside."""
+    """An ONNX bundle with a relative name has the same graph as outside."""
     monkeypatch.chdir(tmp_path)
     bundle(tmp_path / "net", tiny_graph())
     driver = isolated_caller("onnx:net", host=PolicyHost(isolated=kind))
@@ -256,16 +262,16 @@ def test_a_bundle_loads_in_a_sandbox(
 
 
 def test_a_policy_in_a_shared_folder_is_refused(
-    desk: Path, monkeypatch: pytest.MonkeyPatch
+    policy_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A home folder would show all that is in it."""
-    monkeypatch.setenv("HOME", str(desk / "own"))
+    """A policy in the home folder would see all files there."""
+    monkeypatch.setenv("HOME", str(policy_folder / "own"))
     with pytest.raises(UsageError, match="put it in a folder of its own"):
         isolated_caller("probe:Probe")
 
 
 @pytest.mark.parametrize(
-    ("denied", "said"),
+    ("denied", "message"),
     [
         (("unshare",), "isolated: landlock"),
         (("unshare", "landlock_create_ruleset"), "--isolated=weak runs the policy in another"),
@@ -273,10 +279,9 @@ def test_a_policy_in_a_shared_folder_is_refused(
     ids=["no namespaces", "no sandbox"],
 )
 def test_without_namespaces_a_policy_runs_under_landlock_or_not_at_all(
-    denied: tuple[str, ...], said: str
+    denied: tuple[str, ...], message: str
 ) -> None:
-    """Where the kernel denies the calls of both kinds, the message names the steps and the
-    remedy."""
+    """Where the kernel denies both kinds, the message names the steps and the remedy."""
     code = f"""
 from cosim.core.errors import MachineError
 from scenarios.ipc.kernel_calls import drop_privileges, filter_calls, prctl
@@ -292,14 +297,14 @@ except MachineError as error:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     if "landlock: find Landlock" in done.stdout and len(denied) == 1:
         pytest.skip(done.stdout)
-    assert said in done.stdout, done
+    assert message in done.stdout, done
     if len(denied) == 2:
         assert "namespaces: create user, mount, PID, IPC and network namespaces" in done.stdout
         assert "landlock: find Landlock: Operation not permitted" in done.stdout
 
 
 def test_without_landlocks_scope_a_process_signals_only_itself() -> None:
-    """The rules for older kernels: a signal to the parent fails, and abort works."""
+    """Under the rules for older kernels a signal to the parent fails, and abort works."""
     code = """
 import os
 from scenarios.ipc.kernel_calls import filter_calls, prctl
@@ -317,7 +322,7 @@ os.abort()
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--policy-data", "."), "--policy-data goes with --isolated"),
         (("--isolated=weak", "--policy-memory", "2"), "--policy-memory goes with --isolated"),
@@ -328,8 +333,9 @@ os.abort()
     ids=["alone", "weak", "missing", "kind", "privileged"],
 )
 def test_options_of_isolation_are_checked(
-    words: tuple[str, ...], said: str, cosim: Cosim, tmp_path: Path
+    words: tuple[str, ...], message: str, cosim: Cosim, tmp_path: Path
 ) -> None:
-    """Before anything runs; `--isolated` takes no value without "="."""
+    """Invalid combinations are refused before anything runs, and `--isolated` takes a value only
+    after "="."""
     done = cosim("run", *words, "reactive", "--policy", "route", cwd=tmp_path)
-    assert done.returncode == 2 and said in done.stderr, done.stderr
+    assert done.returncode == 2 and message in done.stderr, done.stderr

@@ -1,4 +1,4 @@
-"""Importing scans: bad inputs, the order of files, real scans, the command line."""
+"""Import of scans: faulty inputs, the order of files, real scans, and the command line."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ Spoil = Callable[[Path], dict[str, Any] | None]
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A good scan, to be copied."""
+def good_scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a valid scan, to be copied."""
     folder = write_street(tmp_path_factory.mktemp("scans") / "street")
     _draw(folder, [("sidewalk", (1, -4, LENGTH_M - 1, -1))])
     return folder
 
 
 @pytest.fixture
-def scan(made: Path, tmp_path: Path) -> Path:
-    """A copy of the good scan."""
-    return Path(shutil.copytree(made, tmp_path / "street"))
+def scan(good_scan: Path, tmp_path: Path) -> Path:
+    """Return a copy of the valid scan."""
+    return Path(shutil.copytree(good_scan, tmp_path / "street"))
 
 
 def _draw(folder: Path, areas: list[tuple[str, tuple[float, ...]]]) -> None:
@@ -79,8 +79,8 @@ def _draw(folder: Path, areas: list[tuple[str, tuple[float, ...]]]) -> None:
         }
         for kind, box in areas
     ]
-    whole = {"type": "FeatureCollection", "frame": "local", "features": features}
-    (folder / "areas.geojson").write_text(json.dumps(whole))
+    collection = {"type": "FeatureCollection", "frame": "local", "features": features}
+    (folder / "areas.geojson").write_text(json.dumps(collection))
 
 
 def _check(folder: Path, **given: Any) -> CheckedScan:
@@ -89,15 +89,15 @@ def _check(folder: Path, **given: Any) -> CheckedScan:
 
 
 def _words(folder: Path, **given: Any) -> list[str]:
-    """What is said about a scan: its findings, or the error."""
+    """Return the findings of a scan, or its error."""
     try:
         return [str(one) for one in _check(folder, **given).findings]
     except CosimError as error:
         return [f"refused: {error}"]
 
 
-def test_a_good_scan_passes_all_checks(scan: Path) -> None:
-    """Nothing is warned of but the coverage, of which a lone street has little; no good splat is removed."""
+def test_a_valid_scan_passes_all_checks(scan: Path) -> None:
+    """The only warning is of the coverage, which a single street lacks, and no splat is removed."""
     checked = _check(scan)
     levels = {one.level for one in checked.findings if "coverage" not in one.words}
     assert levels == {"note"}
@@ -173,7 +173,7 @@ def _without(name: str) -> Spoil:
 
 
 def _as_ply(folder: Path) -> dict[str, Any]:
-    """The mesh as .ply, which states neither unit nor axes, in centimetres."""
+    """Write the mesh as .ply, which states neither unit nor axes, in centimetres."""
     street().moved(100.0 * np.eye(3)).mesh().export(folder / "mesh.ply")
     (folder / "mesh.glb").unlink()
     return {}
@@ -187,7 +187,7 @@ def _drawn(*areas: tuple[str, tuple[float, ...]]) -> Spoil:
 
 
 def _punched(folder: Path) -> dict[str, Any]:
-    """A mesh without ground at x from 10 to 14."""
+    """Write a mesh without ground at x from 10 to 14."""
     place = street()
     middle = place.vertices[place.triangles].mean(axis=1)
     hole = (np.abs(middle[:, 0] - 12) < 2) & (middle[:, 2] < 0.01)
@@ -320,11 +320,12 @@ BAD: dict[str, tuple[Spoil, str]] = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_scan_is_described_in_one_line(scan: Path, name: str) -> None:
-    """Each fault gives one line with the measured value and, where the scan is refused, a remedy."""
+    """Each fault gives one line with the measured value and, where the scan is refused, a
+    remedy."""
     spoil, wanted = BAD[name]
-    said = _words(scan, **(spoil(scan) or {}))
-    found = [words for words in said if re.search(wanted, words)]
-    assert len(found) == 1, said
+    lines = _words(scan, **(spoil(scan) or {}))
+    found = [words for words in lines if re.search(wanted, words)]
+    assert len(found) == 1, lines
     assert "\n" not in found[0]
     if not found[0].startswith(("warning", "removed")):
         assert found[0].startswith("refused: ")
@@ -333,7 +334,8 @@ def test_a_bad_scan_is_described_in_one_line(scan: Path, name: str) -> None:
 def test_too_many_splats_are_refused_and_reduced_by_option(
     scan: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The budget is told with the option that reduces; the least visible splats go."""
+    """The error names the limit and the option that reduces splats, which drops the least visible
+    ones."""
     monkeypatch.setattr(scan_sources, "BUDGET", 10_000)
     (words,) = _words(scan)
     assert "12000 splats; at most 10000 are imported: reduce them with --most-splats 5000" in words
@@ -348,15 +350,17 @@ def test_too_many_splats_are_refused_and_reduced_by_option(
 
 
 def test_rotations_in_another_order_are_noticed(scan: Path) -> None:
-    """Flat splats that were read in the wrong order do not lie along the mesh."""
+    """Flat splats that are read in the wrong order do not lie along the mesh."""
     cloud = splats_of(street())
     (scan / "splats.ply").write_bytes(gaussian_ply(cloud, order="xyzw"))
     assert any("try --quaternions xyzw" in words for words in _words(scan))
-    assert not any("--quaternions" in words for words in _words(scan, quaternions="xyzw"))
+    lines = _words(scan, quaternions="xyzw")
+    assert lines and not any("--quaternions" in words for words in lines)
+    assert _refused(lines) == []
 
 
-def test_mirrored_and_flipped_meshes_are_mended_by_option(scan: Path) -> None:
-    """--mirror gives the mesh of the unmirrored file; --flip turns its triangles alone."""
+def test_mirrored_and_flipped_meshes_are_repaired_by_option(scan: Path) -> None:
+    """--mirror gives the mesh of the unmirrored file, and --flip turns only its triangles."""
     (scan / "splats.ply").unlink()
     wanted = _check(scan).scan
     assert wanted is not None
@@ -375,9 +379,9 @@ def test_mirrored_and_flipped_meshes_are_mended_by_option(scan: Path) -> None:
 
 
 @pytest.mark.engine
-def test_the_order_of_rows_changes_no_bit_of_what_is_stored(scan: Path, tmp_path: Path) -> None:
-    """Shuffled triangles, vertices and splats, split over several files, on one processor: the same
-    hashes. One splat changed: another hash of the splats, the same map."""
+def test_the_order_of_rows_changes_no_stored_bit(scan: Path, tmp_path: Path) -> None:
+    """Shuffled triangles, vertices and splats, split over several files and read on one processor,
+    have the same hashes. A changed splat changes only the hash of splats."""
     options = read_options(scan, {"areas": str(scan / "areas.geojson"), **GIVEN, "name": "scan-a"})
     import_scan(scan, options)
     random = np.random.default_rng(3)
@@ -418,10 +422,9 @@ def _given_of(options: Any) -> dict[str, Any]:
 def test_a_generated_street_is_recovered_from_a_corrupted_export(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """In centimetres, y up, turned by 33 degrees, at UTM coordinates, with 5 % of the triangles lost
-    and 3 cm of noise: heights to 3 cm, the walkable area to 95 %, ways to 1 %; and the oracle solves
-    the same scenario, two with --whole, within the time limit that its time on the good scan
-    gives."""
+    """An export in centimetres, y up, turned by 33 degrees, at UTM coordinates, with noise and lost
+    triangles keeps heights, areas and paths. The oracle solves the same scenario within the limit
+    of the clean scan, two with --whole."""
     clean = tmp_path / "clean"
     city = City(seed=7, size_m=300.0)
     x0, y0, x1, y1 = crossing_box(place(city)[1])
@@ -437,11 +440,11 @@ def test_a_generated_street_is_recovered_from_a_corrupted_export(
     random = np.random.default_rng(5)
     mesh = wanted.mesh
     noisy = mesh.vertices + random.normal(0, 0.03, mesh.vertices.shape)
-    there = ((noisy @ turn.T + offset) * 100.0) @ y_up.T
+    exported = ((noisy @ turn.T + offset) * 100.0) @ y_up.T
     rows = random.random(len(mesh.triangles)) > 0.05
     folder = tmp_path / "spoiled"
     folder.mkdir()
-    _write_ply(folder / "mesh.ply", there, mesh.triangles[rows], mesh.colours)
+    _write_ply(folder / "mesh.ply", exported, mesh.triangles[rows], mesh.colours)
     given = {"scale": 0.01, "up": "+y", "georeference": _system("EPSG:25833")}
     matrix = np.array(scan_sources.load_mesh(folder, read_options(folder, given))[0].matrix)
 
@@ -487,7 +490,7 @@ def _write_ply(
     triangles: NDArray[np.int32],
     colours: NDArray[np.uint8],
 ) -> None:
-    """Binary, with doubles."""
+    """Write a binary .ply with doubles."""
     head = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
         + "".join(f"property double {name}\n" for name in "xyz")
@@ -505,7 +508,7 @@ def _write_ply(
 def test_the_command_line_imports_checks_and_shows(
     cosim: Cosim, scan: Path, tmp_path: Path
 ) -> None:
-    """Options come from scan.json, and the picture shows the areas; wrong input ends with 2."""
+    """Options come from scan.json, the picture shows the areas, and wrong input ends with 2."""
     (scan / "scan.json").write_text(
         json.dumps(
             {"splat_scale": 1.0, "splat_up": "+z", "areas": "areas.geojson", "licence": "CC0"}
@@ -538,7 +541,7 @@ def test_the_command_line_imports_checks_and_shows(
 @pytest.mark.engine
 @pytest.mark.skipif(not SHARED.is_dir(), reason="no shared scans beside the repository")
 def test_a_street_in_lund_is_imported(tmp_path: Path) -> None:
-    """Its way lies on its ground; its splats agree with its mesh, and lack coverage."""
+    """The walked path lies on its ground; the splats agree with the mesh and lack coverage."""
     for name in ("lund_street_ground.glb", "lund_street_obstacles.glb"):
         shutil.copy(SHARED / "lund-street" / name, tmp_path)
     shutil.copy(SHARED / "lund-street-splats" / "lund_street.ply", tmp_path)
@@ -554,8 +557,7 @@ def test_a_street_in_lund_is_imported(tmp_path: Path) -> None:
 
 
 def test_the_documented_options_are_those_of_the_import(tmp_path: Path) -> None:
-    """The scan.json and the path of the page are read, and its table names every key and
-    option."""
+    """The documented scan.json and path are read, and the table names every key and option."""
     options, path = blocks("json", "docs/scans.md")
     (tmp_path / "scan.json").write_text(options.text)
     (tmp_path / "walk.geojson").write_text(path.text)
@@ -571,7 +573,8 @@ def test_the_documented_options_are_those_of_the_import(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="no shared scans beside the repository")
 def test_trained_splats_in_a_wrong_frame_are_refused(tmp_path: Path) -> None:
-    """The transform of Lund's photos is for the photos' frame; its trained splats are in metres."""
+    """The trained splats of Lund are in metres, and the transform of its photos does not fit
+    them."""
     for name in ("lund_street_ground.glb", "lund_street_obstacles.glb"):
         shutil.copy(SHARED / "lund-street" / name, tmp_path)
     trained = SHARED / "lund-street-trained"
@@ -585,19 +588,20 @@ def test_trained_splats_in_a_wrong_frame_are_refused(tmp_path: Path) -> None:
     )
     assert "--splat-scale 1 --splat-up +z fits" in words
     found = check_scan(tmp_path, read_options(tmp_path, {**GIVEN, **way}))
-    said = {one.level: [] for one in found.findings}
+    by_level = {one.level: [] for one in found.findings}
     for one in found.findings:
-        said[one.level].append(one.words)
-    assert "refused" not in said
-    assert "removed 5109 splats: over 300 m from the mesh" in " ".join(said["note"])
-    warned = " ".join(said["warning"])
+        by_level[one.level].append(one.words)
+    assert "refused" not in by_level
+    assert "removed 5109 splats: over 300 m from the mesh" in " ".join(by_level["note"])
+    warned = " ".join(by_level["warning"])
     assert "splats to mesh: 0.0" in warned
     assert "coverage" in warned
 
 
 @pytest.mark.engine
 def test_areas_come_from_openstreetmap_through_the_georeference(tmp_path: Path) -> None:
-    """Around a crossing of the village, roads and sidewalks are where its nodes are; the net is built."""
+    """Around a crossing of the village, roads and sidewalks are where its nodes are, and the net is
+    built."""
     side = np.linspace(-45, 45, 181)
     x, y = (one.ravel() for one in np.meshgrid(side, side, indexing="ij"))
     at = (np.arange(180)[:, None] * 181 + np.arange(180)).ravel()
@@ -627,8 +631,8 @@ def test_areas_come_from_openstreetmap_through_the_georeference(tmp_path: Path) 
 
 
 def test_a_heading_turns_the_scan_to_north(tmp_path: Path) -> None:
-    """Latitude and longitude alone state the assumed heading and the remedy; with a heading, +y of the
-    scan points there, and a system of coordinates has none."""
+    """Without a heading the finding states the assumed one and the remedy. With a heading, +y of
+    the scan points there; a coordinate system has no heading."""
     (tmp_path / "mesh.glb").write_bytes(glb(street()))
 
     def loaded(words: str) -> scan_sources.LoadedScan:
@@ -636,13 +640,13 @@ def test_a_heading_turns_the_scan_to_north(tmp_path: Path) -> None:
         return scan_sources.load_mesh(tmp_path, read_options(tmp_path, given))[0]
 
     plain, stated, east = (loaded(f"55.698,13.195{rest}") for rest in ("", ",0", ",90"))
-    said = [one.words for one in plain.findings if "is taken as north, heading 0" in one.words]
-    assert len(said) == 1 and "third number of --georeference" in said[0]
+    assumed = [one.words for one in plain.findings if "is taken as north, heading 0" in one.words]
+    assert len(assumed) == 1 and "third number of --georeference" in assumed[0]
     assert not any("taken as north" in one.words for one in (*stated.findings, *east.findings))
     assert np.array_equal(plain.mesh.vertices, stated.mesh.vertices)
     turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-    there = np.array(sorted((plain.mesh.vertices @ turn.T).round(4).tolist()))
-    assert np.array(sorted(east.mesh.vertices.round(4).tolist())) == pytest.approx(there, abs=1e-3)
+    turned = np.array(sorted((plain.mesh.vertices @ turn.T).round(4).tolist()))
+    assert np.array(sorted(east.mesh.vertices.round(4).tolist())) == pytest.approx(turned, abs=1e-3)
     with pytest.raises(CosimError, match=r"heading_deg is 720, but must be -360 to 360"):
         loaded("55.698,13.195,720")
     (tmp_path / "scan.json").write_text('{"georeference": {"crs": "EPSG:25833", "heading_deg": 3}}')
@@ -652,31 +656,31 @@ def test_a_heading_turns_the_scan_to_north(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("heading", ["", ",33"])
 def test_the_remedy_of_a_tilted_scan_levels_it(scan: Path, heading: str) -> None:
-    """The refusal has the transforms for scan.json; with them the ground is level, and the splats are
-    on the mesh."""
+    """The refusal has the transforms for scan.json; with them the ground is level, and the splats
+    are on the mesh."""
     turn = _turned(12.0)
     (scan / "mesh.glb").write_bytes(glb(turn(street())))
     cloud = splats_of(street())
     cloud.centres = turn(Street(cloud.centres, street().triangles, street().colours)).vertices
     (scan / "splats.ply").write_bytes(gaussian_ply(cloud))
-    there = {"georeference": parse_georeference(f"55.698,13.195{heading}")}
-    (words,) = _refused(_words(scan, **there))
+    given = {"georeference": parse_georeference(f"55.698,13.195{heading}")}
+    (words,) = _refused(_words(scan, **given))
     found = re.search(r'this in scan\.json, in place of scale and up: ("transform".*\]\])$', words)
     assert found is not None, words
     (scan / "scan.json").write_text("{" + found[1] + "}")
-    again = _words(scan, splat_scale=None, splat_up=None, areas=None, **there)
-    assert _refused(again) == []
-    (level,) = (one for one in again if "degrees off the up axis" in one)
+    repaired = _words(scan, splat_scale=None, splat_up=None, areas=None, **given)
+    assert _refused(repaired) == []
+    (level,) = (one for one in repaired if "degrees off the up axis" in one)
     assert float(level.split()[4]) < 0.3
-    assert any(re.search(r"splats to mesh: 0\.0", one) for one in again)
+    assert any(re.search(r"splats to mesh: 0\.0", one) for one in repaired)
 
 
-def _refused(said: list[str]) -> list[str]:
-    return [words for words in said if words.startswith("refused")]
+def _refused(lines: list[str]) -> list[str]:
+    return [words for words in lines if words.startswith("refused")]
 
 
-def test_texture_and_obj_names_are_known(tmp_path: Path) -> None:
-    """An .obj with its texture in another file is read from a folder, with the texture's colour."""
+def test_an_obj_with_a_texture_is_read(tmp_path: Path) -> None:
+    """Vertices have the colour of a texture in another file, and a missing texture is reported."""
     from PIL import Image
 
     mesh = street().mesh()

@@ -1,4 +1,4 @@
-"""An imported generated scan: its looks show the same street, and robots stand on its mesh."""
+"""An imported generated scan: both looks show the same street, and robots stand on its mesh."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ NEAR_M = 20.0
 
 
 @pytest.fixture(scope="module")
-def looks(tmp_path_factory: pytest.TempPathFactory) -> CityMap:
-    """A generated scan of 30 x 30 m."""
+def looks_map(tmp_path_factory: pytest.TempPathFactory) -> CityMap:
+    """Return a generated scan of 30 x 30 m."""
     folder = tmp_path_factory.mktemp("scans") / "looks"
     city = City(seed=7, size_m=300.0)
     x0, y0, x1, y1 = crossing_box(surface_of_place(city).street_map)
@@ -44,14 +44,14 @@ def looks(tmp_path_factory: pytest.TempPathFactory) -> CityMap:
 
 
 @pytest.mark.engine
-def test_a_record_has_the_look_that_the_cameras_saw(looks: CityMap) -> None:
-    """The splats' hash and the sun with a camera, no splats with the mesh's look, nothing without a
-    camera; the state is the same."""
+def test_a_record_has_the_look_that_the_cameras_saw(looks_map: CityMap) -> None:
+    """A record has the splats' hash and the sun with a camera, no splats with the mesh's look, and
+    no look without a camera. The state is the same."""
     line = max(read_map("looks").strips.values(), key=lambda strip: strip.length_m).line[:, :2]
     scenario = Scenario(
         id="look",
         suite="looks",
-        place=looks,
+        place=looks_map,
         seed=0,
         start=(*line[0].tolist(), math.atan2(*(line[1] - line[0])[::-1])),
         goal=tuple(line[-1].tolist()),
@@ -86,10 +86,10 @@ def test_a_record_has_the_look_that_the_cameras_saw(looks: CityMap) -> None:
 
 
 @pytest.mark.engine
-def test_the_splats_of_a_scan_match_its_mesh(looks: CityMap) -> None:
-    """Over drawn poses on a generated scan, pictures agree to 24 dB, depths to 5 cm for 90 % of the
-    pixels within 20 m, and labels for 97 %."""
-    surface = surface_of_place(looks)
+def test_the_splats_of_a_scan_match_its_mesh(looks_map: CityMap) -> None:
+    """At drawn poses pictures agree to 24 dB, depths to 5 cm for 90 % of the pixels within 20 m,
+    and labels for 97 %."""
+    surface = surface_of_place(looks_map)
     assert surface.scan is not None
     walkable = [a.polygon for a in surface.scan.areas if a.kind in ("sidewalk", "crossing")]
     ground = shapely.buffer(shapely.union_all(walkable), -0.6)
@@ -122,10 +122,10 @@ STARTS = 1000
 
 
 @pytest.mark.engine
-def test_robots_stand_on_the_mesh_wherever_they_start(looks: CityMap) -> None:
-    """At 1,000 random places of the walkable area, after 0.1 s, the robot has not moved, and its base
-    is within 2 cm of the mean height of the mesh under its wheels."""
-    surface = surface_of_place(looks)
+def test_robots_stand_on_the_mesh_wherever_they_start(looks_map: CityMap) -> None:
+    """At 1,000 random places the robot has not moved after 0.1 s, and its base is within 2 cm of
+    the mesh under its wheels."""
+    surface = surface_of_place(looks_map)
     assert surface.scan is not None
     inside = shapely.buffer(read_map("looks").walkable, -0.5)
     rng = np.random.default_rng(4)

@@ -47,7 +47,7 @@ def test_a_generated_scan_has_the_ground_of_its_street(tmp_path: Path) -> None:
 
 
 def test_a_scan_is_generated_again_to_the_byte(tmp_path: Path) -> None:
-    """A small box gives the same files twice."""
+    """Two scans of a small box have the same files."""
     x0, y0, x1, y1 = crossing_box(surface_of_place(CITY).street_map)
     box = (x0 + 28.0, y0 + 18.0, x1 - 28.0, y1 - 18.0)
     for folder in ("a", "b"):

@@ -1,4 +1,4 @@
-"""The look of a scan is only a look: the simulated state does not depend on it."""
+"""The look of a scan does not change the simulated state."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CAMERA = CameraSpec(width=64, height=36)
 
 
 class Swaying:
-    """Drives on in curves, with a camera or without; keeps the pictures that it gets."""
+    """Drives in curves, with or without a camera, and stores its pictures."""
 
     def __init__(self, camera: CameraSpec | None, w_radps: float = 0.2) -> None:
         self._w_radps = w_radps
@@ -44,8 +44,8 @@ class Swaying:
 
 @pytest.mark.engine
 def test_the_look_of_a_scan_never_changes_the_state(tmp_path: Path) -> None:
-    """With mesh, splats and without a camera an episode with people has the same hash of states;
-    the pictures differ. Driven otherwise, it has another hash."""
+    """With mesh, with splats and without a camera an episode with people has the same state hash
+    and other pictures; other commands have another hash."""
     city = City(seed=7, size_m=300.0)
     x0, y0, x1, y1 = crossing_box(place(city)[1])
     folder = tmp_path / "states"

@@ -1,4 +1,4 @@
-"""Straight scenarios on scans: drawn over the pieces of their net, as wide as the ground is."""
+"""Straight scenarios on scans: drawn over the pieces of their net, as wide as the ground."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ WIDTHS_M = (2.3, 3.0, 4.5, 6.0)
 
 
 def _bent_way() -> np.ndarray:
-    """A path of 120 m that turns by 4 or 8 degrees every 15 m, there and back."""
+    """Return a path of 120 m that turns by 4 or 8 degrees every 15 m, in both directions."""
     turns = np.radians([0, 4, 0, 8, 0, 4, 8, 4])
     steps = 15.0 * np.column_stack([np.cos(turns), np.sin(turns)])
     return np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)])
 
 
 def _corridor(width_m: float, folder: Path) -> StreetMap:
-    """The map of a corridor along the path, with posts off its middle and in wide corridors."""
+    """Return the map of a corridor along the path, with posts off its middle and in wide
+    corridors."""
     way = _bent_way()
     (x0, y0), (x1, y1) = way.min(axis=0) - 12.0, way.max(axis=0) + 12.0
     grid = flat_grid(x0, y0, x1, y1)
@@ -51,7 +52,7 @@ def _corridor(width_m: float, folder: Path) -> StreetMap:
 
 @pytest.fixture(scope="module")
 def corridors(tmp_path_factory: pytest.TempPathFactory) -> dict[float, StreetMap]:
-    """Maps of the corridor, by width."""
+    """Return maps of the corridor, by width."""
     folder = tmp_path_factory.mktemp("corridors")
     return {width_m: _corridor(width_m, folder / f"{width_m:g}") for width_m in WIDTHS_M}
 
@@ -63,7 +64,7 @@ def capacities(corridors: dict[float, StreetMap]) -> dict[float, Capacity]:
 
 def test_a_wider_corridor_never_has_fewer_places(capacities: dict[float, Capacity]) -> None:
     """The number of places of each event and of straight ways grows with the width, in spite of
-    slight bends and of obstacles that only wide corridors contain."""
+    bends and of obstacles in wide corridors."""
     for name in (*EVENT_KINDS, "straight"):
         counts = [
             {**capacity.events, **capacity.structures}[name].found
@@ -76,8 +77,7 @@ def test_a_wider_corridor_never_has_fewer_places(capacities: dict[float, Capacit
 def test_the_check_of_a_scan_offers_what_is_drawn(
     corridors: dict[float, StreetMap], capacities: dict[float, Capacity]
 ) -> None:
-    """An event fits by the check on the corridors on which it is drawn for each of four seeds, and
-    on no others."""
+    """The check offers an event on exactly the corridors on which each of four seeds draws it."""
     for width_m, street_map in corridors.items():
         graph = WalkGraph(street_map)
         for name, kind in EVENT_KINDS.items():
@@ -94,7 +94,7 @@ def _fits(kind: EventKind, street_map: StreetMap, graph: WalkGraph, seed: int) -
     return True
 
 
-def test_ways_over_pieces_have_the_ground_that_they_state(
+def test_routes_over_pieces_have_the_stated_ground(
     corridors: dict[float, StreetMap],
 ) -> None:
     """Routes lead from one piece of the net to another, and the ground is walkable on both sides as
@@ -102,25 +102,25 @@ def test_ways_over_pieces_have_the_ground_that_they_state(
     street_map = corridors[4.5]
     graph = WalkGraph(street_map)
     pieces = [strip.polygon for strip in street_map.strips.values()]
-    joined = 0
+    crossings = 0
     for seed in range(8):
-        whole = build_reactive(
+        drawn = build_reactive(
             EVENT_KINDS["frontal"], CityMap(map="corridor"), street_map, graph, seed, "frontal"
         )
-        (event,) = whole.events
-        line = shapely.LineString(whole.route)
+        (event,) = drawn.events
+        line = shapely.LineString(drawn.route)
         ground = shapely.buffer(line, event.half_width_m - 0.01, cap_style="flat")
         assert street_map.walkable.covers(ground)
-        joined += sum(one.intersects(line) for one in pieces) > 1
+        crossings += sum(one.intersects(line) for one in pieces) > 1
         straight = build_unit(
             "straight", CityMap(map="corridor"), street_map, graph, seed, "straight"
         )
-        joined += sum(one.intersects(shapely.LineString(straight.route)) for one in pieces) > 1
-    assert joined >= 2
+        crossings += sum(one.intersects(shapely.LineString(straight.route)) for one in pieces) > 1
+    assert crossings >= 2
 
 
 def test_stretches_cover_the_corridor(corridors: dict[float, StreetMap]) -> None:
-    """Corridors that are cut into more pieces have the same stretches."""
+    """Corridors with more pieces have the same stretches."""
     counts = set()
     for street_map in corridors.values():
         stretches = sidewalks_of(street_map, WalkGraph(street_map))

@@ -1,4 +1,4 @@
-"""Suites on scans: what is drawn on small drawn areas."""
+"""Suites on scans, drawn on small areas."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CORRIDOR = [ScanArea("sidewalk", shapely.box(0.0, 0.0, 120.0, 3.0))]
 
 @pytest.fixture(scope="module", autouse=True)
 def maps(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A street and a corridor as maps in a cache of their own."""
+    """Store a street and a corridor as maps in a separate cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
         place.cache_clear()
@@ -47,8 +47,8 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     place.cache_clear()
 
 
-def _three_suites(name: str, events: int) -> None:
-    """Three unit scenarios, some reactive ones, and a route of 100 m with a crowd can be drawn."""
+def _check_three_suites(name: str, events: int) -> None:
+    """Check that unit scenarios, reactive ones, and a route of 100 m with a crowd can be drawn."""
     street_map = read_map(name)
     unit = suite_on_map("unit", name, 0, 3).scenarios
     assert len(unit) == 3 and len({one.id for one in unit}) == 3
@@ -66,11 +66,12 @@ def _three_suites(name: str, events: int) -> None:
 @pytest.mark.parametrize("name", ["corridor", "flat-street"])
 def test_suites_are_drawn_on_small_scans(name: str) -> None:
     """A corridor of 3 m and a street with one crossing have room for all three suites."""
-    _three_suites(name, 4)
+    _check_three_suites(name, 4)
 
 
 def test_structures_take_turns_where_they_fit() -> None:
-    """Each structure is drawn on the street; on the corridor the others are left out, and told."""
+    """Each structure is drawn on the street; on the corridor those that do not fit are left out and
+    reported."""
     street = suite_on_map("unit", "flat-street", 1, None)
     assert [one.structure for one in street.scenarios] == ["straight", "curve", "crosswalk"]
     assert street == suite_on_map("unit", "flat-street", 1, None)
@@ -85,7 +86,7 @@ def test_structures_take_turns_where_they_fit() -> None:
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="no shared scans beside the repository")
 def test_suites_are_drawn_in_lund(tmp_path: Path) -> None:
-    """A corridor of 3 m along the walked way in Lund has room for all three suites."""
+    """A corridor of 3 m along the walked path in Lund has room for all three suites."""
     for name in ("lund_street_ground.glb", "lund_street_obstacles.glb"):
         shutil.copy(SHARED / name, tmp_path)
     route = json.loads((SHARED / "lund_street_route.json").read_text())
@@ -93,12 +94,12 @@ def test_suites_are_drawn_in_lund(tmp_path: Path) -> None:
     (tmp_path / "way.json").write_text(json.dumps(route))
     way = str(tmp_path / "way.json")
     import_scan(tmp_path, read_options(tmp_path, {"way": way, "width_m": 3.0, "name": "lund"}))
-    _three_suites("lund", 4)
+    _check_three_suites("lund", 4)
 
 
 @pytest.fixture(scope="module")
 def scan(maps: None, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A stored scan with a mesh, and a draft of areas."""
+    """Store a scan with a mesh, and a draft of areas."""
     folder = write_street(tmp_path_factory.mktemp("scans") / "street")
     meshes = [path.name for path in folder.glob("*.glb")]
     import_scan(folder, read_options(folder, {"files": meshes, "name": "replaced"}))
@@ -136,7 +137,7 @@ def test_areas_of_a_stored_scan_are_replaced(cosim: Cosim, scan: str, tmp_path: 
     )
 
 
-def test_scans_are_sent_to_workers_whole(
+def test_scans_are_sent_to_workers_completely(
     scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker that lacks a scan gets its net, its drawn ground and its files."""
@@ -153,13 +154,14 @@ def test_scans_are_sent_to_workers_whole(
 
 
 def test_a_drawn_scenario_is_found_by_its_id(cosim: Cosim, tmp_path: Path) -> None:
-    """`cosim look` draws it again by --map, or finds it in the run folder; the errors name both."""
+    """`cosim look` draws it again with --map, or finds it in the run folder; the errors name
+    both."""
     suites = {
         kind: suite_on_map(kind, "flat-street", 3, count)
         for kind, count in (("reactive", 4), ("unit", None), ("long-horizon", 1))
     }
-    for whole in suites.values():
-        for scenario in whole.scenarios:
+    for suite in suites.values():
+        for scenario in suite.scenarios:
             assert drawn_on_map(scenario.id, "flat-street").scenarios == (scenario,)
     with pytest.raises(
         UsageError, match=r"is none of map 'flat-street': .* straight-flat-street-0"
@@ -174,7 +176,7 @@ def test_a_drawn_scenario_is_found_by_its_id(cosim: Cosim, tmp_path: Path) -> No
     done = cosim("look", wanted.id, *options)
     assert done.returncode == 0, done.stderr
     assert picture.stat().st_size > 500 and wanted.id in done.stdout
-    lost = cosim("look", wanted.id)
-    assert lost.returncode == 2 and "give the run folder by --suite" in " ".join(
-        lost.stderr.split()
+    unknown = cosim("look", wanted.id)
+    assert unknown.returncode == 2 and "give the run folder by --suite" in " ".join(
+        unknown.stderr.split()
     )

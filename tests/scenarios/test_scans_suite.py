@@ -36,8 +36,8 @@ REAL = [name for name, one in SCAN_PLACES.items() if isinstance(one, RealScan)]
 
 
 @pytest.fixture
-def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An empty cache."""
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Use an empty cache."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     place.cache_clear()
     yield
@@ -57,7 +57,7 @@ def test_the_suite_has_110_short_ways_and_a_route_on_each_place() -> None:
     assert structures == {"straight": 70, "curve": 30, "crosswalk": 10, LONG_WAY: 5}
 
 
-def test_limits_of_claims_are_those_of_the_suite_alone() -> None:
+def test_claims_depend_on_the_name_of_the_suite() -> None:
     """Under the name of another suite, the same scenarios violate the claims on split and
     structures."""
     suite = load_suite("scans")
@@ -65,13 +65,13 @@ def test_limits_of_claims_are_those_of_the_suite_alone() -> None:
     assert all(list(CLAIMS[claim](other)) for claim in ("val and test", "structures", "events"))
 
 
-def test_two_scenarios_of_a_structure_have_spots_of_their_own() -> None:
+def test_scenarios_of_a_structure_have_different_spots() -> None:
     """Candidates on the spot of an earlier scenario were dropped."""
     assert read_proofs(SUITES["scans"]).dropped["on the spot of another"] > 0
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_a_missing_real_place_says_how_to_get_it(name: str, empty: None) -> None:
+def test_a_missing_real_place_is_named_with_its_import(name: str, empty_cache: None) -> None:
     """The error has source, size, licence and the command of the import."""
     found = SCAN_PLACES[name]
     assert isinstance(found, RealScan)
@@ -88,7 +88,7 @@ def test_a_preset_of_no_real_place_is_refused() -> None:
 
 
 @pytest.mark.engine
-def test_another_map_of_the_name_of_a_place_is_refused(empty: None) -> None:
+def test_a_different_map_under_the_name_of_a_place_is_refused(empty_cache: None) -> None:
     """The error says how to get the place of the suite."""
     store_flat("scan-5", street_areas())
     store_flat("lund-street", street_areas())
@@ -99,7 +99,7 @@ def test_another_map_of_the_name_of_a_place_is_refused(empty: None) -> None:
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", REAL)
-def test_a_preset_gives_the_map_of_the_suite(name: str, empty: None) -> None:
+def test_a_preset_gives_the_map_of_the_suite(name: str, empty_cache: None) -> None:
     """The meshes of a real place, imported with its preset, have the hash of its scenarios."""
     if not (SHARED / name).is_dir():
         pytest.skip("the scans of real places are not at hand")
@@ -114,7 +114,7 @@ def test_a_preset_gives_the_map_of_the_suite(name: str, empty: None) -> None:
 
 @pytest.mark.engine
 def test_a_generated_scan_is_made_and_driven_on() -> None:
-    """On the first scenario `straight` runs to an end, and the oracle repeats its proof."""
+    """On the first scenario `straight` drives to an end, and the oracle repeats its proof."""
     scenario = load_suite("scans").scenarios[0]
     assert isinstance(scenario.place, CityMap)
     assert isinstance(SCAN_PLACES[scenario.place.map], GeneratedScan)

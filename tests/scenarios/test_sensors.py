@@ -1,4 +1,4 @@
-"""Sensors in episodes: the simulation does not depend on them, and repeats their readings."""
+"""Sensors in episodes: the simulation does not depend on them, and readings are repeatable."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def bytes_of(seen: list[Observation]) -> list[bytes]:
 @pytest.mark.engine
 @pytest.mark.parametrize("robot", ["courier", "dog"])
 def test_the_state_hash_does_not_depend_on_sensors(robot: str) -> None:
-    """The same commands by a blind policy and by one with all sensors: the same hash; the same seed
-    repeats the readings, and another one has others."""
+    """A blind policy and one with all sensors have the same hash under the same commands. The same
+    seed repeats the readings, and another seed gives others."""
     blind, _ = driven(BLIND, robot=robot)
     sensing, first = driven(SENSING, robot=robot)
     assert blind == sensing
@@ -76,7 +76,7 @@ def test_the_state_hash_does_not_depend_on_sensors(robot: str) -> None:
 
 @pytest.mark.engine
 def test_a_sensor_changes_no_reading_of_another() -> None:
-    """Scans and tracks are the same with and without the others, and so are fixes."""
+    """Scans, tracks and fixes are the same with and without the other sensors."""
     _, everything = driven(SENSING)
     _, scans = driven(dataclasses.replace(SENSING, imu="none", people="none"))
     _, people = driven(dataclasses.replace(SENSING, scan=None, imu="none"))
@@ -110,7 +110,7 @@ def test_the_sensor_track_is_that_of_the_strongest_source(
 
 
 class Sensing:
-    """Drives a bend, and keeps what it senses."""
+    """Drives a bend, and stores its readings."""
 
     manifest = dataclasses.replace(SENSING, rate_hz=5.0, goal="random_point")
 
@@ -127,18 +127,18 @@ class Sensing:
 
 @pytest.mark.engine
 def test_a_replay_repeats_the_readings_of_the_recorded_policy(tmp_path: Path) -> None:
-    """Scans, tracks and inertial readings of a run, computed again from its files, have the same
-    bits at the same ticks, across resets of the robot."""
+    """Readings that are computed again from the files of a run have the same bits at the same
+    ticks, across resets of the robot."""
     scenario = msgspec.structs.replace(crowded(), time_limit_s=4.0)
     policy = Sensing()
     product.run(
         Suite(name="brief", version="1", scenarios=(scenario,)), policy, out=tmp_path / "run"
     )
-    told = load_recorded(tmp_path / "run", scenario.id)
+    recorded = load_recorded(tmp_path / "run", scenario.id)
     found: list[Observation] = []
-    with sensor_replay(told) as sensors:
+    with sensor_replay(recorded) as sensors:
         assert sensors is not None
-        episode, replayed = replay_episode(told)
+        episode, replayed = replay_episode(recorded)
 
         def keep(step: Step, verdict: Verdict) -> None:
             if (seen := sensors.read(step, verdict)) is not None:
@@ -175,15 +175,15 @@ class Mine:
 
 
 @pytest.mark.engine
-def test_an_isolated_policy_senses_the_same(tmp_path: Path, cosim: Cosim) -> None:
-    """A policy that drives by scan, tracks and inertial readings reaches the same state hash in
-    this process and in a sandbox, and its row has the sensors and their track."""
+def test_an_isolated_policy_gets_the_same_readings(tmp_path: Path, cosim: Cosim) -> None:
+    """A policy that drives by its sensors reaches the same state hash here and in a sandbox, and
+    its row has its sensors and track."""
     scenario = msgspec.structs.replace(crowded(), time_limit_s=3.0)
     write_suite(Suite(name="brief", version="1", scenarios=(scenario,)), tmp_path / "brief.json")
     (tmp_path / "mine.py").write_text(MINE)
     hashes = set()
     for out, more in (("here", ()), ("afar", ("--isolated",))):
-        asked = (
+        words = (
             "run",
             "brief.json",
             "--policy",
@@ -194,8 +194,8 @@ def test_an_isolated_policy_senses_the_same(tmp_path: Path, cosim: Cosim) -> Non
             out,
             *more,
         )
-        said = cosim(*asked, cwd=tmp_path)
-        assert said.returncode == 0, said.stderr
+        done = cosim(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
         (record,) = read_records(tmp_path / out)
         assert record.status == "done" and record.manifest.track == "people"
         hashes.add(record.state_hash)

@@ -1,5 +1,4 @@
-"""Setting up an episode: what it imports, and that what a process keeps from episode to episode
-changes nothing."""
+"""Set-up of an episode: its imports, and independence from earlier episodes of the process."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ import sys
 import pytest
 
 from tests.conftest import PATIENCE_S
-from tests.support.in_turn import COUNT, SAMPLE
+from tests.support.episode_order import COUNT, SAMPLE
 
 NOT_DRIVEN_WITH = (
     "pandas",
@@ -23,7 +22,7 @@ NOT_DRIVEN_WITH = (
 )
 
 
-def test_an_episode_imports_only_what_it_drives_with() -> None:
+def test_an_episode_imports_only_what_it_needs() -> None:
     """Making an Episode imports no map reader, no SUMO tools and no pandas, and SUMO only when it
     simulates."""
     code = (
@@ -42,14 +41,14 @@ def test_an_episode_imports_only_what_it_drives_with() -> None:
 
 
 @pytest.mark.engine
-def test_the_kth_episode_of_a_process_is_the_first_one_of_another(
+def test_later_episodes_of_a_process_equal_first_ones(
     request: pytest.FixtureRequest,
 ) -> None:
-    """Seven episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
-    order: same states, same pictures."""
+    """Seven episodes (30 with --whole) of two cities with many crowds, grounds, robots and lights
+    have the same states and pictures in random order."""
     whole = request.config.getoption("--whole")
     count, only = (COUNT, []) if whole else (len(SAMPLE), ["--sample"])
-    command = [sys.executable, "-m", "tests.support.in_turn", *only]
+    command = [sys.executable, "-m", "tests.support.episode_order", *only]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split("\n")[-2] == f"[] {count} {count}", done.stderr

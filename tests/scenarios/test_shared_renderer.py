@@ -1,5 +1,5 @@
-"""One renderer for many environments: the same pictures, labels and hashes; and whoever dies, the
-others go on."""
+"""One renderer for many environments: equal pictures, labels and hashes, also after processes
+die."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ FRAMES = EpisodeOptions(seed=7, frames_every_s=0.5)
 
 
 def scenarios_of(*names: str) -> tuple[Scenario, ...]:
-    """A second of a long way in a small city, with another crowd for each name."""
+    """Return a second of a long way in a small city, with another crowd for each name."""
     one = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
     return tuple(msgspec.structs.replace(one, id=name, seed=i) for i, name in enumerate(names))
 
@@ -73,7 +73,7 @@ def suite_of(*names: str) -> Suite:
 def renderer_for(
     folder: Path, policy: Policy, patience: Patience = Patience()
 ) -> Iterator[SharedRenderer]:
-    """A renderer in a process of its own, without a run."""
+    """Start a renderer in another process, without a run."""
     name = f"{OF}:{type(policy).__name__}"
     driver = load_policy(name)
     hello = Hello(name, driver.manifest, driver.source_hash, patience=patience)
@@ -91,8 +91,7 @@ def linked(renderer: SharedRenderer) -> RendererLink:
 
 
 def renderer_pid() -> int:
-    """The process that draws: below a shepherd of this process, the one that has the listening
-    socket's address."""
+    """Return the drawing process: the child of a shepherd of this process that serves pictures."""
     found = [
         int(child)
         for shepherd in children(os.getpid())
@@ -103,13 +102,13 @@ def renderer_pid() -> int:
 
 
 def children(pid: int) -> list[int]:
-    """The processes that the threads of a process have started."""
+    """Return the processes that the threads of a process have started."""
     tasks = Path(f"/proc/{pid}/task").iterdir()
     return sorted(int(child) for task in tasks for child in (task / "children").read_text().split())
 
 
-def asked_together(links: Sequence[RendererLink], *requests: Request) -> list[bytes]:
-    """The replies to requests that the renderer finds waiting all at once: it is stopped while they
+def replies_together(links: Sequence[RendererLink], *requests: Request) -> list[bytes]:
+    """Return the replies to requests that arrive together, as the renderer is stopped while they
     are sent."""
     pid = renderer_pid()
     os.kill(pid, signal.SIGSTOP)
@@ -121,10 +120,10 @@ def asked_together(links: Sequence[RendererLink], *requests: Request) -> list[by
     return [link.received() for link in links]
 
 
-def seen_by_themselves(
+def separate_frames(
     scenarios: Sequence[Scenario], robot: RobotState, streets: Sequence[Street]
 ) -> list[list[Frame]]:
-    """The pictures of a camera of its own for each of some scenarios in one place."""
+    """Return the frames of a separate camera for each of some scenarios in one place."""
     from cosim.spec.robot import robot_called
     from physics.cameras.gl.camera import GlCamera
     from physics.dynamics.world import BulletWorld
@@ -143,10 +142,9 @@ def seen_by_themselves(
 
 
 @pytest.mark.engine
-def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -> None:
-    """Of environments of other robots, lights and weathers, drawn together for as long as they stay: one that
-    ends and one that speaks nonsense leave the others alone. Nothing has a name in /dev/shm, and
-    all know when the renderer is killed."""
+def test_pictures_and_labels_equal_those_of_separate_cameras(tmp_path: Path) -> None:
+    """Environments with other robots, lights and weathers are drawn together, also when one ends or
+    sends an invalid message. No file is left in /dev/shm, and a killed renderer is noticed."""
     before = shared_files()
     (one,) = scenarios_of("one")
     fog = Light(fog_m=40.0)
@@ -154,13 +152,13 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
         one, id="other", robot="scout", light=fog, weather="rainy_night"
     )
     busy = busy_street(place(one.place)[1], persons=20, frames=4)
-    expected = seen_by_themselves((one, other), busy.robot, busy.streets)
+    expected = separate_frames((one, other), busy.robot, busy.streets)
     with renderer_for(tmp_path, Seeing()) as renderer:
         links = [linked(renderer) for _ in range(3)]
         for link, each in zip(links, (one, other, other), strict=True):
             link.enter(each)
         for k, street in enumerate(busy.streets):
-            replies = asked_together(links, *[Draw(busy.robot, street)] * len(links))
+            replies = replies_together(links, *[Draw(busy.robot, street)] * len(links))
             for link, reply, frames in zip(links, replies, expected, strict=False):
                 picture = link.decode_frame(reply)
                 assert picture.rgb.tobytes() == frames[k].rgb.tobytes()
@@ -186,9 +184,9 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
     assert shared_files() == before
 
 
-def test_who_connects_says_that_it_waits() -> None:
-    """A renderer that is still loading its policy accepts nobody for as long as that takes: an
-    environment that was silent meanwhile would be taken for one that hangs."""
+def test_an_environment_reports_that_it_waits_for_the_renderer() -> None:
+    """While the renderer loads its policy it accepts no connection, and the environment is not
+    taken for one that hangs."""
     address = f"cosim-test-{os.getpid()}"
     memory = SharedMemory.new()
     waited = []
@@ -202,15 +200,15 @@ def test_who_connects_says_that_it_waits() -> None:
             socket.send_fds(end, [b"\0"], [memory.descriptor])
             MessageSocket(end).send(encode_exchange(Rendered(1, "late")))
 
-        made = RendererLink(address, accept, waiting_every_s=0.01)
-        made.enter(small_scenario())
-        assert (made.number, made.renderer, len(waited)) == (1, "late", 1)
-        made.close()
+        link = RendererLink(address, accept, waiting_every_s=0.01)
+        link.enter(small_scenario())
+        assert (link.number, link.renderer, len(waited)) == (1, "late", 1)
+        link.close()
     memory.close()
 
 
-def knows(name: str, step: int) -> ActRequest:
-    """The request of the environment of a blind policy at a step."""
+def request_at(name: str, step: int) -> ActRequest:
+    """Return the request of the environment of a blind policy at a step."""
     people = People.of(("c1",), [[3.0, 0.0]], [0.0], [1.0], ("walk",))
     robot = RobotState(Pose(0.0, 0.0, 0.0), 0.5)
     route = Polyline([(0.0, 0.0), (30.0, 0.0)])
@@ -225,31 +223,31 @@ def knows(name: str, step: int) -> ActRequest:
 
 
 @pytest.mark.engine
-def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) -> None:
+def test_a_failed_batch_names_the_queried_episodes(tmp_path: Path) -> None:
     """An error in act_batch crashes all its episodes; a policy that ends the renderer costs an
     attempt only of the queried ones."""
     with renderer_for(tmp_path, Knowing(), Patience(answer_s=1.0)) as renderer:
 
-        def begun(*names: str) -> list[RendererLink]:
+        def started(*names: str) -> list[RendererLink]:
             links = [linked(renderer) for _ in names]
             for link, name in zip(links, names, strict=True):
                 assert decode_reply(link.exchange(ResetRequest("r", name, "a", 0))) == EpisodeReply(
                     "r", name, "a"
                 )
             for step in (0, 1):
-                replies = together(links, names, step)
+                replies = answers(links, names, step)
                 assert replies == [ActReply("r", name, "a", step, 0.59, 0.0) for name in names]
             return links
 
-        def together(
+        def answers(
             links: Sequence[RendererLink], names: Sequence[str], step: int
         ) -> list[PolicyReply]:
-            requests = [knows(name, step) for name in names]
-            return [decode_reply(reply) for reply in asked_together(links, *requests)]
+            requests = [request_at(name, step) for name in names]
+            return [decode_reply(reply) for reply in replies_together(links, *requests)]
 
         names = "honest", "raises"
         refused = Refusal("policy", "raised KeyError: 'no such weight'", together=2)
-        replies = together(begun(*names), names, 2)
+        replies = answers(started(*names), names, 2)
         assert [
             msgspec.structs.replace(reply, words=without_lines(reply.words)) for reply in replies
         ] == [refused] * 2
@@ -267,8 +265,8 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
             "closes": RendererEnd("the renderer process ended with exit code 1"),
         }
         for number, (name, end) in enumerate(ends.items(), start=1):
-            honest_one, other = begun("honest", name)
-            other.send(knows(name, 2))
+            honest_one, other = started("honest", name)
+            other.send(request_at(name, 2))
             while name == "hangs" and renderer.end_of(1) is None:
                 renderer.check()
             with pytest.raises(RendererLost) as lost:
@@ -281,55 +279,57 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
 
 
 @pytest.fixture(scope="module")
-def by_themselves(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two episodes in this process, each drawing for itself."""
+def separate_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run of two episodes in this process, each with its own camera."""
     folder = tmp_path_factory.mktemp("runs") / "own"
     suite_run.run(suite_of("a", "b"), Seeing(), out=folder, options=FRAMES)
     return folder
 
 
-def same(one: Path, other: Path) -> bool:
-    """Whether two runs have the same tables and hashes, and the same frames to the byte."""
+def same_runs(first: Path, second: Path) -> bool:
+    """Return whether two runs have the same hashes, and the same frames to the byte."""
     hashes = [
         {record.scenario.id: record.state_hash for record in read_records(folder)}
-        for folder in (one, other)
+        for folder in (first, second)
     ]
     frames = [
         {p.relative_to(f): p.read_bytes() for p in f.glob("episodes/*/frames/*.png")}
-        for f in (one, other)
+        for f in (first, second)
     ]
     assert len(set(hashes[0].values())) == 2 and len(frames[0]) == 4
     return hashes[0] == hashes[1] and frames[0] == frames[1]
 
 
 @pytest.mark.engine
-def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
-    by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
+def test_a_run_with_a_shared_renderer_equals_one_with_separate_cameras(
+    separate_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
 ) -> None:
-    """Two processes, drawn for and asked by a third: state hashes and pictures are those of
-    episodes that each drew for themselves, in one process; run.json says how it was run, and every
-    question was put by one process."""
+    """Two processes whose pictures and answers come from a third have the state hashes and frames
+    of separate episodes. run.json names the mode, and one process puts all queries."""
     monkeypatch.setenv(NOTES, str(tmp_path / "notes"))
     write_suite(suite_of("a", "b"), tmp_path / "small.json")
     words = ("--policy", f"{OF}:Together", "--frames", "0.5", "--seed", "7", "--out", "shared")
-    said = cosim("run", "small.json", *words, "--jobs", "2", "--shared-renderer", cwd=tmp_path)
-    assert said.returncode == 0, said.stderr
+    done = cosim("run", "small.json", *words, "--jobs", "2", "--shared-renderer", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
     assert (
-        same(by_themselves, tmp_path / "shared") and read_spec(tmp_path / "shared").shared_renderer
+        same_runs(separate_run, tmp_path / "shared")
+        and read_spec(tmp_path / "shared").shared_renderer
     )
     notes = [line.split() for line in (tmp_path / "notes").read_text().splitlines()]
     ended = [line[1] for line in notes if line[0] == "ended"]
-    asked = [line for line in notes if line[0] != "ended"]
-    assert len({line[0] for line in asked}) == 1 and sum(len(line) - 1 for line in asked) == 8
+    queries = [line for line in notes if line[0] != "ended"]
+    assert len({line[0] for line in queries}) == 1 and sum(len(line) - 1 for line in queries) == 8
     called = {episode_id_of(7, scenario).episode for scenario in scenarios_of("a", "b")}
-    assert set(ended) == {name for line in asked for name in line[1:]} == called and len(ended) == 2
+    assert (
+        set(ended) == {name for line in queries for name in line[1:]} == called and len(ended) == 2
+    )
     assert cosim("run", "small.json", *words, "--resume", cwd=tmp_path).returncode == 0
 
 
 @pytest.mark.engine
-def test_a_policy_asked_by_the_shared_renderer_is_given_the_same(tmp_path: Path) -> None:
-    """Goals that are pictures, labels, odometry and calibration: it drives by them to the same
-    state hash as where it has a camera of its own, by the same waypoints."""
+def test_a_policy_in_the_shared_renderer_gets_the_same_observations(tmp_path: Path) -> None:
+    """With picture goals, labels, odometry and calibration it reaches the state hash and the
+    waypoints of a run with its own camera."""
     guided = f"{OF}:Guided"
     one = EpisodeOptions(seed=7)
     suite_run.run(suite_of("a"), guided, out=tmp_path / "own", options=one)
@@ -347,10 +347,10 @@ def test_a_policy_asked_by_the_shared_renderer_is_given_the_same(tmp_path: Path)
 
 @pytest.mark.engine
 def test_episodes_whose_renderer_is_killed_are_run_again(
-    by_themselves: Path, tmp_path: Path
+    separate_run: Path, tmp_path: Path
 ) -> None:
-    """kill -9 in the middle of two episodes: another renderer draws them from their beginning, none
-    has crashed, and what comes out is the same as ever."""
+    """After kill -9 in the middle of two episodes another renderer draws them from the start, with
+    equal results and no crash."""
     killed: list[int] = []
 
     def kill(message: object) -> None:
@@ -368,14 +368,14 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
         options=FRAMES,
         tell=kill,
     )
-    assert killed and same(by_themselves, folder)
+    assert killed and same_runs(separate_run, folder)
     logs = sorted(path.name for path in (folder / "logs").iterdir())
     assert logs == ["renderer-0.log", "renderer-1.log", "worker-0.log", "worker-1.log"]
 
 
-def test_where_there_is_nothing_to_share_it_is_said() -> None:
-    """A blind policy that is asked for each episode by itself, a camera that is not gl, a policy
-    object: in words."""
+def test_a_run_with_nothing_to_share_is_refused() -> None:
+    """A blind policy without act_batch, a camera that is not gl, other pictures and a policy object
+    are refused with the reason."""
     check_shared(PolicyCaller(Together()), "gl")
     check_shared(PolicyCaller(Seeing()), "gl")
     check_shared(PolicyCaller(Knowing()), "bullet")
@@ -390,20 +390,21 @@ def test_where_there_is_nothing_to_share_it_is_said() -> None:
         check_shared(PolicyCaller(Seeing()), "bullet")
     deep = Manifest("deep", camera=CameraSpec(depth=True))
     wide = Manifest("wide", cameras={"left": CameraSpec(mount="left")})
-    for manifest, what in (
+    for manifest, words in (
         (deep, "'deep' asks for depth"),
         (wide, "'wide' asks for further cameras"),
     ):
         with pytest.raises(
-            UsageError, match=f"policy {what}, which a shared renderer does not give"
+            UsageError, match=f"policy {words}, which a shared renderer does not give"
         ):
             check_shared(PolicyCaller(Seeing(), manifest), "gl")
     with pytest.raises(UsageError, match="shared_renderer=True needs a policy by its name"):
         suite_run.run(suite_of("a"), Together(), shared_renderer=True)
 
 
-def test_no_environment_can_shrink_its_memory_under_the_renderers_hands() -> None:
-    """The size is sealed; a picture that was taken stays when the next one comes."""
+def test_shared_memory_cannot_be_resized() -> None:
+    """Its size is sealed, and a picture that was read does not change when the next one is
+    written."""
     memory = SharedMemory.new(64)
     with pytest.raises(PermissionError):
         os.ftruncate(memory.descriptor, 0)

@@ -1,4 +1,4 @@
-"""Event pedestrians and injected people among people: they see the crowd and each other, and go
+"""Event pedestrians and injected people among people: they see the crowd and each other, and walk
 round them."""
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BOX_M = (0.35, 0.275)
 
 
 def event(kind: str, **fields: object) -> Event:
-    """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
+    """Return an event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
     known = {
         "id": "e0",
         "kind": kind,
@@ -42,7 +42,7 @@ def event(kind: str, **fields: object) -> Event:
     return Event(**known | fields)  # type: ignore[arg-type]
 
 
-def asked(
+def query_at(
     tick: int,
     x_m: float,
     v_mps: float,
@@ -50,7 +50,7 @@ def asked(
     events: tuple[Event, ...] = (),
     *states: EventState,
 ) -> EventQuery:
-    """The question of a robot at `x_m` on the x axis that faces +x."""
+    """Return the query of a robot at `x_m` on the x axis that faces +x."""
     return EventQuery(
         episode="t",
         tick=tick,
@@ -70,42 +70,49 @@ def asked(
 
 
 def drive(
-    one: Event, ticks: int, speed_mps: float, start_m: float, *crowd: NearbyPerson
+    planned: Event, ticks: int, speed_mps: float, start_m: float, *crowd: NearbyPerson
 ) -> list[tuple[float, EventReply]]:
-    """(robot x, reply) at every tick of a robot that drives along the x axis, among people who walk
-    straight on."""
+    """Return (robot x, reply) at every tick of a robot that drives along the x axis, among people
+    who walk straight ahead."""
     states: tuple[EventState, ...] = ()
     out = []
     for tick in range(ticks):
         t_s = tick * TICK_MS / 1000
-        here = tuple(
+        nearby = tuple(
             NearbyPerson(
                 c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps, c.kind
             )
             for c in crowd
         )
-        reply = react(asked(tick, start_m + speed_mps * t_s, speed_mps, here, (one,), *states))
+        reply = react(
+            query_at(tick, start_m + speed_mps * t_s, speed_mps, nearby, (planned,), *states)
+        )
         states = reply.states
         out.append((start_m + speed_mps * t_s, reply))
     return out
 
 
-def told(person: InjectedPerson) -> NearbyPerson:
-    """A person as it sees others of its kind."""
-    one = person.walker
+def nearby_person(person: InjectedPerson) -> NearbyPerson:
+    """Return a person as others of its kind see it."""
+    walker = person.walker
     return NearbyPerson(
-        actor_id(person.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED
+        actor_id(person.injection),
+        walker.x_m,
+        walker.y_m,
+        walker.vx_mps,
+        walker.vy_mps,
+        PersonKind.INJECTED,
     )
 
 
 def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
-    """Between the disk of a person and the outline of the robot."""
+    """Return the gap between the disk of a person and the outline of the robot."""
     away = np.maximum(np.abs([x_m - robot_x_m, y_m]) - BOX_M, 0.0)
     return float(np.hypot(*away)) - 0.3
 
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
-def test_people_who_are_in_nobodys_way_change_nothing(kind: str) -> None:
+def test_people_off_the_sidewalk_change_nothing(kind: str) -> None:
     """A person off the sidewalk changes no bit of an event."""
     alone = drive(event(kind), 600, 1.0, 25.0)
     assert drive(event(kind), 600, 1.0, 25.0, NearbyPerson("c1", 50.0, 9.0, 0.0, 0.0)) == alone
@@ -126,8 +133,8 @@ def test_people_who_are_in_nobodys_way_change_nothing(kind: str) -> None:
 def test_the_people_of_an_event_do_not_walk_through_each_other(
     kind: str, people: int, side: int
 ) -> None:
-    """Stepping to their places, back, and over a crosswalk; in the end everybody is where it
-    belongs."""
+    """They keep apart on the way to their places, back, and over a crosswalk, and end at their
+    places."""
     track = drive(event(kind, people=people, side=side), 1000, 0.4, 38.0)
     for _, reply in track:
         places = [(w.x_m, w.y_m) for w in reply.states[0].walkers]
@@ -139,8 +146,9 @@ def test_the_people_of_an_event_do_not_walk_through_each_other(
         assert [(w.x_m, w.y_m) for w in last.walkers] == [(w.x_m, w.y_m) for w in first.walkers]
 
 
-def test_who_stands_in_the_way_is_gone_round_and_who_stands_on_the_place_is_walked_up_to() -> None:
-    """`obstructing` ends in the middle of the sidewalk all the same."""
+def test_an_obstructing_pedestrian_reaches_its_place_past_standing_people() -> None:
+    """It walks round a person on its way, and ends in the middle of the sidewalk even if another
+    person is there."""
     for x_m, y_m, least in ((50.0, 0.9, 0.54), (50.0, 0.0, -1.0)):
         track = drive(event("obstructing"), 200, 0.5, 40.0, NearbyPerson("c1", x_m, y_m, 0.0, 0.0))
         ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track]
@@ -149,8 +157,8 @@ def test_who_stands_in_the_way_is_gone_round_and_who_stands_on_the_place_is_walk
 
 
 @pytest.mark.parametrize("y_m", [0.0, 0.2, -0.2])
-def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m: float) -> None:
-    """A frontal pedestrian passes people on its line and still meets the robot."""
+def test_a_frontal_pedestrian_walks_round_people_and_meets_the_robot(y_m: float) -> None:
+    """It passes people on its line and still meets the robot."""
     crowd = (NearbyPerson("c1", 44.0, y_m, 0.0, 0.0), NearbyPerson("c2", 34.0, y_m, 1.1, 0.0))
     track = drive(event("frontal"), 500, 0.06, 31.0, *crowd)
     robots = [x_m for x_m, r in track if r.states[0].phase == "acting"]
@@ -166,8 +174,8 @@ def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side: int) -> None:
-    """A lateral pedestrian steps round a person on its line and aims again at the robot."""
+def test_a_lateral_pedestrian_walks_round_a_person_and_meets_the_robot(side: int) -> None:
+    """It steps round a person on its line and aims again at the robot."""
     track = drive(
         event("lateral", side=side), 400, 0.8, 40.0, NearbyPerson("c1", 50.1, side * 0.9, 0.0, 0.0)
     )
@@ -178,8 +186,7 @@ def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side
 
 
 def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
-    """Behind somebody who walks slowly on its side it swerves, passes and comes in ahead of the
-    robot."""
+    """Behind a slow walker on its side it swerves, passes and finishes its event."""
     slow = NearbyPerson("c1", 52.0, 1.6, 0.6, 0.0)
     track = drive(event("overtaking"), 500, 1.0, 45.0, slow)
     ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track]
@@ -187,8 +194,8 @@ def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
     assert track[-1][1].states[0].phase in ("over", "gone")
 
 
-def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_end() -> None:
-    """An injected person passes people on its path and ends next to the one at its end."""
+def test_an_injected_person_walks_round_people_and_ends_beside_one_at_its_goal() -> None:
+    """It passes people on its path and ends next to the one at its end."""
     person = spawn_injected(
         Injected(
             tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)
@@ -197,8 +204,8 @@ def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_
     standing = (NearbyPerson("c1", 5.0, 5.0, 0.0, 0.0), NearbyPerson("c2", 10.0, 5.0, 0.0, 0.0))
     ways = []
     for tick in range(400):
-        me = told(person)
-        after = step_injected(person, asked(tick, 90.0, 0.0, (*standing, me)))
+        itself = nearby_person(person)
+        after = step_injected(person, query_at(tick, 90.0, 0.0, (*standing, itself)))
         assert after is not None
         person = after
         ways.append((person.walker.x_m, person.walker.y_m))
@@ -208,37 +215,38 @@ def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_
 
 
 @pytest.mark.parametrize("names", ["ab", "ba", "abc"])
-def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None:
-    """With the same path they are not in each other after a second, nor ever again before they
-    arrive."""
+def test_people_injected_at_the_same_place_separate(names: str) -> None:
+    """With the same path they are apart after a second, and stay apart until they arrive."""
     path = ((0.0, 5.0), (10.0, 5.0))
     injected_people = [
         spawn_injected(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names
     ]
     for tick in range(120):
-        seen = tuple(map(told, injected_people))
-        after = [step_injected(person, asked(tick, 90.0, 0.0, seen)) for person in injected_people]
+        seen = tuple(map(nearby_person, injected_people))
+        after = [
+            step_injected(person, query_at(tick, 90.0, 0.0, seen)) for person in injected_people
+        ]
         injected_people = [person for person in after if person is not None]
         places = [(g.walker.x_m, g.walker.y_m) for g in injected_people]
         gaps = [math.dist(a, b) for a, b in itertools.combinations(places, 2)]
         assert len(injected_people) == len(names) and (tick < 20 or min(gaps) > 0.4)
 
 
-def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these() -> None:
-    """Of a crowd, one 3 m from an event pedestrian and a person beside it; nobody while there is
-    none."""
+def test_the_director_gets_people_near_event_pedestrians() -> None:
+    """Of a crowd it gets one 3 m from an event pedestrian and the injected person, and nobody
+    without event pedestrians."""
     ids = ("u", "s", "t", "a", "r")
     kind = [0, 0, PersonKind.EVENT, PersonKind.EVENT, PersonKind.INJECTED]
     xy = [(3.0, 0.0), (9.0, 0.0), (0.0, 0.0), (0.0, 1.0), (-2.0, 0.0)]
     people = People.of(
         ids, xy, [math.pi / 2] * 5, [1.0, 1.0, 0.0, 0.0, 0.5], ("walk",) * 5, kind=kind
     )
-    told = nearby_people(people)
-    assert [(b.id, b.x_m, b.y_m, b.kind) for b in told] == [
+    nearby = nearby_people(people)
+    assert [(b.id, b.x_m, b.y_m, b.kind) for b in nearby] == [
         ("u", 3.0, 0.0, 0),
         ("r", -2.0, 0.0, PersonKind.INJECTED),
     ]
-    assert [(b.vx_mps, b.vy_mps) for b in told] == [
+    assert [(b.vx_mps, b.vy_mps) for b in nearby] == [
         pytest.approx((0.0, 1.0)),
         pytest.approx((0.0, 0.5)),
     ]
@@ -255,11 +263,10 @@ def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these
         ("obstructing", 1, 1, [(50.0, 0.5), (50.5, 0.3), (49.5, 0.3), (49.8, -0.4), (50.3, -0.4)]),
     ],
 )
-def test_nobody_is_kept_from_a_place_of_the_event_for_ever(
+def test_standing_people_do_not_keep_event_pedestrians_from_their_places(
     kind: str, people: int, side: int, standing: list[tuple[float, float]]
 ) -> None:
-    """Where people stand in the way and close to the places, everybody is there within 8 s and
-    stays."""
+    """All event pedestrians are at their places within 8 s and stay there."""
     crowd = [NearbyPerson(f"c{k}", *xy, 0.0, 0.0) for k, xy in enumerate(standing)]
     track = drive(event(kind, people=people, side=side), 300, 0.1, 40.0, *crowd)
     late = track[160][1].states[0]

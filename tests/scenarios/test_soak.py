@@ -1,4 +1,5 @@
-"""Enduring a place: crowd and traffic around bodies that go anywhere, in a process of its own."""
+"""Long simulation of a place: crowd and traffic around bodies that move anywhere, in another
+process."""
 
 from __future__ import annotations
 
@@ -12,9 +13,9 @@ pytestmark = pytest.mark.engine
 MAP = "sumo-fkk-in"
 
 
-def test_a_map_is_endured() -> None:
-    """A net that comes with SUMO is simulated to the end, with about as many persons and cars as
-    asked for; how far it has come is reported meanwhile."""
+def test_a_map_is_simulated_to_the_end() -> None:
+    """A net that comes with SUMO is simulated with about the requested persons and cars, and
+    progress is reported."""
     shares: list[float] = []
     done = endure(
         CityMap(map=MAP),

@@ -1,4 +1,4 @@
-"""How episodes end: failures before and after an event, a skipped loop, and a pace."""
+"""Ends of episodes: failures before and after an event, a skipped loop, and a pace."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.conftest import Cosim
 
 
 class Blind:
-    """Always the same command."""
+    """Gives the same command at every query."""
 
     manifest = Manifest("blind", camera=None)
 
@@ -41,14 +41,14 @@ class Blind:
         self.command = Command(v_mps, w_radps)
 
     def reset(self, scenario_id: str, seed: int) -> None:
-        """It takes no notice."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command:
         return self.command
 
 
 def obstructing(limit_s: float) -> Scenario:
-    """Without street life, and shorter."""
+    """Return a shorter event without street life."""
     (one,) = (s for s in load_suite("reactive").scenarios if s.id == "obstructing-001")
     return msgspec.structs.replace(
         one, crowd=CrowdSpec(persons=0, vehicles=0), time_limit_s=limit_s
@@ -65,9 +65,9 @@ def outcome(record: Record) -> tuple[str, str | None, float | None, bool]:
 
 
 @pytest.mark.engine
-def test_who_fails_before_the_event_has_failed() -> None:
-    """Off the sidewalk at once, and standing until the time is up: both before the trigger, both
-    scored."""
+def test_a_failure_before_the_event_is_scored() -> None:
+    """Leaving the sidewalk at once and standing until the timeout are scored as failures, though
+    the event has not triggered."""
     far = obstructing(20.0)
     (event,) = far.events
     far = msgspec.structs.replace(
@@ -83,11 +83,11 @@ def test_who_fails_before_the_event_has_failed() -> None:
 
 
 @pytest.mark.engine
-def test_an_event_that_the_robot_alone_bypassed_is_not_solved(
+def test_an_event_whose_person_was_never_seen_is_not_solved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A goal reached without a failure, with a camera that never saw the person nearby: the
-    episode is valid and not solved."""
+    """A goal that is reached without a failure, while the camera never saw the person nearby, is
+    valid and not solved."""
     begin = Scorer.__init__
 
     def veiled(*given: object) -> None:
@@ -107,8 +107,8 @@ def test_an_event_that_the_robot_alone_bypassed_is_not_solved(
 
 
 @pytest.mark.engine
-def test_an_event_that_cannot_begin_before_the_goal_is_owed_by_the_simulator() -> None:
-    """Its trigger lies beyond the goal: whatever the robot does, the episode is invalid."""
+def test_an_event_that_cannot_trigger_makes_the_episode_invalid() -> None:
+    """An event whose trigger lies beyond the goal is a fault of the scenario."""
     short = obstructing(20.0)
     (event,) = short.events
     beyond = msgspec.structs.replace(event, trigger_m=0.0, route_s_m=event.route_s_m + 20.0)
@@ -126,17 +126,18 @@ APART_M = 1.7
 
 
 def there_and_back() -> Scenario:
-    """25 m along a wide sidewalk of a small city and back again, 1.7 m beside; nobody is there."""
+    """Return a route 25 m along a wide sidewalk of a small city and back, 1.7 m beside, without
+    people."""
     _, street_map = place(SMALL)
     widest = max(
         (s for s in street_map.strips.values() if s.length_m > 60.0), key=lambda s: s.width_m
     )
     middle = Polyline(widest.line)
-    there = [middle.at(20.0 + s_m) for s_m in np.arange(0.0, OUT_M)]
+    points = [middle.at(20.0 + s_m) for s_m in np.arange(0.0, OUT_M)]
     left, right = (
         [
             (p.x_m - side * math.sin(p.heading_rad), p.y_m + side * math.cos(p.heading_rad))
-            for p in there
+            for p in points
         ]
         for side in (APART_M / 2, -APART_M / 2)
     )
@@ -158,7 +159,7 @@ def there_and_back() -> Scenario:
 
 @pytest.mark.engine
 def test_a_robot_that_skips_the_loop_of_a_route_is_at_its_goal() -> None:
-    """The oracle takes the shortest way; the episode ends there, and what was recorded agrees with
+    """The oracle takes the shortest path, the episode ends at the goal, and the record agrees with
     the trajectory."""
     scenario = there_and_back()
     result = run_episode(scenario, POLICIES["orca"]())
@@ -169,24 +170,24 @@ def test_a_robot_that_skips_the_loop_of_a_route_is_at_its_goal() -> None:
 
 @pytest.mark.engine
 def test_a_pace_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At half of real time a second of an episode takes two, and comes to the same state hash as
-    without a pace."""
+    """At half of real time a second of an episode takes two, and has the same state hash as without
+    a pace."""
     slept_s: list[float] = []
     monkeypatch.setattr(
         episode, "Pacer", partial(Pacer, clock=lambda: 100.0 + sum(slept_s), sleep=slept_s.append)
     )
     short = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
-    free = run_episode(short, load_policy("schedule:stand")).record
+    unpaced = run_episode(short, load_policy("schedule:stand")).record
     assert not slept_s
-    held = run_episode(short, load_policy("schedule:stand"), EpisodeOptions(pace=0.5)).record
-    assert sum(slept_s) == pytest.approx(2.0 * Clock().time_s(held.ticks)) and held.ticks >= 20
-    assert held.state_hash == free.state_hash != ""
-    assert msgspec.structs.replace(held, clock={}) == msgspec.structs.replace(free, clock={})
+    paced = run_episode(short, load_policy("schedule:stand"), EpisodeOptions(pace=0.5)).record
+    assert sum(slept_s) == pytest.approx(2.0 * Clock().time_s(paced.ticks)) and paced.ticks >= 20
+    assert paced.state_hash == unpaced.state_hash != ""
+    assert msgspec.structs.replace(paced, clock={}) == msgspec.structs.replace(unpaced, clock={})
 
 
 @pytest.mark.parametrize("pace", ["-1", "nan", "inf", "0.01", "1000"])
-def test_a_pace_that_makes_no_sense_is_refused(pace: str, cosim: Cosim) -> None:
-    """By the command line and from Python, with what was found and what is valid."""
+def test_an_invalid_pace_is_refused(pace: str, cosim: Cosim) -> None:
+    """The command line and Python refuse it with its value and the valid range."""
     words = "pace must be from 0.1 to 100 times real time, or 0 for as fast as possible, not"
     with pytest.raises(UsageError, match=words):
         EpisodeOptions(pace=float(pace))

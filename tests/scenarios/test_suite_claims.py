@@ -1,5 +1,4 @@
-"""What `cosim suite check` finds out: a suite that keeps all claims, and for each claim one that
-breaks it."""
+"""`cosim suite check`: a suite that keeps all claims, and for each claim a suite that breaks it."""
 
 from __future__ import annotations
 
@@ -55,8 +54,8 @@ replace = msgspec.structs.replace
 
 
 @cache
-def honest(name: str) -> Read:
-    """A suite of the recipe's slots that keeps every claim of its file, drawn on no map, with
+def valid_suite(name: str) -> Read:
+    """Return a suite of the recipe's slots that keeps every claim of its file, without a map, with
     proofs."""
     kinds = [*EVENT_KINDS]
     slots = {slot.name: slot for slot in RECIPES[name].slots}
@@ -65,7 +64,7 @@ def honest(name: str) -> Read:
         if slot.decoy_of:
             made = decoy_of(scenarios[-1])
         else:
-            made = of_slot(slot, slots.get(slot.like, slot), number, kinds)
+            made = scenario_of_slot(slot, slots.get(slot.like, slot), number, kinds)
         if must_give_way(made):
             made = replace(made, go_on_mps=least_pace_mps(decoy_of(made), EXPERT_MPS))
         scenarios.append(limited(made, EXPERT_S, EXPERT_MPS))
@@ -73,8 +72,8 @@ def honest(name: str) -> Read:
     return Read(suite, proofs_of(suite))
 
 
-def of_slot(slot: Slot, like: Slot, number: int, kinds: list[str]) -> Scenario:
-    """A scenario as the slot's name promises it. like: the slot whose scenario it repeats, or it
+def scenario_of_slot(slot: Slot, like: Slot, number: int, kinds: list[str]) -> Scenario:
+    """Return a scenario that fits its slot. like: the slot whose scenario it repeats, or the slot
     itself."""
     rng = np.random.default_rng(number)
     long = slot.structure == LONG_WAY
@@ -122,7 +121,7 @@ def of_slot(slot: Slot, like: Slot, number: int, kinds: list[str]) -> Scenario:
 
 
 def event_of(kind: str, number: int, wanted: Wanted | None = None) -> Event:
-    """An event of a kind, where its slot wants it."""
+    """Return an event of a kind, where its slot wants it."""
     row = EVENT_KINDS[kind]
     event = Event(
         id="e0",
@@ -179,43 +178,43 @@ def proofs_of(suite: Suite) -> Proofs:
 @pytest.mark.parametrize("claim", CLAIMS)
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_suite_that_keeps_its_claims_has_no_faults(name: str, claim: str) -> None:
-    """Every claim of every recipe can be kept."""
-    assert list(CLAIMS[claim](honest(name))) == []
+    """Each claim of each recipe can be kept."""
+    assert list(CLAIMS[claim](valid_suite(name))) == []
 
 
-def one(read: Read, index: int, **changed: object) -> Read:
-    """The suite with one scenario changed, proved as it is now."""
+def with_scenario(read: Read, index: int, **changed: object) -> Read:
+    """Return the suite with one scenario changed, and proofs of the changed scenario."""
     scenarios = list(read.suite.scenarios)
     scenarios[index] = replace(scenarios[index], **changed)
-    return of(read, scenarios)
+    return with_scenarios(read, scenarios)
 
 
-def all_of(read: Read, change: Callable[[Scenario], Scenario]) -> Read:
-    return of(read, [change(s) for s in read.suite.scenarios])
+def with_all_changed(read: Read, change: Callable[[Scenario], Scenario]) -> Read:
+    return with_scenarios(read, [change(s) for s in read.suite.scenarios])
 
 
-def of(read: Read, scenarios: list[Scenario]) -> Read:
+def with_scenarios(read: Read, scenarios: list[Scenario]) -> Read:
     suite = replace(read.suite, scenarios=tuple(scenarios))
     return Read(suite, proofs_of(suite))
 
 
 def with_proof(read: Read, **changed: object) -> Read:
-    """The suite with its first proof changed."""
+    """Return the suite with its first proof changed."""
     assert read.proofs is not None
     first, *others = read.proofs.proofs
     return Read(read.suite, replace(read.proofs, proofs=(replace(first, **changed), *others)))
 
 
 def straightened(scenario: Scenario) -> Scenario:
-    """Its route on one line."""
+    """Return the scenario with its route on one line."""
     length_m = scenario.route_line.length_m
     x_m = scenario.start[0]
     ends = ((x_m, 0.0), (x_m + length_m, 0.0))
     return replace(scenario, start=(*ends[0], 0.0), goal=ends[1], route=ends)
 
 
-def nearer(scenario: Scenario, share: float) -> Scenario:
-    """Its route cut to a share of it."""
+def shortened(scenario: Scenario, share: float) -> Scenario:
+    """Return the scenario with its route cut to a share of it."""
     points = [
         scenario.route_line.at(float(s)).xy
         for s in np.linspace(0.0, share * scenario.route_line.length_m, 21)
@@ -226,7 +225,7 @@ def nearer(scenario: Scenario, share: float) -> Scenario:
 
 
 def bent(scenario: Scenario) -> dict[str, object]:
-    """Its route with a turn of 20 degrees in the middle."""
+    """Return a route with a turn of 20 degrees in the middle."""
     (x_m, y_m), half_m = scenario.start[:2], 0.5 * scenario.route_line.length_m
     turn_rad = math.radians(20.0)
     middle = (x_m + half_m, y_m)
@@ -234,30 +233,30 @@ def bent(scenario: Scenario) -> dict[str, object]:
     return {"route": ((x_m, y_m), middle, goal), "goal": goal}
 
 
-def moved(scenario: Scenario, s_m: float) -> Scenario:
-    """Its events moved to an arc length."""
+def with_events_at(scenario: Scenario, s_m: float) -> Scenario:
+    """Return the scenario with its events at an arc length."""
     return replace(scenario, events=tuple(replace(e, route_s_m=s_m) for e in scenario.events))
 
 
-def sided(scenario: Scenario, **sides: int) -> Scenario:
-    """Its events with other sides."""
+def with_sides(scenario: Scenario, **sides: int) -> Scenario:
+    """Return the scenario with its events on other sides."""
     return replace(scenario, events=tuple(replace(e, **sides) for e in scenario.events))
 
 
-def spot_of(read: Read, index: int, other: int) -> Read:
-    """A scenario moved onto another's spot."""
-    there = read.suite.scenarios[other]
-    moved = {
-        name: getattr(there, name)
+def on_spot_of(read: Read, index: int, other: int) -> Read:
+    """Return the suite with a scenario moved onto another's spot."""
+    occupied = read.suite.scenarios[other]
+    fields = {
+        name: getattr(occupied, name)
         for name in ("place", "start", "goal", "route", "crossings", "events")
     }
-    return one(read, index, **moved)
+    return with_scenario(read, index, **fields)
 
 
 @cache
-def broken() -> dict[str, tuple[str, Read, str]]:
+def broken_suites() -> dict[str, tuple[str, Read, str]]:
     """Return suites with one claim broken, the claim, and words of the fault."""
-    unit, reactive, long = map(honest, ("unit", "reactive", "long-horizon"))
+    unit, reactive, long = map(valid_suite, ("unit", "reactive", "long-horizon"))
     curve = next(i for i, s in enumerate(unit.suite.scenarios) if s.structure == "curve")
     crosswalk = next(i for i, s in enumerate(unit.suite.scenarios) if s.structure == "crosswalk")
     night = replace(unit.suite.scenarios[0].light, hour=23.0)
@@ -266,23 +265,35 @@ def broken() -> dict[str, tuple[str, Read, str]]:
     static = next(i for i, s in enumerate(reactive.suite.scenarios) if s.structure == "static")
     overtaken = next(i for i, s in enumerate(reactive.suite.scenarios) if s.id == "overtaking-001")
     return {
-        "one-missing": ("counts", of(unit, list(unit.suite.scenarios[1:])), "is missing"),
-        "one-of-another-structure": ("counts", one(unit, 0, structure="curve"), "not ('straight'"),
+        "one-missing": (
+            "counts",
+            with_scenarios(unit, list(unit.suite.scenarios[1:])),
+            "is missing",
+        ),
+        "one-of-another-structure": (
+            "counts",
+            with_scenario(unit, 0, structure="curve"),
+            "not ('straight'",
+        ),
         "one-elsewhere": (
             "counts",
-            one(unit, 0, place=City(seed=99, net_hash="net")),
+            with_scenario(unit, 0, place=City(seed=99, net_hash="net")),
             "not ('straight', 'val', 1)",
         ),
         "all-val": (
             "val and test",
-            all_of(unit, lambda s: replace(s, split="val")),
+            with_all_changed(unit, lambda s: replace(s, split="val")),
             "is test, not 20%",
         ),
-        "test-where-val-is": ("val and test", one(unit, 0, split="test"), "where val is, too"),
-        "no-net-hash": ("hashes", one(unit, 0, place=City(seed=1)), "has no hash"),
+        "test-where-val-is": (
+            "val and test",
+            with_scenario(unit, 0, split="test"),
+            "where val is, too",
+        ),
+        "no-net-hash": ("hashes", with_scenario(unit, 0, place=City(seed=1)), "has no hash"),
         "two-nets-of-a-place": (
             "hashes",
-            one(unit, 0, place=City(seed=1, net_hash="other")),
+            with_scenario(unit, 0, place=City(seed=1, net_hash="other")),
             "has 2 nets",
         ),
         "another-was-proved": ("hashes", Read(unit.suite, reactive.proofs), "was proved"),
@@ -306,26 +317,34 @@ def broken() -> dict[str, tuple[str, Read, str]]:
         "a-proof-that-touches": ("proofs", with_proof(unit, obstacles_m=-0.1), "has a contact"),
         "a-proof-too-slow": ("proofs", with_proof(unit, time_s=61.0), "no time within the limit"),
         "two-experts": ("proofs", with_proof(unit, expert="route"), "several experts"),
-        "too-short": ("lengths", of(unit, [nearer(unit.suite.scenarios[0], 0.4)]), "m long"),
+        "too-short": (
+            "lengths",
+            with_scenarios(unit, [shortened(unit.suite.scenarios[0], 0.4)]),
+            "m long",
+        ),
         "not-so-far-in-all": (
             "lengths",
-            all_of(long, lambda s: nearer(s, 0.95)),
+            with_all_changed(long, lambda s: shortened(s, 0.95)),
             "34.67 km in all",
         ),
-        "a-curve-straightened": ("structures", all_of(unit, straightened), "is no 'curve'"),
+        "a-curve-straightened": (
+            "structures",
+            with_all_changed(unit, straightened),
+            "is no 'curve'",
+        ),
         "a-straight-way-bent": (
             "structures",
-            one(unit, curve, structure="straight"),
+            with_scenario(unit, curve, structure="straight"),
             "is no 'straight'",
         ),
         "an-event-round-a-bend": (
             "structures",
-            one(reactive, 0, **bent(first)),
+            with_scenario(reactive, 0, **bent(first)),
             "is no 'obstructing': turns 20 degrees",
         ),
         "a-crosswalk-with-signals": (
             "structures",
-            one(
+            with_scenario(
                 unit,
                 crosswalk,
                 crossings=(RouteCrossing(id="c", enter_s_m=3.0, leave_s_m=8.0, signalised=True),),
@@ -334,101 +353,119 @@ def broken() -> dict[str, tuple[str, Read, str]]:
         ),
         "another-event": (
             "structures",
-            one(reactive, 0, events=(event_of("frontal", 1),)),
+            with_scenario(reactive, 0, events=(event_of("frontal", 1),)),
             "is no 'obstructing'",
         ),
         "somebody-in-static": (
             "structures",
-            one(reactive, static, events=(event_of("frontal", 1),)),
+            with_scenario(reactive, static, events=(event_of("frontal", 1),)),
             "is no 'static'",
         ),
-        "a-long-way-without-barriers": ("structures", one(long, 0, barriers=()), "is no 'route'"),
+        "a-long-way-without-barriers": (
+            "structures",
+            with_scenario(long, 0, barriers=()),
+            "is no 'route'",
+        ),
         "goes-on-after-a-failure": (
             "structures",
-            one(unit, 0, ends_on_failure=False),
+            with_scenario(unit, 0, ends_on_failure=False),
             "does not end",
         ),
         "kinds-of-other-lengths": (
             "lengths",
-            all_of(reactive, lambda s: nearer(s, 0.8) if s.structure == "lateral" else s),
+            with_all_changed(
+                reactive, lambda s: shortened(s, 0.8) if s.structure == "lateral" else s
+            ),
             "lateral: its ways are 16.8 m long on average",
         ),
         "always-at-the-end": (
             "positions",
-            all_of(reactive, lambda s: moved(s, s.route_line.length_m - 3.0)),
+            with_all_changed(reactive, lambda s: with_events_at(s, s.route_line.length_m - 3.0)),
             "lateral: positions in the first third: 0.0%",
         ),
         "an-event-before-its-trigger": (
             "positions",
-            one(reactive, 0, events=(replace(first.events[0], route_s_m=2.0),)),
+            with_scenario(reactive, 0, events=(replace(first.events[0], route_s_m=2.0),)),
             "does not fit where it is",
         ),
         "all-free-on-the-left": (
             "sides",
-            all_of(reactive, lambda s: sided(s, free_side=1)),
+            with_all_changed(reactive, lambda s: with_sides(s, free_side=1)),
             "queueing: free side on the right: 0.0%",
         ),
         "all-come-from-the-left": (
             "sides",
-            all_of(reactive, lambda s: sided(s, side=1)),
+            with_all_changed(reactive, lambda s: with_sides(s, side=1)),
             "lateral: come from the right: 0.0%",
         ),
         "no-free-side": (
             "sides",
-            one(reactive, 0, events=(replace(first.events[0], free_side=0),)),
+            with_scenario(reactive, 0, events=(replace(first.events[0], free_side=0),)),
             "has no free side",
         ),
-        "one-obstacle": ("obstacles", one(reactive, 0, obstacles=(BIN,)), "has 1 obstacles"),
+        "one-obstacle": (
+            "obstacles",
+            with_scenario(reactive, 0, obstacles=(BIN,)),
+            "has 1 obstacles",
+        ),
         "no-decoys": (
             "decoys",
-            of(reactive, [s for s in reactive.suite.scenarios if not s.decoy_of]),
+            with_scenarios(reactive, [s for s in reactive.suite.scenarios if not s.decoy_of]),
             "has no decoy",
         ),
         "a-decoy-elsewhere": (
             "decoys",
-            one(reactive, 1, obstacles=(BIN, BIN, BIN)),
+            with_scenario(reactive, 1, obstacles=(BIN, BIN, BIN)),
             "differs from obstructing-001 in obstacles",
         ),
         "a-decoy-that-is-its-event": (
             "decoys",
-            one(reactive, 1, events=first.events),
+            with_scenario(reactive, 1, events=first.events),
             "differs from obstructing-001 in events",
         ),
         "a-decoy-of-static": (
             "decoys",
-            one(reactive, 1, decoy_of="static-001"),
+            with_scenario(reactive, 1, decoy_of="static-001"),
             "has a decoy, but no event",
         ),
         "a-limit-below-the-experts-time": (
             "limits",
-            one(unit, 0, time_limit_s=8.0),
+            with_scenario(unit, 0, time_limit_s=8.0),
             "its time limit of 8 s is below the expert's 9 s",
         ),
-        "another-time-limit": ("limits", one(unit, 0, time_limit_s=60.0), "is 60 s, not 16.5"),
+        "another-time-limit": (
+            "limits",
+            with_scenario(unit, 0, time_limit_s=60.0),
+            "is 60 s, not 16.5",
+        ),
         "another-limit-of-a-decoy": (
             "limits",
-            one(reactive, 1, time_limit_s=16.5),
+            with_scenario(reactive, 1, time_limit_s=16.5),
             "is 16.5 s, not 14.7",
         ),
-        "no-go-on-rule": ("limits", one(reactive, lateral, go_on_mps=0.0), "is 0, not 0.72"),
+        "no-go-on-rule": (
+            "limits",
+            with_scenario(reactive, lateral, go_on_mps=0.0),
+            "is 0, not 0.72",
+        ),
         "no-rule-to-give-way": (
             "exclusive",
-            one(reactive, overtaken, go_on_mps=0.0),
+            with_scenario(reactive, overtaken, go_on_mps=0.0),
             "need not give way",
         ),
         "a-person-inside-an-obstacle": (
             "people",
-            one(reactive, 1, obstacles=(replace(BIN, y_m=-1.0), replace(BIN, y_m=1.0))),
+            with_scenario(reactive, 1, obstacles=(replace(BIN, y_m=-1.0), replace(BIN, y_m=1.0))),
             "stays 0.30 m inside an obstacle",
         ),
         "another-speed-than-the-decoys": (
             "exclusive",
-            one(reactive, overtaken, go_on_mps=0.9),
+            with_scenario(reactive, overtaken, go_on_mps=0.9),
             "its go_on_mps is 0.9, that of its decoy 0.72",
         ),
         "a-window-that-people-end": (
             "exclusive",
-            one(
+            with_scenario(
                 reactive,
                 overtaken,
                 events=(replace(reactive.suite.scenarios[overtaken].events[0], trigger_m=2.0),),
@@ -437,17 +474,17 @@ def broken() -> dict[str, tuple[str, Read, str]]:
         ),
         "a-window-beyond-the-goal": (
             "exclusive",
-            one(reactive, overtaken, goal_radius_m=5.5),
+            with_scenario(reactive, overtaken, goal_radius_m=5.5),
             "may be at the goal",
         ),
         "walkers-in-a-reactive-one": (
             "street life",
-            one(reactive, 0, crowd=CrowdSpec(persons=12)),
+            with_scenario(reactive, 0, crowd=CrowdSpec(persons=12)),
             "12 people",
         ),
         "an-empty-street-on-a-long-way": (
             "street life",
-            one(long, 0, crowd=CrowdSpec(persons=0, vehicles=0)),
+            with_scenario(long, 0, crowd=CrowdSpec(persons=0, vehicles=0)),
             "0 people and 0 vehicles",
         ),
         "a-crowd-that-was-asked-for": (
@@ -457,55 +494,61 @@ def broken() -> dict[str, tuple[str, Read, str]]:
         ),
         "no-signals": (
             "street life",
-            all_of(long, lambda s: replace(s, crossings=())),
+            with_all_changed(long, lambda s: replace(s, crossings=())),
             "0 of 105 ways have signals",
         ),
         "a-runner": (
             "events",
-            one(reactive, 0, events=(replace(event_of("obstructing", 1), speed_mps=2.0),)),
+            with_scenario(
+                reactive, 0, events=(replace(event_of("obstructing", 1), speed_mps=2.0),)
+            ),
             "walks at 2.00 m/s",
         ),
         "a-kind-is-missing-on-long-ways": (
             "events",
-            all_of(
+            with_all_changed(
                 long, lambda s: replace(s, events=tuple(e for e in s.events if e.kind != "lateral"))
             ),
             "lateral: 0 times",
         ),
         "all-from-one-side": (
             "events",
-            all_of(
+            with_all_changed(
                 reactive, lambda s: replace(s, events=tuple(replace(e, side=1) for e in s.events))
             ),
             "events from right",
         ),
-        "night": ("spread", one(unit, 0, light=night), "too dark"),
-        "thick-fog": ("spread", one(unit, 0, light=replace(night, hour=12.0, fog_m=40.0)), "foggy"),
+        "night": ("spread", with_scenario(unit, 0, light=night), "too dark"),
+        "thick-fog": (
+            "spread",
+            with_scenario(unit, 0, light=replace(night, hour=12.0, fog_m=40.0)),
+            "foggy",
+        ),
         "always-noon": (
             "spread",
-            all_of(unit, lambda s: replace(s, light=replace(night, hour=12.0))),
+            with_all_changed(unit, lambda s: replace(s, light=replace(night, hour=12.0))),
             "morning: 0.0%",
         ),
         "never-fog": (
             "spread",
-            all_of(unit, lambda s: replace(s, light=replace(s.light, fog_m=None))),
+            with_all_changed(unit, lambda s: replace(s, light=replace(s.light, fog_m=None))),
             "0.0% of the scenarios have fog",
         ),
         "all-of-one-length": (
             "spread",
-            all_of(unit, lambda s: nearer(s, 10.5 / s.route_line.length_m)),
+            with_all_changed(unit, lambda s: shortened(s, 10.5 / s.route_line.length_m)),
             "long: 0.0%",
         ),
         "the-same-spot-twice": (
             "duplicates",
-            spot_of(unit, 3, 0),
+            on_spot_of(unit, 3, 0),
             "is on the spot of straight-001",
         ),
     }
 
 
 def exploit_for(suite_hash: str) -> Exploit:
-    """An exploitability with a schedule that was driven nowhere."""
+    """Return an exploitability with a schedule that was not driven."""
     schedule = Schedule(name="blind-all")
     shares = {"val_sr": Share(0, 0), "val_d": None, "sr": Share(0, 0), "d": None}
     found = FoundSchedule(
@@ -523,28 +566,28 @@ def exploit_for(suite_hash: str) -> Exploit:
     return Exploit(suite="unit", suite_hash=suite_hash, found=(found,))
 
 
-def test_a_broken_claim_is_found_out() -> None:
-    """A suite with one claim broken has a fault of that claim that names what is wrong."""
-    for name, (claim, read, words) in broken().items():
+def test_a_broken_claim_is_found() -> None:
+    """A suite with one claim broken has a fault of that claim with the expected words."""
+    for name, (claim, read, words) in broken_suites().items():
         assert any(words in fault for fault in CLAIMS[claim](read)), name
 
 
 def test_every_claim_of_the_file_is_broken_once() -> None:
-    """No claim is kept by whatever comes; size is a matter of the file, broken here."""
-    assert {claim for claim, _, _ in broken().values()} | {"size"} == set(CLAIMS)
+    """Each claim has a suite that breaks it; size has a test of its own."""
+    assert {claim for claim, _, _ in broken_suites().values()} | {"size"} == set(CLAIMS)
 
 
-def test_a_large_file_is_found_out(tmp_path: Path) -> None:
-    """More than 3 MB with its proofs are told."""
+def test_a_large_file_is_found(tmp_path: Path) -> None:
+    """More than 3 MB of suite and proofs is a fault."""
     path = tmp_path / "unit.json"
     path.write_bytes(b" " * 3_000_001)
-    (fault,) = CLAIMS["size"](Read(honest("unit").suite, honest("unit").proofs, path))
+    (fault,) = CLAIMS["size"](Read(valid_suite("unit").suite, valid_suite("unit").proofs, path))
     assert "3.0 MB" in fault
 
 
-def test_the_recipes_make_what_the_benchmark_says() -> None:
-    """330, 1700, 105 and 115 scenarios; a fifth in cities and crops of their own, two fifths on
-    scans; eleven real places; 36.5 km."""
+def test_the_recipes_have_the_documented_sizes() -> None:
+    """They have 330, 1700, 105 and 115 scenarios, the documented shares of test, eleven real
+    places, and 36.5 km."""
     counts = {name: len(recipe.slots) for name, recipe in RECIPES.items()}
     assert counts == {"unit": 330, "reactive": 1700, "long-horizon": 105, "scans": 115}
     for name, recipe in RECIPES.items():
@@ -562,33 +605,32 @@ def test_the_recipes_make_what_the_benchmark_says() -> None:
 
 
 def test_scenarios_are_chosen_by_split() -> None:
-    """`--split test` runs those of test alone; a split that no scenario is of is refused."""
-    assert {s.split for s in select_scenarios(honest("unit").suite, split="test")} == {"test"}
-    assert len(select_scenarios(honest("unit").suite, split="val")) == 264
+    """`--split test` keeps the scenarios of test, and `val` those of val."""
+    assert {s.split for s in select_scenarios(valid_suite("unit").suite, split="test")} == {"test"}
+    assert len(select_scenarios(valid_suite("unit").suite, split="val")) == 264
 
 
 def test_added_street_life_is_marked() -> None:
-    """A crowd that was asked for is another suite, by its version and its hash, and each scenario
-    says so."""
-    busy = with_crowd(honest("reactive").suite, persons=12, vehicles=8)
+    """A requested crowd changes version and hash of a suite, and each scenario is marked."""
+    busy = with_crowd(valid_suite("reactive").suite, persons=12, vehicles=8)
     assert (
         busy.version == "1-persons12-vehicles8"
-        and busy.content_hash != honest("reactive").suite.content_hash
+        and busy.content_hash != valid_suite("reactive").suite.content_hash
     )
     assert all(s.crowd.added and s.crowd.persons == 12 for s in busy.scenarios)
 
 
 def test_real_places_are_known_by_name() -> None:
-    """Each of the eleven is a map of the list, from a file that the SUMO package installs."""
+    """Each of the eleven is a listed map whose file is installed by the SUMO package."""
     known = known_maps()
     for name, one_place in WHEEL_PLACES.items():
         assert known[name].origin == "sumo" and one_place.path.is_file()
 
 
 def test_proofs_survive_their_file(tmp_path: Path) -> None:
-    """Written and read they are the same; what was dropped is counted by reason."""
-    assert honest("unit").proofs is not None
-    first, *others = honest("unit").proofs.proofs
+    """Written proofs are read back equal, and dropped candidates are counted by reason."""
+    assert valid_suite("unit").proofs is not None
+    first, *others = valid_suite("unit").proofs.proofs
     dropped = (
         Dropped(0, "collision with object", "at 3.0 m"),
         Dropped(1000, "collision with object", "at 9.1 m"),
@@ -601,8 +643,8 @@ def test_proofs_survive_their_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("structure", STRUCTURES)
-def test_a_unit_scenario_is_what_its_structure_says(structure: str) -> None:
-    """Drawn from a seed: 10 to 20 m, nobody there, a bend of 45 degrees for a curve, one crossing
+def test_a_unit_scenario_matches_its_structure(structure: str) -> None:
+    """Drawn scenarios are 10 to 20 m long without people, with a bend for a curve and one crossing
     for a crosswalk."""
     _, street_map = place(SMALL)
     graph = WalkGraph(street_map)
@@ -619,8 +661,8 @@ def test_a_unit_scenario_is_what_its_structure_says(structure: str) -> None:
         assert len(scenario.crossings) == (structure == "crosswalk")
 
 
-def test_a_long_way_has_the_length_that_is_wanted() -> None:
-    """Within three metres, whatever corners it cuts."""
+def test_a_long_way_has_the_requested_length() -> None:
+    """Lengths are within three metres, though routes cut corners."""
     _, street_map = place(SMALL)
     for length_m in (150.0, 260.0):
         drawn = build_long_horizon(
@@ -631,15 +673,15 @@ def test_a_long_way_has_the_length_that_is_wanted() -> None:
 
 @pytest.fixture(scope="module")
 def way() -> Scenario:
-    """A long way in a small city."""
+    """Return a long way in a small city."""
     _, street_map = place(SMALL)
     return build_long_horizon(
         SMALL, street_map, WalkGraph(street_map), 3, "lh-small", length_m=150.0
     )
 
 
-def test_a_second_way_is_found_out(way: Scenario) -> None:
-    """With its barriers exactly one path leads to the goal; without one of them another is open."""
+def test_a_second_path_is_found(way: Scenario) -> None:
+    """With its barriers one path leads to the goal, and without one of them another is open."""
     _, street_map = place(SMALL)
     assert list(ways_left(way, street_map)) == []
     for number in range(len(way.barriers)):
@@ -652,8 +694,8 @@ def test_a_second_way_is_found_out(way: Scenario) -> None:
     assert claims == {"single path"}
 
 
-def test_a_narrow_gap_is_found_out(way: Scenario) -> None:
-    """Obstacles across the sidewalk leave no gap; those that were drawn do."""
+def test_a_narrow_gap_is_found(way: Scenario) -> None:
+    """Obstacles across the sidewalk leave no gap, and those that were drawn do."""
     _, street_map = place(SMALL)
     assert list(narrow_places(way, street_map)) == []
     x_m, y_m, heading_rad = way.route_line.at(30.0)
@@ -669,23 +711,23 @@ def test_a_narrow_gap_is_found_out(way: Scenario) -> None:
     assert "no gap" in words
 
 
-def test_another_net_and_a_place_that_does_not_fit_are_found_out(way: Scenario) -> None:
-    """A scenario of another net, and one whose crossing is not on its map."""
+def test_another_net_and_a_missing_crossing_are_found(way: Scenario) -> None:
+    """A scenario of another net, and one whose crossing is not on its map, have faults."""
     other = replace(way, place=replace(way.place, net_hash="other"))
     assert {fault.claim for fault in faults_in_places([other], [], None)} == {"nets"}
     astray = replace(way, crossings=(replace(way.crossings[0], id="nowhere"),))
     assert "fits its place" in {fault.claim for fault in faults_in_places([astray], [], None)}
 
 
-def test_a_sample_holds_every_structure() -> None:
-    """So many of each, the same at every call."""
-    sample = sample_of(honest("reactive").suite, 2)
-    assert sample == sample_of(honest("reactive").suite, 2) and len(sample) == 2 * 9
+def test_a_sample_has_every_structure() -> None:
+    """A sample has the same number of each, and is the same at every call."""
+    sample = sample_of(valid_suite("reactive").suite, 2)
+    assert sample == sample_of(valid_suite("reactive").suite, 2) and len(sample) == 2 * 9
     assert len({s.structure for s in sample}) == 9
 
 
 @pytest.mark.engine
-def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim: Cosim) -> None:
+def test_a_build_resumes_and_its_proofs_hold(tmp_path: Path, cosim: Cosim) -> None:
     """A candidate whose process died twice is dropped, a second build repeats nothing, and a wrong
     state in a proof is found."""
     out = tmp_path / "unit.json"
@@ -699,11 +741,11 @@ def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim:
     (proof,) = proofs.proofs
     assert proof.dropped == (Dropped(0, "its process died"),) and suite.scenarios[0].seed == 1000
     assert proofs.dropped == {"its process died": 1} and "its process died" in lines[0]
-    kept = (parts / "straight-001.json").stat().st_mtime_ns
+    modified = (parts / "straight-001.json").stat().st_mtime_ns
     assert build_suite("unit", out, only=["straight-001"])[0] == suite == read_suite(out)
-    assert (parts / "straight-001.json").stat().st_mtime_ns == kept
-    said = cosim("suite", "check", str(out), "--sample", "1", "--drive", "0")
-    assert said.returncode == 1 and "curve-001: is missing" in said.stdout
+    assert (parts / "straight-001.json").stat().st_mtime_ns == modified
+    done = cosim("suite", "check", str(out), "--sample", "1", "--drive", "0")
+    assert done.returncode == 1 and "curve-001: is missing" in done.stdout
     write_proofs(out, "unit", suite.content_hash, [replace(proof, state_hash="00")])
     (fault,) = faults_in_places(suite.scenarios, ["straight-001"], read_proofs(out))
     assert fault.claim == "proofs to the bit" and "its state is" in fault.words
@@ -714,7 +756,7 @@ def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim:
 
 @pytest.mark.parametrize("name", SUITES)
 def test_the_shipped_suites_keep_their_claims(name: str) -> None:
-    """What ships is what the recipe says, as far as its file and its proofs tell."""
+    """Files and proofs of the shipped suites have no faults."""
     path = SUITES[name]
     read = Read(load_suite(name), read_proofs(path), path)
     assert {
@@ -724,9 +766,8 @@ def test_the_shipped_suites_keep_their_claims(name: str) -> None:
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", [name for name in SUITES if name != "scans"])
-def test_a_sample_of_the_shipped_suites_holds_in_its_places(name: str) -> None:
-    """One scenario's net, way, gaps, and proof to the bit; `cosim suite check --whole` looks at
-    all."""
+def test_a_sample_of_each_shipped_suite_is_valid_on_its_map(name: str) -> None:
+    """Net, route, gaps and proof of one scenario hold; `cosim suite check --whole` checks all."""
     suite = load_suite(name)
     short = [s for s in sample_of(suite, 1) if s.structure != LONG_WAY][:1]
     picked = short or sorted(suite.scenarios, key=lambda s: s.route_line.length_m)[:1]
@@ -734,8 +775,8 @@ def test_a_sample_of_the_shipped_suites_holds_in_its_places(name: str) -> None:
     assert list(faults_in_places(picked, driven, read_proofs(SUITES[name]))) == []
 
 
-def test_a_real_place_says_where_it_comes_from() -> None:
-    """A crop is imported from the SUMO package's net when it is asked for, with its licences."""
+def test_a_real_place_states_its_source() -> None:
+    """A crop is imported from the net of the SUMO package on first use, with its licences."""
     about = about_map("ingolstadt-1")
     assert about.source == "ingolstadt.net.xml.gz" and any(
         "OpenStreetMap" in words for words in about.licences

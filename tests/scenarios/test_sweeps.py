@@ -1,5 +1,4 @@
-"""Own scenarios that are run: the examples that ship, and sweeps, from a list in a file to a table
-and a picture."""
+"""Runs of users' scenarios: the shipped examples, and sweeps with their table and picture."""
 
 from __future__ import annotations
 
@@ -33,8 +32,8 @@ SHORTER = {
 
 @pytest.fixture
 def swept() -> tuple[OwnFile, pd.DataFrame]:
-    """A sweep over density and goal, and what could have come of it: at a density of 20 every
-    second one fails."""
+    """Return a sweep over density and goal, and a result table in which half of the episodes at
+    density 20 fail."""
     own = read_own(EXAMPLES / "density-sweep.toml")
     table = pd.DataFrame(
         index=range(len(own.variants)), columns=["scenario", "status", *METRICS], dtype=object
@@ -46,11 +45,10 @@ def swept() -> tuple[OwnFile, pd.DataFrame]:
     return own, table
 
 
-def test_a_sweep_gives_what_the_summary_of_a_run_gives_for_each_value(
+def test_a_sweep_equals_the_summary_of_a_run_for_each_value(
     swept: tuple[OwnFile, pd.DataFrame],
 ) -> None:
-    """Means, pooled rates and intervals of the episodes of one value, as of a run of these
-    alone."""
+    """Means, pooled rates and intervals of one value are those of a run of its episodes alone."""
     own, table = swept
     summary = summary_of_sweep(own, table).set_index(["crowd.density", "metric"])
     assert list(dict.fromkeys(summary.index.get_level_values(0))) == [0, 5, 10, 20]
@@ -68,11 +66,10 @@ def test_a_sweep_gives_what_the_summary_of_a_run_gives_for_each_value(
     assert rate["mean"] == pytest.approx(100.0 * table["failures"].sum() / 120.0) and rate["n"] == 3
 
 
-def test_a_sweep_is_written_whole_or_not_at_all(
+def test_a_sweep_is_written_as_table_and_picture(
     swept: tuple[OwnFile, pd.DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A table of every metric and a picture; without the library that draws only the table; nothing
-    without a place."""
+    """Without matplotlib only the table is written, and a missing folder is named."""
     own, table = swept
     summary = summary_of_sweep(own, table)
     assert [path.name for path in write_sweep(summary, own, tmp_path)] == ["sweep.csv", "sweep.png"]
@@ -106,10 +103,10 @@ LONG = [f"a-map-with-quite-a-long-name-{k}" for k in range(12)]
     ],
     ids=["numbers", "long names", "many names", "long lines"],
 )
-def test_nothing_of_a_sweeps_picture_is_cut_off(
+def test_no_text_of_a_sweeps_picture_is_cut_off(
     monkeypatch: pytest.MonkeyPatch, fields: dict[str, list[Any]]
 ) -> None:
-    """No name of a value, a field, a line or the file is outside of the picture, or on another."""
+    """Names of values, fields, lines and the file lie within the picture and do not overlap."""
     metrics = ("success", "failures_per_100m", "time_to_goal_s")
     rows = [
         dict(zip(fields, at, strict=True))
@@ -127,7 +124,7 @@ def test_nothing_of_a_sweeps_picture_is_cut_off(
 
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The examples in a folder of their own, shortened to what a test can wait for."""
+    """Return the examples in a separate folder, shortened for the tests."""
     folder = tmp_path_factory.mktemp("own") / "examples"
     shutil.copytree(EXAMPLES, folder)
     for path in folder.glob("*.toml"):
@@ -140,9 +137,8 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", ["morning-crossing", "own-map"])
-def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -> None:
-    """A crossing with a crowd, an event on a map of one's own; the row holds the hash that `check`
-    tells."""
+def test_an_example_is_valid_and_runs(examples: Path, name: str, cosim: Cosim) -> None:
+    """Two examples run, and their rows have the hashes that `check` prints."""
     done = cosim("scenario", "check", f"{name}.toml", cwd=examples)
     assert done.returncode == 0, done.stderr
     ran = cosim(
@@ -157,8 +153,8 @@ def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -
 
 @pytest.mark.engine
 def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
-    """From a file to a table by density, and files beside the run; it is resumed, but not once the
-    file is edited."""
+    """One command leads from a file to a table by density and a picture; it can be resumed until
+    the file is edited."""
     words = (
         "scenario",
         "run",
@@ -191,9 +187,9 @@ def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
 
 
 @pytest.mark.engine
-def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, cosim: Cosim) -> None:
-    """A run folder for each goal protocol, all of one seed and in real time as asked, and one table
-    of them; a recording of several is refused before anything runs."""
+def test_a_sweep_over_goal_protocols_is_one_run_each(tmp_path: Path, cosim: Cosim) -> None:
+    """Each goal protocol has a run folder, all with one seed and in real time, and one table. A
+    recording of several is refused before anything runs."""
     (tmp_path / "told.toml").write_text(
         'name = "told"\ngoal_protocol = ["route_point", "final_point"]\n'
         '[place]\ncity = 1\nsize_m = 500\n[way]\nkind = "straight"\n[limits]\ntime_s = 0.5\n'
@@ -222,7 +218,7 @@ def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, co
 
 
 def test_an_axis_has_room_above_means_without_intervals() -> None:
-    """Also where some or all values are unknown."""
+    """The axis ends above the means, also where some or all values are unknown."""
     rows = pd.DataFrame({"mean": [10.3, 10.7, np.nan], "high": [np.nan, np.nan, np.nan]})
     assert top_of(rows) > 11.0
     assert top_of(rows.assign(high=14.0)) > 15.0

@@ -1,4 +1,4 @@
-"""Training of splats from photos: COLMAP's models, photos, the split, and what is measured."""
+"""Training of splats from photos: COLMAP models, photos, the split, and measures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COUNT = 12
 
 
 class Model:
-    """Cameras on a line, looking at a wall of points, in a frame that is turned."""
+    """Cameras on a line that look at a wall of points, in a rotated frame."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(3)
@@ -50,7 +50,7 @@ class Model:
         return [w, x, y, z]
 
     def tracked(self, k: int) -> NDArray[np.int64]:
-        """Ids of points; -1 is a pixel without one, as COLMAP writes it."""
+        """Return ids of points; -1 is a pixel without one, as COLMAP writes it."""
         return np.array([*self.ids[k::3], -1])
 
     def write_binary(self, folder: Path) -> None:
@@ -86,7 +86,8 @@ class Model:
         (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
 
     def draw(self, folder: Path) -> None:
-        """Photos through the lens: a white dot for each point, and the photo's number as grey."""
+        """Write photos through the lens: a white dot for each point, and the photo's number as
+        grey."""
         folder.mkdir(parents=True)
         lens = np.array([[FOCAL, 0, CENTRE[0] - 0.5], [0, FOCAL, CENTRE[1] - 0.5], [0, 0, 1]])
         for k in range(COUNT):
@@ -106,15 +107,15 @@ def model() -> Model:
 
 
 @pytest.fixture
-def folder(model: Model, tmp_path: Path) -> Path:
-    """A folder as COLMAP makes it, with photos."""
+def colmap_folder(model: Model, tmp_path: Path) -> Path:
+    """Return a folder as COLMAP makes it, with photos."""
     model.write_binary(tmp_path / "sparse" / "0")
     model.draw(tmp_path / "images")
     return tmp_path
 
 
 def test_binary_and_text_models_are_read_alike(model: Model, tmp_path: Path) -> None:
-    """Both have the poses, points and colours that were written, and each photo its own points."""
+    """Both formats give the written poses, points and colours, and each photo its own points."""
     model.write_binary(tmp_path / "a" / "sparse" / "0")
     model.write_text(tmp_path / "b" / "sparse")
     for found in (read_model(tmp_path / "a"), read_model(tmp_path / "b")):
@@ -129,9 +130,9 @@ def test_binary_and_text_models_are_read_alike(model: Model, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("size", [1000, 160])
-def test_photos_are_undistorted_and_scaled(model: Model, folder: Path, size: int) -> None:
-    """In an undistorted photo, points are where its intrinsics and pose put them."""
-    photo = read_photos(read_model(folder), folder / "images", size)[4]
+def test_photos_are_undistorted_and_scaled(model: Model, colmap_folder: Path, size: int) -> None:
+    """In an undistorted photo, points are where its intrinsics and pose project them."""
+    photo = read_photos(read_model(colmap_folder), colmap_folder / "images", size)[4]
     assert max(photo.rgb.shape) == min(size, WIDTH)
     local = model.points @ photo.matrix[:3, :3].T + photo.matrix[:3, 3]
     expected = ((local / local[:, 2:]) @ photo.intrinsics.T)[:, :2]
@@ -148,9 +149,9 @@ def test_photos_are_undistorted_and_scaled(model: Model, folder: Path, size: int
     assert seen >= 15
 
 
-def test_each_eighth_photo_is_held_out(folder: Path) -> None:
-    """The third of each eight, without photos that are left out; no photo is in both parts."""
-    photos = read_photos(read_model(folder), folder / "images", 64, ["photo 01.jpg"])
+def test_each_eighth_photo_is_held_out(colmap_folder: Path) -> None:
+    """The third of each eight remaining photos is held out, and no photo is in both parts."""
+    photos = read_photos(read_model(colmap_folder), colmap_folder / "images", 64, ["photo 01.jpg"])
     training, held_out = split(photos)
     assert [photo.name for photo in held_out] == ["photo 03.jpg", "photo 11.jpg"]
     assert len(training) == COUNT - 3
@@ -160,7 +161,8 @@ def test_each_eighth_photo_is_held_out(folder: Path) -> None:
 
 
 def test_psnr_is_measured() -> None:
-    """An error of 0.1 everywhere is 20 dB; an exposure is fitted away, a shift of the picture not."""
+    """An error of 0.1 everywhere is 20 dB; an exposure is fitted away, and a shift of the picture
+    is not."""
     photo = np.random.default_rng(1).uniform(0.2, 0.8, (20, 30, 3)).astype(np.float32)
     assert psnr_db(photo + np.float32(0.1), photo) == pytest.approx(20.0, abs=1e-4)
     assert psnr_db(photo, photo) == math.inf
@@ -171,7 +173,7 @@ def test_psnr_is_measured() -> None:
 
 
 def test_written_splats_are_read_by_the_importer(tmp_path: Path) -> None:
-    """Places, sizes, colours and opacities are those that were written."""
+    """Places, sizes, colours and opacities are read back."""
     rng = np.random.default_rng(2)
     rows = np.zeros(50, dtype=SPLAT_ROW)
     for name in SPLAT_ROW.names or ():
@@ -218,25 +220,26 @@ def _without_model(folder: Path) -> None:
         (_without_model, "holds no COLMAP model"),
     ],
 )
-def test_bad_models_are_refused(folder: Path, spoil: object, words: str) -> None:
+def test_bad_models_are_refused(colmap_folder: Path, spoil: object, words: str) -> None:
     """The error names the file, what is wrong, and the remedy."""
     assert callable(spoil)
-    spoil(folder)
+    spoil(colmap_folder)
     with pytest.raises(CosimError, match=words):
-        read_photos(read_model(folder), folder / "images", 64)
+        read_photos(read_model(colmap_folder), colmap_folder / "images", 64)
 
 
-def test_what_must_be_installed_is_named(folder: Path) -> None:
-    """Everything is read first; without gsplat the error has the command that installs it."""
+def test_a_missing_package_is_named_with_its_installation(colmap_folder: Path) -> None:
+    """Without gsplat the error has the command that installs it, after the inputs are checked."""
     with pytest.raises(SystemExit, match=r"gsplat cannot be imported: pip install torch gsplat=="):
-        main([str(folder), str(folder / "out"), "--size", "64"])
+        main([str(colmap_folder), str(colmap_folder / "out"), "--size", "64"])
     with pytest.raises(SystemExit, match=r"--leave-out 07\.jpg: not in the model"):
-        main([str(folder), str(folder / "out"), "--leave-out", "07.jpg"])
-    assert not (folder / "out").exists()
+        main([str(colmap_folder), str(colmap_folder / "out"), "--leave-out", "07.jpg"])
+    assert not (colmap_folder / "out").exists()
 
 
 def test_dense_points_are_read(tmp_path: Path) -> None:
-    """Places and colours come from a file like COLMAP's fused.ply; a cut file is refused."""
+    """Places and colours are read from a file like COLMAP's fused.ply, and a truncated file is
+    refused."""
     row = np.dtype([("p", "<f4", 3), ("n", "<f4", 3), ("c", "u1", 3)])
     rows = np.zeros(9, dtype=row)
     rows["p"], rows["c"] = np.arange(27).reshape(9, 3), np.arange(27).reshape(9, 3)

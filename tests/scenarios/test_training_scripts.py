@@ -1,4 +1,4 @@
-"""The script of a policy with a memory, with commands that only write the files of the real ones."""
+"""The training script of the recurrent policy, with stub commands that only write files."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ esac
 """
 
 
-def called(
+def run_script(
     folder: Path, code: int = 4, **settings: str
 ) -> tuple[subprocess.CompletedProcess[str], list[str]]:
-    """The script with these settings and this exit code of `cosim collect`, and its commands."""
+    """Run the script with these settings and this exit code of `cosim collect`; return the process
+    and its commands."""
     for name in ("cosim", "python"):
         (folder / name).write_text(COMMAND)
         (folder / name).chmod(0o755)
@@ -66,13 +67,14 @@ def called(
 
 
 def test_a_collection_that_crashed_is_not_done(tmp_path: Path) -> None:
-    """An uncaught exception, exit code 1, stops the script; so does a collection whose time is not
-    over. The rest of the time is what the next call collects for."""
-    done, calls = called(tmp_path, code=1)
+    """An uncaught exception (exit code 1) stops the script, and so does an unfinished collection.
+    The next call collects for the remaining time."""
+    done, calls = run_script(tmp_path, code=1)
     assert done.returncode == 1 and "stopped in collect-0-unit: call again" in done.stdout
-    assert not [*tmp_path.glob("work/log/*.done")] and all("collect" in call for call in calls)
+    assert not [*tmp_path.glob("work/log/*.done")] and calls
+    assert all("collect" in call for call in calls)
     (tmp_path / "work/log/collect-0-unit.seconds").write_text("360")
-    done, calls = called(tmp_path, MINUTES="5", COLLECT="4.5")
+    done, calls = run_script(tmp_path, MINUTES="5", COLLECT="4.5")
     assert done.returncode == 1 and "stopped in collect-0-long: call again" in done.stdout
     assert [path.name for path in tmp_path.glob("work/log/*.done")] == ["collect-0-unit.done"]
     minutes = {call.split()[2]: float(call.split("--minutes ")[1].split()[0]) for call in calls}
@@ -80,11 +82,12 @@ def test_a_collection_that_crashed_is_not_done(tmp_path: Path) -> None:
 
 
 def test_a_collection_without_episodes_is_not_done(tmp_path: Path) -> None:
-    """If its time was too short for one, the next call collects again, for as long."""
-    done, calls = called(tmp_path, EMPTY="1")
+    """If its time was too short for an episode, the next call collects again for as long."""
+    done, calls = run_script(tmp_path, EMPTY="1")
     assert done.returncode == 1 and "no episode in COLLECT minutes" in done.stdout
-    assert not [*tmp_path.glob("work/log/*.done")] and not any("pack" in call for call in calls)
-    done, _ = called(tmp_path)
+    assert not [*tmp_path.glob("work/log/*.done")]
+    assert calls and not any("pack" in call for call in calls)
+    done, _ = run_script(tmp_path)
     assert done.stdout.endswith("all done\n")
 
 
@@ -101,8 +104,8 @@ def test_a_collection_without_episodes_is_not_done(tmp_path: Path) -> None:
 def test_the_script_ends_with_a_table(
     tmp_path: Path, settings: dict[str, str], table: bool, names: list[str]
 ) -> None:
-    """Each policy has a name of its own, and all are compared; without a seed nothing is."""
-    done, calls = called(tmp_path, **settings)
+    """Each policy has its own name, and all are compared; without a seed none is."""
+    done, calls = run_script(tmp_path, **settings)
     assert done.returncode == 0 and done.stdout.endswith("all done\n"), done
     assert ("a table" in done.stdout) == table
     trained = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
@@ -123,10 +126,10 @@ HEAD = "by,metric,value_before,value_after,verdict\n"
     ids=["one rises", "one falls", "none rises"],
 )
 def test_fine_tuning_is_kept_if_val_improves(tmp_path: Path, rows: str, kept: str) -> None:
-    """The learner explores, what it drove is weighted, and the better one drives with black
-    pictures. Questions train on one event, and score with random goals."""
+    """The learner explores, its episodes are weighted, and the better policy also drives with black
+    pictures. Questions train on one event, and scores use random goals."""
     settings = {"VALUES": "0.5", "QUESTIONS": "1", "SUITES": "reactive", "SPLIT": "test"}
-    done, calls = called(tmp_path, **settings, TABLE=HEAD + rows)
+    done, calls = run_script(tmp_path, **settings, TABLE=HEAD + rows)
     assert done.returncode == 0 and f"kept: {kept}\n" in done.stdout, done
     net = tmp_path / "work/nets/sidewalk-0"
     explored = [call for call in calls if f"--learner onnx:{net} --explore 0.3" in call]
@@ -143,8 +146,8 @@ def test_fine_tuning_is_kept_if_val_improves(tmp_path: Path, rows: str, kept: st
 
 
 def test_a_collection_must_fit_in_a_piece(tmp_path: Path) -> None:
-    """A COLLECT of MINUTES or more is refused, with both."""
-    done, calls = called(tmp_path, COLLECT="9")
+    """A COLLECT of MINUTES or more is refused, with both values."""
+    done, calls = run_script(tmp_path, COLLECT="9")
     assert (done.returncode, calls) == (2, [])
     assert done.stdout == "COLLECT=9 must be less than MINUTES=9\n"
 
@@ -152,7 +155,7 @@ def test_a_collection_must_fit_in_a_piece(tmp_path: Path) -> None:
 def test_black_pictures_have_the_name_and_hash_of_their_policy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """So another policy is another run. Without a policy the message says how to set one."""
+    """Another policy is another run, and without a policy the message says how to set one."""
     names = set()
     for policy in ("small", "small-reactive"):
         monkeypatch.setenv("POLICY", policy)

@@ -1,4 +1,4 @@
-"""Transports: whatever carries jobs and results, the results are the same."""
+"""Transports: results do not depend on how jobs and results are carried."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from scenarios.ipc.messages import Done, Hello, Job, Message, MessageHandler
 from scenarios.runs import run as suite_run
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.tools.verify.doctor import small_scenario
-from tests.support.equality import thirty
+from tests.support.equality import thirty_scenarios
 
 
 class Ahead:
-    """Drives straight on, and sees where it goes."""
+    """Drives straight ahead with a camera."""
 
     manifest = Manifest("ahead", rate_hz=4.0, camera=CameraSpec(32, 24))
 
@@ -38,14 +38,14 @@ class Ahead:
 
 
 class Fails(Ahead):
-    """Raises."""
+    """Raises an error."""
 
     def act(self, observation: object) -> Command:
         raise LookupError("no answer")
 
 
 def done_here(policy: Policy, handle: MessageHandler) -> None:
-    """One short scenario in this process."""
+    """Run one short scenario in this process."""
     driver = PolicyCaller.of(policy)
     worker = InProcess(driver).start(Hello("mine", driver.manifest, driver.source_hash))
     worker.give(Job(msgspec.structs.replace(small_scenario(), time_limit_s=1.0)))
@@ -53,44 +53,41 @@ def done_here(policy: Policy, handle: MessageHandler) -> None:
 
 
 @pytest.mark.engine
-def test_a_full_disk_is_no_crash_of_an_episode_in_this_process(tmp_path: Path) -> None:
-    """What the run cannot write while the episode goes on ends the run, as it does with
-    processes."""
-    told: list[Message] = []
+def test_a_full_disk_ends_the_run_in_this_process(tmp_path: Path) -> None:
+    """An error while writing ends the run instead of crashing the episode, as with processes."""
+    messages: list[Message] = []
 
     def handle(message: Message) -> None:
-        told.append(message)
+        messages.append(message)
         raise MachineError("cannot be written: no space left on device")
 
     with pytest.raises(MachineError, match="no space left"):
         done_here(Ahead(), handle)
-    assert len(told) == 1 and not isinstance(told[0], Done)
+    assert len(messages) == 1 and not isinstance(messages[0], Done)
 
 
 @pytest.mark.engine
 def test_the_traceback_of_a_crash_is_printed_in_this_process(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """A record holds the message alone; the lines that lead to it are printed, as in a worker's
-    log."""
-    told: list[Message] = []
-    done_here(Fails(), told.append)
+    """A record has only the message, and its traceback is printed, as in a worker's log."""
+    messages: list[Message] = []
+    done_here(Fails(), messages.append)
     assert (
-        isinstance(done := told[-1], Done)
+        isinstance(done := messages[-1], Done)
         and done.status == "crashed"
         and b"no answer" in done.record
     )
-    said = capfd.readouterr().err
-    assert said.startswith("--- ") and 'raise LookupError("no answer")' in said
+    errors = capfd.readouterr().err
+    assert errors.startswith("--- ") and 'raise LookupError("no answer")' in errors
 
 
 @pytest.mark.engine
 def test_a_suite_has_the_same_results_over_every_transport(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In this process and in one of its own: the same state hashes, the same tables to the byte,
-    the same logs and camera frames; a policy object runs in this process, a named one in
-    processes."""
+    """In this process and in another one, state hashes, tables, logs and camera frames are equal to
+    the byte."""
     used = []
     for kind in (InProcess, LocalProcesses):
         monkeypatch.setattr(
@@ -125,6 +122,6 @@ def test_a_suite_has_the_same_results_over_every_transport(
 
 
 def test_equality_runs_thirty_scenarios() -> None:
-    """The script that compares all mechanisms takes thirty scenarios, without decoys."""
-    chosen = thirty().scenarios
+    """The script that compares all mechanisms selects thirty scenarios, without decoys."""
+    chosen = thirty_scenarios().scenarios
     assert len(chosen) == 30 and not any(one.decoy_of for one in chosen)

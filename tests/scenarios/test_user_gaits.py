@@ -1,4 +1,4 @@
-"""Gaits of users in runs: recorded and replayed, or crashed with the reason; and a published one."""
+"""Users' gaits in runs: recorded and replayed, or crashed with the reason; and a published gait."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PUBLISHED = (
 
 
 def second(name: str) -> Scenario:
-    """A scenario of one second, without people."""
+    """Return a scenario of one second, without people."""
     empty = CrowdSpec(persons=0, radius_m=40.0, vehicles=0)
     return msgspec.structs.replace(
         small_scenario(), id=name, time_limit_s=1.0, crowd=empty, robot="dog"
@@ -46,7 +46,8 @@ def second(name: str) -> Scenario:
 
 
 def test_a_run_records_its_gait_and_replays_with_it(tmp_path: Path, cosim: Cosim) -> None:
-    """By name and hash; with changed files neither a replay nor the rest of the run is possible."""
+    """The record has name and hash; with changed files neither a replay nor a resumed run is
+    possible."""
     write_suite(Suite(name="s", version="1", scenarios=(second("a"),)), tmp_path / "s.json")
     gait = written_gait(tmp_path)
     run = tmp_path / "run"
@@ -66,9 +67,9 @@ def test_a_run_records_its_gait_and_replays_with_it(tmp_path: Path, cosim: Cosim
     assert done.returncode == 2 and "gait_hash" in done.stderr
 
 
-def test_a_single_episode_records_the_gait_that_moved_it(tmp_path: Path) -> None:
-    """Its hash, and the absolute path; an episode of a run whose files have changed since is
-    invalid, with both hashes."""
+def test_a_single_episode_records_its_gait(tmp_path: Path) -> None:
+    """The record has hash and absolute path; an episode whose files have changed is invalid, with
+    both hashes."""
     options = EpisodeOptions(gait=f"onnx:{written_gait(tmp_path)}")
     with contextlib.chdir(tmp_path):
         record = run_episode(second("a"), Straight(), EpisodeOptions(gait="onnx:tiny.onnx")).record
@@ -90,7 +91,7 @@ def test_a_single_episode_records_the_gait_that_moved_it(tmp_path: Path) -> None
 def test_a_gait_that_fails_crashes_the_episode_with_the_reason(
     scale: float, kp: float, why: str, tmp_path: Path
 ) -> None:
-    """NaN, and torques far beyond the limits."""
+    """NaN answers and torques far beyond the limits crash the episode."""
     joints = {name: row | {"kp": kp, "scale": 1000} for name, row in JOINTS.items()}
     gait = written_gait(tmp_path, layers_graph(scale=scale), joints=joints)
     with np.errstate(all="ignore"):
@@ -99,8 +100,7 @@ def test_a_gait_that_fails_crashes_the_episode_with_the_reason(
 
 
 def test_a_published_network_walks_as_a_gait_of_the_dog(tmp_path: Path) -> None:
-    """The Go2's network of rl_sar, as ONNX: 10 m at 1 m/s in 12 s, on the line; it turns, and
-    stands."""
+    """The Go2 network of rl_sar walks 10 m at 1 m/s in 12 s on the line, turns, and stands."""
     if not (PUBLISHED / "policy.pt").is_file():
         pytest.skip(f"the published network {PUBLISHED}/policy.pt is missing (COSIM_WEIGHTS)")
     gait = robot_lab_gait(tmp_path, PUBLISHED)

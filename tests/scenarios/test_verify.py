@@ -1,5 +1,5 @@
-"""cosim verify: the shipped values are of the shipped suites, and whatever is planted is found and
-named."""
+"""`cosim verify`: the shipped values match the shipped suites, and every planted difference is
+found and named."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def shipped() -> Results:
     return Results.load(SHIPPED)
 
 
-def test_what_is_shipped_is_of_the_shipped_suites(shipped: Results) -> None:
-    """Twelve cases by the rule, each with both pictures. `scans` has no structure of its own."""
+def test_shipped_values_match_the_shipped_suites(shipped: Results) -> None:
+    """There are twelve cases, each with both pictures; `scans` has no structure of its own."""
     assert shipped.suites == {name: load_suite(name).content_hash for name in SUITES}, REMADE
     cases = verified_cases()
     assert [case.id for case in cases] == [*shipped.traces] and len(cases) == 12, REMADE
@@ -47,8 +47,8 @@ def test_what_is_shipped_is_of_the_shipped_suites(shipped: Results) -> None:
     assert writable(shipped, [case.id for case in cases]) is shipped
 
 
-def test_what_is_shipped_was_made_by_the_sources_as_they_are(shipped: Results) -> None:
-    """Else a difference is blamed on a source that is as it was shipped."""
+def test_shipped_values_were_made_by_these_sources(shipped: Results) -> None:
+    """Otherwise a difference would be attributed to an unedited source."""
     here = source_hashes()
     other = [
         room for room in {*here, *shipped.sources} if here.get(room) != shipped.sources.get(room)
@@ -60,19 +60,19 @@ def test_what_is_shipped_was_made_by_the_sources_as_they_are(shipped: Results) -
 
 
 def test_a_difference_is_blamed_on_packages_that_exist() -> None:
-    """Every package that a blame names has a source hash, so that an edited one is found."""
+    """Every package that a blame names has a source hash, so an edited one is found."""
     assert {source for blame in BLAMES.values() for source in blame.sources} <= {*source_hashes()}
 
 
 def differences(shipped: Results, here: Results) -> tuple[list[str], str]:
-    """What differs, and all that is said of it."""
+    """Return the names of differing findings, and their messages."""
     wrong = [one for one in findings(shipped, here) if not one.fine]
     words = [f"{one.name}: {one.words}" for one in wrong]
     return [one.name for one in wrong], "\n".join([*words, *blamed(wrong, shipped, here)])
 
 
 def changed_at(trace: Trace, part: str, tick: int) -> Trace:
-    """A trace of which a part is another one from a tick on, and so is what comes after it."""
+    """Return a trace in which a part and all later parts differ from a tick on."""
     at = 3 * (tick + 1)
     other = "".join("0" if digit != "0" else "1" for digit in trace.ticks[part][at:])
     later = {name: digits[: at + 3] + "fff" for name, digits in trace.ticks.items()}
@@ -85,8 +85,8 @@ def with_trace(given: Results, case: str, change: Callable[[Trace], Trace | str]
     return replace(given, traces=given.traces | {case: change(trace)})
 
 
-def test_the_shipped_installation_is_found_whole(shipped: Results) -> None:
-    """Beside itself nothing differs, and there is a line for every case."""
+def test_the_shipped_installation_has_no_differences(shipped: Results) -> None:
+    """Compared with itself nothing differs, and there is a line for every case."""
     assert differences(shipped, shipped) == ([], "")
     assert {*shipped.traces} < {one.name for one in findings(shipped, shipped)}
 
@@ -170,14 +170,14 @@ PLANTED: dict[str, tuple[Callable[[Results], Results], list[str], tuple[str, ...
 
 
 @pytest.mark.parametrize("plant, names, words", PLANTED.values(), ids=PLANTED)
-def test_what_is_planted_is_named_with_its_remedy(
+def test_a_planted_difference_is_named_with_its_remedy(
     shipped: Results, plant: Callable[[Results], Results], names: list[str], words: tuple[str, ...]
 ) -> None:
-    """Nothing else differs, and the words say which engine, version or part it is."""
-    found, said = differences(shipped, plant(shipped))
+    """Nothing else differs, and the message names the engine, version or part."""
+    found, message = differences(shipped, plant(shipped))
     assert found == names
     for word in words:
-        assert word in said
+        assert word in message
 
 
 def picture(level: int) -> Frame:
@@ -201,10 +201,10 @@ def picture(level: int) -> Frame:
         "another driver, forty levels off",
     ],
 )
-def test_pictures_may_differ_a_little_where_another_driver_draws(
+def test_pictures_of_another_driver_may_differ_a_little(
     shipped: Results, level: int, driver: str, fine: bool
 ) -> None:
-    """Where the shipped driver draws they are the same to the bit."""
+    """With the shipped driver they must be equal to the bit."""
 
     def with_picture(given: Results, level: int) -> Results:
         one = kept_picture(picture(level))
@@ -216,13 +216,13 @@ def test_pictures_may_differ_a_little_where_another_driver_draws(
     after = with_picture(shipped, level)
     if driver == "another":
         after = replace(after, alone=after.alone | {DRIVER: "0"}, renderer="gl: other")
-    found, said = differences(before, after)
+    found, message = differences(before, after)
     assert found == ([] if fine else ["curve-001"])
-    assert fine or "its picture by gl is not: 100.00 % of the labels" in said
+    assert fine or "its picture by gl is not: 100.00 % of the labels" in message
 
 
 def test_a_changed_texture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One texel of one texture: that texture and no other."""
+    """One changed texel changes this texture and no other."""
     stack = engines.ground_layers(256)
     spoiled = stack.rgba.copy()
     spoiled[stack.index("asphalt"), 3, 5, 0] ^= 1
@@ -233,13 +233,13 @@ def test_a_changed_texture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     before = textures()
     monkeypatch.setattr(engines, "_STACKS", (ground_layers, *engines._STACKS[1:]))
-    assert {name for name, differences in textures().items() if before[name] != differences} == {
+    assert {name for name, digest in textures().items() if before[name] != digest} == {
         "ground asphalt"
     }
 
 
-def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
-    """In a copy of the tree one constant is another one: the hash of its room is, and no other."""
+def test_an_edited_source_changes_the_hash_of_its_package(tmp_path: Path) -> None:
+    """In a copy of the tree an edited constant changes this hash and no other."""
     for room in TOP_FOLDERS:
         shutil.copytree(
             ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__", "*.json")
@@ -256,7 +256,7 @@ def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
     "content", [b"", b"{}", b'{"schema": 1'], ids=["empty", "of nothing", "cut short"]
 )
 def test_damaged_values_are_named(tmp_path: Path, content: bytes) -> None:
-    """In one line, with the remedy."""
+    """One line names the file and the remedy."""
     (tmp_path / "verify.json").write_bytes(content)
     with pytest.raises(
         RunError, match=r"verify\.json: holds nothing to verify by: .*\. Install again$"
@@ -264,8 +264,8 @@ def test_damaged_values_are_named(tmp_path: Path, content: bytes) -> None:
         Results.load(tmp_path / "verify.json")
 
 
-def test_whatever_a_case_raises_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also what no error of this project is, as another version of a package brings it."""
+def test_an_error_of_a_case_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors of other packages are reported as well."""
 
     def traced(case: object) -> Trace:
         raise AttributeError("module 'numpy' has no attribute 'frob'")
@@ -274,30 +274,30 @@ def test_whatever_a_case_raises_is_told_in_words(monkeypatch: pytest.MonkeyPatch
     assert trace_of(verified_cases()[0]) == "AttributeError: module 'numpy' has no attribute 'frob'"
 
 
-def test_a_case_that_there_is_not_is_refused(cosim: Cosim) -> None:
-    """With the valid names."""
-    said = cosim("verify", "--case", "frontal-01")
-    assert said.returncode == 2 and "Did you mean frontal-001?" in said.stderr
+def test_an_unknown_case_is_refused(cosim: Cosim) -> None:
+    """The message suggests a valid name."""
+    done = cosim("verify", "--case", "frontal-01")
+    assert done.returncode == 2 and "Did you mean frontal-001?" in done.stderr
 
 
 @pytest.mark.engine
 def test_this_installation_is_verified(cosim: Cosim) -> None:
-    """By one case of each suite: engines alone, textures, bits, numbers, pictures."""
+    """One case of each suite verifies engines alone, textures, bits, numbers and pictures."""
     names = ("crosswalk-001", "lateral-001", "lh-001-00")
-    said = cosim("verify", "--jobs", "1", *(word for name in names for word in ("--case", name)))
-    assert said.returncode == 0, said.stdout + said.stderr
+    done = cosim("verify", "--jobs", "1", *(word for name in names for word in ("--case", name)))
+    assert done.returncode == 0, done.stdout + done.stderr
     for name in ("SUMO alone", "PyBullet alone", "TinyRenderer alone", *names):
-        assert f"ok      {name}: " in said.stdout
-    assert "This installation gives the shipped bits and numbers." in said.stdout
+        assert f"ok      {name}: " in done.stdout
+    assert "This installation gives the shipped bits and numbers." in done.stdout
 
 
 @pytest.mark.engine
 def test_a_changed_constant_of_the_crowd_is_found(
     monkeypatch: pytest.MonkeyPatch, shipped: Results
 ) -> None:
-    """The crowd differs first, before all that hangs on it."""
+    """The crowd differs first, before all that depends on it."""
     (case,) = [case for case in verified_cases() if case.id == "lh-001-00"]
     monkeypatch.setattr(shown_people, "MAX_SPEED_MPS", 1.2)
     trace = traced(replace(case, time_limit_s=1.0))
-    differences = shipped.traces[case.id]
-    assert isinstance(differences, Trace) and first_difference(differences, trace)[0] == "crowd"
+    expected = shipped.traces[case.id]
+    assert isinstance(expected, Trace) and first_difference(expected, trace)[0] == "crowd"

@@ -17,7 +17,7 @@ from cosim.core.errors import SpecError
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.catalog import SUITES, load_suite
-from tests.support.mutate_suites import fates, mutated, small_suite
+from tests.support.mutate_suites import mutated, outcomes, small_suite
 
 PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|nested too deep")
 """Pattern of the place in the file that a refusal names."""
@@ -73,16 +73,16 @@ def test_mutated_suites_that_are_accepted_can_be_driven(tmp_path: Path) -> None:
     """Eight that reader and map accept are driven for 2 s without a crash (`python -m
     tests.support.mutate_suites`: 200)."""
     driven = []
-    for fate in fates(small_suite(City(seed=1, size_m=500.0)), tmp_path, count(0)):
-        if fate.what == "does not fit its place":
+    for outcome in outcomes(small_suite(City(seed=1, size_m=500.0)), tmp_path, count(0)):
+        if outcome.what == "does not fit its place":
             assert all(
-                line.isprintable() and len(line) <= 500 for line in fate.words.splitlines()
-            ), fate
-        elif fate.what != "refused":
-            driven.append(fate)
+                line.isprintable() and len(line) <= 500 for line in outcome.words.splitlines()
+            ), outcome
+        elif outcome.what != "refused":
+            driven.append(outcome)
         if len(driven) == 8:
             break
-    assert [fate.what for fate in driven] == ["driven"] * 8, driven
+    assert [outcome.what for outcome in driven] == ["driven"] * 8, driven
 
 
 OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (

@@ -20,8 +20,8 @@ pytestmark = pytest.mark.engine
 HALF_M = np.array([0.35, 0.275])
 
 
-def driven_over(street_map: StreetMap, corner: str) -> Pose:
-    """The middle of the longest path of cars over a corner."""
+def middle_of_car_path(street_map: StreetMap, corner: str) -> Pose:
+    """Return the middle of the longest path of cars over a corner."""
     ground = street_map.corners[corner].polygon
     lines = [line.intersection(ground) for line in paths_near(street_map, ground)]
     longest = max(lines, key=lambda line: line.length)
@@ -39,10 +39,10 @@ def driven_over(street_map: StreetMap, corner: str) -> Pose:
 def test_vehicles_stop_before_a_robot_on_a_corner_that_they_cross(
     where: Place, corner: str
 ) -> None:
-    """Two vehicles drive over a spot; none does while a robot stands there as long, and they drive
-    on when it has left."""
+    """Two vehicles drive over a spot without a robot, none while a robot is there as long, and
+    again after it has left."""
     net, street_map = place(where)
-    spot = driven_over(street_map, corner)
+    spot = middle_of_car_path(street_map, corner)
     assert street_map.locate(*spot[:2]).edge == corner
     over: dict[str, int] = {}
     crowd_spec = CrowdSpec(persons=0, vehicles=40)

@@ -1,9 +1,8 @@
 """The census of cities, properties of the generator over seeds and sizes, city folders and their
-command line."""
+commands."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,15 +37,15 @@ pytestmark = pytest.mark.engine
 
 
 @pytest.fixture(scope="module")
-def large() -> Path:
-    """The net of a shipped city."""
+def large_net() -> Path:
+    """Return the net of a shipped city."""
     return city_net(shipped_cities(1)[0])
 
 
-def test_a_shipped_city_keeps_every_promise(large: Path) -> None:
-    """Seven blocks, five zones on every street, one piece, room to pass, long walks, islands,
-    driveways, no fault."""
-    found = census(large)
+def test_a_shipped_city_has_all_documented_features(large_net: Path) -> None:
+    """It has seven blocks, five zones on every street, one connected piece, wide passages, long
+    walks, islands, driveways, and no fault."""
+    found = census(large_net)
     assert found.faults == ()
     assert list(found.blocks) == list(BLOCKS) and min(found.blocks.values()) >= 2
     assert list(found.zones) == list(ZONES) and found.missing == 0
@@ -55,9 +54,8 @@ def test_a_shipped_city_keeps_every_promise(large: Path) -> None:
     assert all(span.low < span.high for span in found.zones.values())
 
 
-def test_census_notices_what_is_broken(tmp_path: Path) -> None:
-    """Zones that are not there, passages too narrow, signals that never let people go: each is a
-    fault."""
+def test_the_census_finds_faults(tmp_path: Path) -> None:
+    """Missing zones, too narrow passages, and signals without a walk phase are faults."""
     broken = tmp_path / "broken.net.xml"
     build_city(City(seed=2, size_m=500.0), broken)
     net = broken.read_bytes()
@@ -72,9 +70,9 @@ def test_census_notices_what_is_broken(tmp_path: Path) -> None:
     assert any("a passage is only 1." in fault for fault in census(broken).faults)
 
 
-def test_streets_are_told_apart_by_their_turns() -> None:
-    """A line without turns is straight, one that turns one way a curve, one that turns both ways an
-    S-bend."""
+def test_streets_are_classified_by_their_turns() -> None:
+    """A line without turns is straight, one that turns one way a curve, and one that turns both
+    ways an S-bend."""
     x = np.linspace(0.0, 100.0, 30)
     assert _shape(np.column_stack([x, 0.02 * x])) == "straight"
     assert _shape(np.column_stack([x, 0.004 * x * x])) == "curve"
@@ -82,7 +80,7 @@ def test_streets_are_told_apart_by_their_turns() -> None:
 
 
 def test_shipped_seeds_are_a_hundred_different_ones() -> None:
-    """The list of seeds is long and without repeats; cities have names of their own."""
+    """The list of seeds has no repeats, and all cities have different names."""
     assert len(SEEDS) == len(set(SEEDS)) == 100
     assert len({city.name for city in shipped_cities()}) == 100
 
@@ -93,11 +91,11 @@ def test_shipped_seeds_are_a_hundred_different_ones() -> None:
     size_m=st.floats(200.0, 600.0).map(lambda size: round(size, 1)),
     style=st.sampled_from(sorted(STYLES)),
 )
-def test_any_city_is_whole(
+def test_any_city_is_connected_and_reproducible(
     tmp_path_factory: pytest.TempPathFactory, seed: int, size_m: float, style: str
 ) -> None:
-    """Any seed, size and style: one component, every strip reached, clear width, signals without
-    fault, same bytes."""
+    """Any seed, size and style gives one component, reachable strips, the clear width, signals
+    without fault, and the same bytes again."""
     folder = tmp_path_factory.mktemp("any")
     one, two = folder / "one.net.xml", folder / "two.net.xml"
     city = City(seed=seed, size_m=size_m, style=style)
@@ -114,8 +112,7 @@ def test_any_city_is_whole(
 
 
 def test_a_city_folder_is_equal_when_made_again(tmp_path: Path) -> None:
-    """The net and what it was made from, byte by byte; nothing is overwritten or left behind by
-    mistake."""
+    """The net and its parameters are equal byte by byte, and other folders are not overwritten."""
     city = City(seed=4, size_m=260.0)
     made = [write_city(city, tmp_path / name) for name in ("a", "b")]
     assert made[0] == made[1] and made[0].net_hash == net_content_hash(
@@ -142,20 +139,14 @@ def test_a_damaged_net_in_the_cache_is_built_again(
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     city = City(seed=9, size_m=200.0)
     path = city_net(city)
-    whole = path.read_bytes()
-    path.write_bytes(damage(whole))
+    undamaged = path.read_bytes()
+    path.write_bytes(damage(undamaged))
     assert not is_undamaged(path)
-    assert city_net(city).read_bytes() == whole
-
-
-def _built(folder: str) -> tuple[str, int]:
-    os.environ["COSIM_CACHE"] = folder
-    path = city_net(City(seed=8, size_m=300.0))
-    return path.name, len(path.read_bytes())
+    assert city_net(city).read_bytes() == undamaged
 
 
 def test_city_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """make, table and draw do what they say; bad input ends in a message."""
+    """make, table and draw write their outputs, and invalid input ends with a message."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     runner = CliRunner()
     made = runner.invoke(app, ["city", "make", "--seed", "3", "--size", "250", str(tmp_path / "c")])
@@ -182,10 +173,10 @@ def test_city_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-def test_distance_to_the_edge_is_the_one_of_geometry(large: Path) -> None:
-    """Signed distances equal shapely's distance to the whole boundary, positive inside, holes and
-    parts included."""
-    place = street_map_of(large)
+def test_distance_to_the_edge_equals_that_of_shapely(large_net: Path) -> None:
+    """Signed distances equal shapely's distance to the whole boundary, positive inside, with holes
+    and parts."""
+    place = street_map_of(large_net)
     area = WalkableArea(place.walkable)
     xy = np.random.default_rng(1).uniform(0.0, 2000.0, (300, 2))
     points = shapely.points(xy)

@@ -38,18 +38,20 @@ SAMPLE = [
 
 @pytest.fixture(scope="module")
 def built() -> dict[tuple[int, float, str], Path]:
-    """The nets of SAMPLE."""
+    """Build the nets of SAMPLE."""
     return {one: city_net(City(seed=one[0], size_m=one[1], style=one[2])) for one in SAMPLE}
 
 
 @pytest.fixture(scope="module")
-def read(built: dict[tuple[int, float, str], Path]) -> dict[tuple[int, float, str], StreetMap]:
-    """The maps that are read of them."""
+def street_maps(
+    built: dict[tuple[int, float, str], Path],
+) -> dict[tuple[int, float, str], StreetMap]:
+    """Read the maps of the built nets."""
     return {one: read_net(path) for one, path in built.items()}
 
 
 def groups(place: StreetMap) -> list[set[str]]:
-    """The strips of a map by connected component of the walking graph."""
+    """Return the strips of a map by connected component of the walking graph."""
     beside: dict[str, set[str]] = defaultdict(set)
     for area in place.corners.values():
         for port in area.ports:
@@ -69,7 +71,7 @@ def groups(place: StreetMap) -> list[set[str]]:
 
 
 def arms(plan: CityPlan) -> dict[str, list[float]]:
-    """Headings with which two-way streets leave each node."""
+    """Return headings with which two-way streets leave each node."""
     found = defaultdict(list)
     for edge in plan.edges:
         if edge.street_class != "ring":
@@ -77,8 +79,8 @@ def arms(plan: CityPlan) -> dict[str, list[float]]:
     return found
 
 
-def test_blocks_start_and_end_where_they_are_told() -> None:
-    """Every primitive line keeps its ends, and curves leave and arrive with the turn asked for."""
+def test_primitive_lines_keep_their_ends_and_turns() -> None:
+    """Curves leave and arrive with the requested turn."""
     a, b = (0.0, 0.0), (100.0, 0.0)
     curve = bend(a, b, 0.5, -0.5)
     s_bend = bend(a, b, 0.5, 0.5)
@@ -109,8 +111,8 @@ def test_same_seed_gives_the_same_plan_and_another_seed_another() -> None:
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("style", sorted(STYLES))
 def test_streets_meet_at_wide_angles_and_stay_inside(seed: int, style: str) -> None:
-    """Arms are more than 45 degrees apart, streets longer than 30 m, no node is a dead end, all
-    inside the square."""
+    """Arms are more than 45 degrees apart, streets longer than 30 m, no node is a dead end, and all
+    are inside the square."""
     plan = plan_city(seed, 1200.0, style)
     for node, headings in arms(plan).items():
         order = sorted(h % (2.0 * math.pi) for h in headings)
@@ -123,7 +125,7 @@ def test_streets_meet_at_wide_angles_and_stay_inside(seed: int, style: str) -> N
         assert all(reach < x < 1200.0 - reach and reach < y < 1200.0 - reach for x, y in edge.line)
 
 
-def test_large_city_shows_every_primitive_block() -> None:
+def test_a_large_city_has_every_primitive_block() -> None:
     """A 2 km city has straights, curves, corners, T, X and Y junctions, roundabouts and mid-block
     crosswalks."""
     plan = plan_city(1, 2000.0, "mixed")
@@ -145,8 +147,8 @@ def test_sidewalks_fit_the_stripes_of_the_crowd_model() -> None:
 
 
 def test_widths_differ_within_the_ranges_of_the_class() -> None:
-    """One street has one cross-section; streets of a class differ, each within the ranges; wide
-    ones have islands."""
+    """One street has one cross-section; streets of a class differ within its ranges, and wide ones
+    have islands."""
     plan = plan_city(3, 2000.0, "mixed")
     sections = defaultdict(set)
     for edge in plan.edges:
@@ -163,7 +165,7 @@ def test_widths_differ_within_the_ranges_of_the_class() -> None:
 
 
 def test_driveways_keep_off_the_ends_of_their_street() -> None:
-    """There are some, beside both directions, far from junctions and crosswalks."""
+    """Driveways exist on both sides, far from junctions and crosswalks."""
     edges = [edge for edge in plan_city(3, 2000.0, "mixed").edges if edge.driveways]
     assert len(edges) > 40 and {edge.id[0] for edge in edges} == {"-", "s"}
     for edge in edges:
@@ -175,7 +177,7 @@ def test_driveways_keep_off_the_ends_of_their_street() -> None:
 
 
 def test_cities_out_of_range_are_refused() -> None:
-    """Size, style and seed are checked, and the message lists what is valid."""
+    """Size, style and seed are checked, and the message lists the valid values."""
     with pytest.raises(MapError, match=r"size_m must be in \[200, 4000\], not 50"):
         plan_city(1, 50.0, "mixed")
     with pytest.raises(
@@ -187,10 +189,12 @@ def test_cities_out_of_range_are_refused() -> None:
 
 
 @pytest.mark.engine
-def test_built_city_is_one_walkable_whole(read: dict[tuple[int, float, str], StreetMap]) -> None:
-    """Every strip has a corner at both ends, is reachable from every other one, and 99 % of the
+def test_a_built_city_is_one_walkable_piece(
+    street_maps: dict[tuple[int, float, str], StreetMap],
+) -> None:
+    """Every strip has a corner at both ends and is reachable from every other one, and 99 % of the
     area is one piece."""
-    for place in read.values():
+    for place in street_maps.values():
         assert all(None not in strip.corners for strip in place.strips.values())
         assert len(groups(place)) == 1
         areas = [part.area for part in shapely.get_parts(place.walkable)]
@@ -199,12 +203,12 @@ def test_built_city_is_one_walkable_whole(read: dict[tuple[int, float, str], Str
 
 @pytest.mark.engine
 def test_built_city_keeps_the_zones_of_its_plan(
-    read: dict[tuple[int, float, str], StreetMap],
+    street_maps: dict[tuple[int, float, str], StreetMap],
 ) -> None:
-    """Sidewalks carry the widths of their street class, the road on their left and verges
+    """Sidewalks have the widths of their street class, the road on their left, and verges
     between."""
     sections = {edge.id: edge for edge in plan_city(*SAMPLE[2]).edges}
-    place = read[SAMPLE[2]]
+    place = street_maps[SAMPLE[2]]
     lanes: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for lane in place.lanes.values():
         if not lane.internal:
@@ -228,20 +232,20 @@ def test_built_city_keeps_the_zones_of_its_plan(
 
 @pytest.mark.engine
 def test_every_signalised_crossing_has_time_to_cross(
-    built: dict[tuple[int, float, str], Path], read: dict[tuple[int, float, str], StreetMap]
+    built: dict[tuple[int, float, str], Path], street_maps: dict[tuple[int, float, str], StreetMap]
 ) -> None:
-    """Crossings get 8 s of green and are cleared at 1.1 m/s before cars go; no two links clash."""
+    """Crossings get 8 s of green and are cleared at 1.1 m/s before cars go, and no two links
+    conflict."""
     for path in built.values():
         assert signal_faults(path.read_bytes()) == []
-    assert sum(strip.signalised for strip in read[SAMPLE[2]].strips.values()) > 20
+    assert sum(strip.signalised for strip in street_maps[SAMPLE[2]].strips.values()) > 20
 
 
 @pytest.mark.engine
-def test_programs_of_netconvert_would_be_found_out(
+def test_faulty_signal_programs_are_found(
     built: dict[tuple[int, float, str], Path],
 ) -> None:
-    """The check of signals notices a crossing that never gets green, and one that is not
-    cleared."""
+    """The check of signals finds a crossing that never gets green, and one that is not cleared."""
     net = built[SAMPLE[2]].read_bytes()
     assert any("never changes" in fault for fault in signal_faults(net.replace(b'G"/>', b'r"/>')))
     hasty = net.replace(b'duration="2"', b'duration="0"').replace(b'duration="3"', b'duration="1"')
@@ -249,8 +253,8 @@ def test_programs_of_netconvert_would_be_found_out(
 
 
 @pytest.mark.engine
-def test_sumo_loads_a_city_without_a_word(built: dict[tuple[int, float, str], Path]) -> None:
-    """SUMO itself finds nothing to warn of: not in topology, not in the programs."""
+def test_sumo_loads_a_city_without_warnings(built: dict[tuple[int, float, str], Path]) -> None:
+    """SUMO finds no fault in topology and programs."""
     import sumo
 
     binary = Path(sumo.__file__).parent / "bin" / "sumo"
@@ -264,7 +268,7 @@ def test_sumo_loads_a_city_without_a_word(built: dict[tuple[int, float, str], Pa
 def test_city_is_equal_to_the_byte_in_another_process(
     built: dict[tuple[int, float, str], Path], tmp_path: Path
 ) -> None:
-    """Building the same city elsewhere, with another hash seed, gives the same file."""
+    """Building the same city in another process, with another hash seed, gives the same file."""
     seed, size_m, style = SAMPLE[2]
     code = (
         "from sumo_nets.city.store import city_net; from cosim.spec.scenario import City;"
@@ -285,8 +289,8 @@ def test_city_is_equal_to_the_byte_in_another_process(
 def test_store_builds_once_and_refuses_another_net(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second request is served from the cache, which says that it was used; what was not used
-    for long makes room. A scenario made on another net is refused with a remedy."""
+    """The second request is served from the cache, and nets that were not used for long are
+    deleted. A scenario made on another net is refused with a remedy."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     (tmp_path / "old.net.xml").write_text("<net/>")
     os.utime(tmp_path / "old.net.xml", (0.0, 0.0))
@@ -305,9 +309,11 @@ def test_store_builds_once_and_refuses_another_net(
 
 
 @pytest.mark.engine
-def test_processes_build_one_city_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each gets the whole net, also when one of them is killed while it builds; what that left is
-    removed."""
+def test_concurrent_processes_build_one_city(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each gets the complete net, also when one of them is killed while it builds, and its scratch
+    files are removed."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     code = (
         "from sumo_nets.city.store import city_net, is_undamaged; from cosim.spec.scenario import City;"
@@ -330,8 +336,8 @@ def test_processes_build_one_city_at_once(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.engine
-def test_netconvert_failures_are_its_complaint_on_one_line(tmp_path: Path) -> None:
-    """Bad input ends in a MapError of one line with netconvert's own words."""
+def test_netconvert_failures_give_one_line(tmp_path: Path) -> None:
+    """Invalid input ends in a MapError of one line with netconvert's own message."""
     broken = tmp_path / "broken.net.xml"
     broken.write_text("<net")
     with pytest.raises(

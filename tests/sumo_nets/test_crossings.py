@@ -1,4 +1,4 @@
-"""Signalised crossings, one after another, with the real engines."""
+"""Scenarios on signalised crossings, with the real engines."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ SMALL = City(seed=5, size_m=500.0)
 
 
 def test_a_crossing_scenario_is_a_short_way_over_one_signalised_crossing() -> None:
-    """Four different crossings, 10 m of sidewalk before and 8 m after each, the same ones whenever
-    they are drawn."""
+    """Four different crossings, with 10 m of sidewalk before and 8 m after each, are drawn the same
+    every time."""
     _, street_map = place(SMALL)
     graph = WalkGraph(street_map)
     drawn = build_all(SMALL, street_map, graph, 3, 4)
@@ -50,8 +50,8 @@ def test_a_crossing_scenario_is_a_short_way_over_one_signalised_crossing() -> No
         assert all(street_map.locate(*end, 0.0).kind == "walk" for end in ends)
 
 
-def test_a_city_has_only_so_many_crossings() -> None:
-    """Who asks for more than there are is told how many there are."""
+def test_too_many_crossings_are_refused() -> None:
+    """The message has the number of crossings of the city."""
     _, street_map = place(SMALL)
     with pytest.raises(MapError, match=r"has \d+ signalised crossings to drive over, not 10000"):
         build_all(SMALL, street_map, WalkGraph(street_map), 3, 10_000)
@@ -59,27 +59,27 @@ def test_a_city_has_only_so_many_crossings() -> None:
 
 @pytest.fixture
 def bench(cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
-    """What `cosim bench crossings` prints, in small cities."""
+    """Return the output of `cosim bench crossings`, in small cities."""
     monkeypatch.setattr("scenarios.tools.bench.crossings._SIZE_M", 600.0)
 
-    def said(*words: str, cwd: Path | None = None) -> str:
+    def run(*words: str, cwd: Path | None = None) -> str:
         done = cosim("bench", "crossings", *words, cwd=cwd)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    return said
+    return run
 
 
-def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red(
+def test_the_bench_counts_entries_at_red(
     bench: Callable[..., str],
 ) -> None:
-    """One crossing from the command line: the robot arrives, nothing at red by it; people and
-    vehicles are counted."""
-    told = bench("--crossings", "1", "--policy", "orca")
-    rows = dict(re.findall(r"^ ([a-z ,]+?)  +([\d.]+)", told, re.MULTILINE))
+    """On one crossing the robot arrives without entering at red, and people and vehicles are
+    counted."""
+    output = bench("--crossings", "1", "--policy", "orca")
+    rows = dict(re.findall(r"^ ([a-z ,]+?)  +([\d.]+)", output, re.MULTILINE))
     assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
     assert rows["waited at red"] == "1"
-    assert int(re.findall(r"(\d+) vehicles passed stop lines", told)[0]) > 0
+    assert int(re.findall(r"(\d+) vehicles passed stop lines", output)[0]) > 0
 
 
 DIES = """
@@ -104,18 +104,18 @@ class Dies:
 """
 
 
-def test_the_bench_keeps_what_was_driven_before_its_process_died(
+def test_the_bench_reports_errors_and_dead_processes(
     tmp_path: Path, bench: Callable[..., str]
 ) -> None:
-    """A policy raises at its first crossing; made anew, it ends the process at the second: both
-    rows say which."""
+    """A policy that raises at its first crossing and ends its process at the second has a row for
+    each."""
     (tmp_path / "dies.py").write_text(DIES)
-    told = bench("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", cwd=tmp_path)
-    (crashed,) = re.findall(r"^ crashed +2  (.+?) *$", told, re.MULTILINE)
+    output = bench("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", cwd=tmp_path)
+    (crashed,) = re.findall(r"^ crashed +2  (.+?) *$", output, re.MULTILINE)
     assert re.fullmatch(r"crossing-001-00 .*no idea.*, crossing-001-01 the process died", crashed)
 
 
-class Heedless:
+class IgnoresTraffic:
     """Follows its route at walking pace, whatever the signals and the traffic do."""
 
     manifest = Manifest("heedless", rate_hz=10.0, camera=None, privileged=True)
@@ -130,9 +130,9 @@ class Heedless:
         )
 
 
-def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
-    """Over a busy crossing at red, at 0.5 m/s: a car brakes to a stop before the robot, once; none
-    touches it."""
+def test_a_car_brakes_for_a_robot_at_red() -> None:
+    """At 0.5 m/s over a busy crossing at red, a car brakes once to a stop, and none touches the
+    robot."""
     _, street_map = place(SMALL)
     drawn = build_all(SMALL, street_map, WalkGraph(street_map), 0, 1)[0]
     busy = msgspec.structs.replace(
@@ -147,23 +147,23 @@ def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
             if name in braking or name in slowest:
                 slowest[name] = min(slowest.get(name, 99.0), speed_mps)
 
-    measures = run_episode(busy, Heedless(), watches=[watch]).record.measures
+    measures = run_episode(busy, IgnoresTraffic(), watches=[watch]).record.measures
     assert measures["red_light_entries"] == 1
     assert measures["vehicles_braked"] == 1 and min(slowest.values()) < 0.1
     assert measures["collisions_vehicle"] == 0
     assert measures["carriageway_time_s"] is not None and measures["carriageway_time_s"] > 10.0
 
 
-@pytest.mark.parametrize("who", ["nobody", "robot", "person"])
-def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
+@pytest.mark.parametrize("present", ["nobody", "robot", "person"])
+def test_vehicles_yield_on_a_crossing_without_signals(present: str) -> None:
     """Cars drive over the middle of a crossing, but not where a robot or a person stands for half a
     minute."""
     net, street_map = place(SMALL)
     crossing = Polyline(street_map.strips[":n1x2_c1"].line[:, :2])
     assert not street_map.strips[":n1x2_c1"].signalised
     middle = crossing.at(0.5 * crossing.length_m)
-    here = np.array([0.35, 0.275])
-    guest = Actor(
+    half_size_m = np.array([0.35, 0.275])
+    actor = Actor(
         id="e0",
         x_m=middle.x_m,
         y_m=middle.y_m,
@@ -176,16 +176,18 @@ def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
     with SumoCrowd(
         net, street_map, CrowdSpec(persons=0, vehicles=40), 7, frozenset(), middle[:2]
     ) as crowd:
-        for tick in range(1200 if who == "nobody" else 600):
+        for tick in range(1200 if present == "nobody" else 600):
             if over:
                 break
             reply = EventReply(
-                episode="t", tick=tick, states=(), actors=(guest,) if who == "person" else ()
+                episode="t", tick=tick, states=(), actors=(actor,) if present == "person" else ()
             )
-            cars = crowd.step(RobotState(middle), reply, absent=who != "robot").vehicles
+            cars = crowd.step(RobotState(middle), reply, absent=present != "robot").vehicles
             boxes = np.column_stack([cars.xy, cars.heading])
             over |= {
                 cars.ids[i]
-                for i in np.flatnonzero(boxes_overlap(np.array(middle), here, boxes, cars.size / 2))
+                for i in np.flatnonzero(
+                    boxes_overlap(np.array(middle), half_size_m, boxes, cars.size / 2)
+                )
             }
-    assert bool(over) is (who == "nobody")
+    assert bool(over) is (present == "nobody")

@@ -38,14 +38,14 @@ class Place(NamedTuple):
 
 @pytest.fixture(scope="module")
 def place() -> Place:
-    """A city of 600 m."""
+    """Return a city of 600 m."""
     net = city_net(City(seed=2, size_m=600.0))
     street_map = street_map_of(net)
     return Place(net, street_map, WalkGraph(street_map))
 
 
-def acting(name: str, x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> Actor:
-    """Somebody of an event who walks."""
+def event_actor(name: str, x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> Actor:
+    """Return a walking person of an event."""
     return Actor(
         id=name,
         x_m=x_m,
@@ -66,8 +66,8 @@ def at(pose: Pose) -> RobotState:
 
 
 def middle(place: Place, *, signalised: bool = False) -> Pose:
-    """The middle of a long sidewalk near the centre of the map, or the nearest one to a signalised
-    crossing."""
+    """Return the middle of a long sidewalk near the centre of the map, or the nearest one to a
+    signalised crossing."""
     street_map = place.map
     x0, y0, x1, y1 = street_map.bounds
     centre = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
@@ -85,7 +85,7 @@ def middle(place: Place, *, signalised: bool = False) -> Pose:
 
 
 def gaps(street: Street, pose: Pose) -> Floats:
-    """Distance of every person to a pose, metres."""
+    """Return the distance of every person to a pose in metres."""
     offset = street.people.xy - pose[:2]
     return np.asarray(np.hypot(offset[:, 0], offset[:, 1]))
 
@@ -115,8 +115,8 @@ def travel(place: Place) -> Travel:
 def test_the_first_street_is_populated_and_clear_around_the_robot(
     place: Place, travel: Travel
 ) -> None:
-    """At tick 0 all persons asked for are there, none nearer than 8 m, all on walkable ground, and
-    cars drive."""
+    """At tick 0 all requested persons are on walkable ground, none nearer than 8 m, and cars
+    drive."""
     street = travel.streets[0]
     near = gaps(street, travel.poses[0])
     assert street.tick == 0 and len(street.people) == 40
@@ -132,7 +132,7 @@ def test_the_first_street_is_populated_and_clear_around_the_robot(
 
 
 def test_the_crowd_follows_a_robot_that_travels(travel: Travel) -> None:
-    """About as many persons as asked for are within the radius of the robot, and none appears near
+    """About as many persons as requested are within the radius of the robot, and none appears near
     it."""
     known: set[str] = set()
     appeared: list[float] = []
@@ -151,9 +151,9 @@ def test_the_crowd_follows_a_robot_that_travels(travel: Travel) -> None:
     assert len(appeared) > 10 and min(appeared) > 34.0
 
 
-def test_a_density_is_reached_and_kept_on_the_way(place: Place) -> None:
-    """Over 100 m persons per 1000 m2 of walkable ground are as asked for, within 5 % on the mean of
-    every third."""
+def test_a_density_is_kept_along_the_way(place: Place) -> None:
+    """Over 100 m the mean of every third has the requested persons per 1000 m2 of walkable ground,
+    within 5 %."""
     start = middle(place)
     reach = place.graph.reach(Port(place.map.locate(*start[:2]).edge, 0))
     path = reach.path(reach.within(130.0, 300.0)[0])
@@ -179,7 +179,7 @@ def test_a_density_is_reached_and_kept_on_the_way(place: Place) -> None:
 
 
 def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
-    """In 40 seconds beside a standing robot people pass on the sidewalk, nobody nearer than 0.5 m."""
+    """In 40 seconds beside a standing robot people pass on the sidewalk, none nearer than 0.5 m."""
     start = middle(place)
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
     nearest = math.inf
@@ -194,9 +194,8 @@ def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
     assert nearest >= 0.5
 
 
-def test_people_walk_on_where_a_standing_robot_blocks_the_sidewalk(tmp_path: Path) -> None:
-    """On a sidewalk of 1.5 m they pass a robot in its middle, on either way, without touching
-    it."""
+def test_people_pass_a_robot_in_the_middle_of_a_narrow_sidewalk(tmp_path: Path) -> None:
+    """On a sidewalk of 1.5 m they pass it in both directions without touching it."""
     nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "street.net.xml"))
     nodes.write_text('<n><node id="a" x="0" y="0"/><node id="b" x="100" y="0"/></n>')
     edge = '<edge id="{0}" from="{0[0]}" to="{0[1]}" numLanes="1" sidewalkWidth="1.5"/>'
@@ -224,9 +223,8 @@ def test_people_walk_on_where_a_standing_robot_blocks_the_sidewalk(tmp_path: Pat
     assert min(passed.values()) >= 1 and least_m > 0.05
 
 
-def test_an_absent_robot_is_walked_through(place: Place) -> None:
-    """Where people keep half a metre from a robot, without it somebody walks over the very
-    place."""
+def test_people_walk_through_an_absent_robot(place: Place) -> None:
+    """Where people keep half a metre from a robot, without it some walk over its place."""
     start = middle(place)
     nearest = math.inf
     with SumoCrowd(
@@ -242,7 +240,7 @@ def test_an_absent_robot_is_walked_through(place: Place) -> None:
 
 
 class Junction(NamedTuple):
-    """The streets of 80 seconds next to signals, and the light of each vehicle at its stop line."""
+    """The streets of 80 seconds beside signals, and the light of each vehicle at its stop line."""
 
     streets: list[Street]
     lights: str
@@ -263,10 +261,8 @@ def junction(place: Place) -> Junction:
 
 
 def test_nobody_enters_a_signalised_crossing_on_red(place: Place, junction: Junction) -> None:
-    """People wait and start over crossings, none once it has been red for 2 s.
-
-    Two seconds is what a slow walker needs from the kerb to the inner part, where the test sees it.
-    """
+    """People wait and start over crossings, none once it has been red for 2 s, which a slow walker
+    needs from the kerb to the inner part."""
     strips = [strip for strip in place.map.strips.values() if strip.signalised]
     lines = {s.id: shapely.LineString(s.line) for s in strips}
     middles = {name: substring(line, 2.2, line.length - 2.2) for name, line in lines.items()}
@@ -293,9 +289,8 @@ def test_vehicles_stop_at_red(junction: Junction) -> None:
     assert len(junction.lights) >= 10 and "r" not in junction.lights
 
 
-def test_signals_change_when_they_say(junction: Junction) -> None:
-    """Every announced change of a signal comes within a tick of its time, and what is red stays red
-    until then."""
+def test_signals_change_at_the_announced_time(junction: Junction) -> None:
+    """Every change happens within a tick of its announced time, and red stays red until then."""
     announced: dict[str, tuple[bool, float]] = {}
     changes = 0
     for tick, street in enumerate(junction.streets):
@@ -313,7 +308,7 @@ def test_signals_change_when_they_say(junction: Junction) -> None:
 
 
 def test_nobody_passes_a_closed_port(place: Place) -> None:
-    """In 40 seconds nobody goes between a closed sidewalk and its corner, where people pass
+    """In 40 seconds nobody crosses between a closed sidewalk and its corner, where people pass
     otherwise."""
     start = middle(place)
     port = Port(place.map.locate(*start[:2]).edge, 1)
@@ -342,8 +337,8 @@ def test_nobody_passes_a_closed_port(place: Place) -> None:
 
 
 def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> None:
-    """Actors are in the street as given, behind the others in order of ids, gone when not given;
-    people walk round."""
+    """Actors are in the street as given, after the others in order of ids, and vanish when not
+    given; people walk round them."""
     start = middle(place)
     ahead = Pose(
         start.x_m + 6.0 * math.cos(start.heading_rad),
@@ -364,7 +359,7 @@ def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> 
     nearest = math.inf
     with SumoCrowd(place.net, place.map, spec, 4, OPEN, start[:2]) as crowd:
         for tick in range(800):
-            walker = acting("a1", start.x_m + 0.01 * tick, start.y_m, 0.0, 0.2)
+            walker = event_actor("a1", start.x_m + 0.01 * tick, start.y_m, 0.0, 0.2)
             street = crowd.step(at(start), reply(tick, talker, walker))
             people = street.people
             assert people.ids[-2:] == ("a1", "a2") and people.kind[-2:].tolist() == [
@@ -386,7 +381,7 @@ def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> 
 
 
 def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
-    """A second run in the same process repeats every array; another seed does not."""
+    """A second run in the same process repeats every array, and another seed does not."""
     start = middle(place)
 
     def run(seed: int, ticks: int) -> list[Street]:
@@ -400,7 +395,7 @@ def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
                     start.y_m,
                     start.heading_rad,
                 )
-                actor = acting("e1", pose.x_m + 2.0, pose.y_m, 0.0, 1.0)
+                actor = event_actor("e1", pose.x_m + 2.0, pose.y_m, 0.0, 1.0)
                 streets.append(crowd.step(at(pose), reply(tick, actor)))
         return streets
 
@@ -418,9 +413,8 @@ def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
     assert first[0].people.xy.tobytes() != other[0].people.xy.tobytes()
 
 
-def test_it_survives_a_robot_anywhere(place: Place) -> None:
-    """A robot and event pedestrians that wander and jump over sidewalks, corners, roads and fields
-    do no harm."""
+def test_the_crowd_runs_with_a_robot_anywhere(place: Place) -> None:
+    """A robot and event pedestrians may jump over sidewalks, corners, roads and fields."""
     rng = np.random.default_rng(9)
     pieces: list[Strip | Corner | Lane] = [
         *place.map.strips.values(),
@@ -446,15 +440,15 @@ def test_it_survives_a_robot_anywhere(place: Place) -> None:
                 body[0] += 0.06 * math.cos(body[2])
                 body[1] += 0.06 * math.sin(body[2])
             actors = [
-                acting(f"e{i}", x, y, heading, 1.2) for i, (x, y, heading) in enumerate(bodies[1:])
+                event_actor(f"e{i}", x, y, heading, 1.2)
+                for i, (x, y, heading) in enumerate(bodies[1:])
             ]
             street = crowd.step(at(Pose(*bodies[0])), reply(tick, *actors))
         assert np.isfinite(street.people.xy).all() and np.isfinite(street.vehicles.xy).all()
 
 
-def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
-    """Bodies that jump about where footpaths meet in two corners side by side do no harm: SUMO
-    confuses the two."""
+def test_the_crowd_runs_beside_corners_without_a_crossing(tmp_path: Path) -> None:
+    """Bodies may jump where footpaths meet in two adjacent corners, which SUMO confuses."""
     at_m = {"j": (0, 0), "a": (60, 18), "b": (-6, -3), "c": (-4, 3.5)}
     paths = [f"{a}{b}" for other in "abc" for a, b in ((other, "j"), ("j", other))]
     nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "paths.net.xml"))
@@ -470,14 +464,14 @@ def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
     spots = rng.uniform((-5, -5, -math.pi), (12, 12, math.pi), (500, 2, 3)).tolist()
     with SumoCrowd(net, street_map, CrowdSpec(persons=4, vehicles=0), 9, OPEN, (0.0, 0.0)) as crowd:
         for tick, (robot, (x, y, heading)) in enumerate(spots):
-            actor = acting("e0", x, y, heading, 1.2)
+            actor = event_actor("e0", x, y, heading, 1.2)
             crowd.step(at(Pose(*robot)), reply(tick, actor))
         assert crowd.street.tick == 500
 
 
 def test_people_turn_round_where_the_sidewalks_meet(tmp_path: Path) -> None:
-    """Behind a barrier they go back to the street's other sidewalk over the far end, where the two
-    meet, and arrive."""
+    """Behind a barrier they return to the other sidewalk of the street over the far end, and
+    arrive."""
     at_m = {"a": (0, 0), "b": (60, 0), "c": (66, 2)}
     nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "street.net.xml"))
     nodes.write_text(
@@ -502,21 +496,21 @@ def test_people_turn_round_where_the_sidewalks_meet(tmp_path: Path) -> None:
 
 
 def test_misuse_is_named(place: Place, tmp_path: Path) -> None:
-    """A second crowd, a step without a running one, bad actors and a broken net each get their own
-    message."""
+    """A second crowd, a step without a running one, invalid actors and a broken net each have their
+    own message."""
     spec = CrowdSpec(persons=2, vehicles=0)
     start = middle(place)
     crowd = SumoCrowd(place.net, place.map, spec, 1, OPEN, start[:2])
     with pytest.raises(EngineError, match="not running: use it as a context manager"):
         crowd.step(at(start), reply(0))
-    nobody = acting("x1", 0.0, 0.0, 0.0, 0.0)
+    actor = event_actor("x1", 0.0, 0.0, 0.0, 0.0)
     with crowd:
         with (
             pytest.raises(EngineError, match="only once per process"),
             SumoCrowd(*_arguments(crowd)),
         ):
             pass
-        for bad in ((nobody, nobody), (acting(crowd.street.people.ids[0], 0.0, 0.0, 0.0, 0.0),)):
+        for bad in ((actor, actor), (event_actor(crowd.street.people.ids[0], 0.0, 0.0, 0.0, 0.0),)):
             with pytest.raises(EngineError, match="unique ids, and none of the crowd's"):
                 crowd.step(at(start), reply(0, *bad))
     crowd.close()

@@ -1,4 +1,4 @@
-"""Counts of behaviour on streets made by hand."""
+"""Counts of the street counter, on hand-made streets."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def test_overlaps_are_counted_in_pair_seconds_with_their_place() -> None:
     assert counter.counts["overlaps: on crossings"] == pytest.approx(2.0)
 
 
-def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
-    """Who comes a metre far 0.5 s after the change began at green; who comes 3 s after walked at
-    red."""
+def test_an_entry_at_red_differs_from_one_at_the_end_of_green() -> None:
+    """A person a metre into the crossing 0.5 s after the change began at green; one 3 s after
+    walked at red."""
     counter = StreetCounter(MAP, 0.05, [])
     for tick in range(100):
         walked_m = -1.0 + 0.07 * tick
@@ -54,12 +54,12 @@ def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
     assert counter.crossings == {":j_c0"}
 
 
-def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
-    """An entry at red counts also where no green was seen before, but not for a person already on
-    the crossing."""
+def test_a_light_that_appears_red_counts_as_red() -> None:
+    """An entry at red counts without an earlier green, but not for a person already on the
+    crossing."""
 
     def counted(xs: list[float], walks: list[bool | None]) -> list[float]:
-        """How many entered, entered at red, and entered within a second of red."""
+        """Return how many entered, entered at red, and entered within a second of red."""
         counter = StreetCounter(MAP, 0.05, [])
         for tick, (x_m, walk) in enumerate(zip(xs, walks, strict=True)):
             seen = street(tick, [(x_m, 0.0)], walk=bool(walk))
@@ -79,9 +79,9 @@ def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
     assert counted([4.0] * 60, [None] * 20 + [False] * 40) == [0, 0, 0]
 
 
-def test_who_walks_on_one_crossing_does_not_enter_another_that_overlaps_it() -> None:
-    """A slanting crossing, red all the time, is walked through by somebody who entered the other
-    one at green."""
+def test_overlapping_crossings_are_entered_separately() -> None:
+    """A person who entered one crossing at green does not enter the slanting red one that overlaps
+    it."""
     slanting = Strip(
         ":j_c1",
         "crossing",
@@ -103,8 +103,8 @@ def test_who_walks_on_one_crossing_does_not_enter_another_that_overlaps_it() -> 
     assert counter.counts["persons entered at red"] == 0
 
 
-def test_people_in_things_and_vehicles_are_seen() -> None:
-    """One of two people stands in a bench, the other in a car that moves; both for one second."""
+def test_people_inside_objects_and_vehicles_are_counted() -> None:
+    """One of two people is in a bench and the other in a moving car, both for one second."""
     counter = StreetCounter(MAP, 0.05, [("bench", shapely.box(1.0, -1.0, 2.0, 1.0))])
     car = Vehicles.of(("v0",), [[6.0, 0.0]], [0.0], [3.0], [[4.0, 2.0]])
     for tick in range(20):

@@ -1,5 +1,5 @@
-"""Maps that are damaged or meant to do harm: refused in one line that says where, or imported
-whole; nothing stays."""
+"""Damaged and malicious maps: refused in one line with the place of the fault, or imported
+completely, without leftovers."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from sumo_nets.maps.map_store import checked_map, import_map, map_net
 from sumo_nets.net import raw_file as rawfile
 from sumo_nets.net.net_facts import read_facts
 from sumo_nets.net.net_file import read_net
-from tests.sumo_nets.conftest import kept
+from tests.sumo_nets.conftest import stored_maps
 from tests.support.mutate_maps import DAMAGES, damaged
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 SAMPLE = 19
 WHOLE = 300
-"""So many damaged maps are imported: one of each kind by default, all of them with --whole."""
+"""Number of damaged maps with --whole; by default SAMPLE, one of each kind."""
 
 TOWN = """<?xml version="1.0" encoding="UTF-8"?>
 <osm version="0.6">
@@ -49,7 +49,7 @@ def nested(depth: int) -> bytes:
 
 
 def tagged(key: str, value: str) -> bytes:
-    """The town, with a tag on its first street."""
+    """Return the town with a tag on its first street."""
     return TOWN.replace('<tag k="name"', f'<tag k="{key}" v="{value}"/><tag k="name"').encode()
 
 
@@ -59,8 +59,8 @@ BOMB = (
 )
 
 
-def zeros(count: int, packed: Callable[[bytes], bytes]) -> bytes:
-    """Many times the same packed million of spaces behind the begin of a map."""
+def packed_spaces(count: int, packed: Callable[[bytes], bytes]) -> bytes:
+    """Return the begin of a map and many copies of a packed million of spaces."""
     return packed(b"<osm>\n") + packed(b" " * 1_000_000) * count
 
 
@@ -138,35 +138,41 @@ def zeros(count: int, packed: Callable[[bytes], bytes]) -> bytes:
         ),
         pytest.param(
             "a.osm.gz",
-            zeros(80, lambda d: gzip.compress(d, mtime=0)),
+            packed_spaces(80, lambda d: gzip.compress(d, mtime=0)),
             "more than 200 times",
             id="gzip-bomb",
         ),
         pytest.param(
-            "a.osm.bz2", zeros(80, bz2.compress), "more than 200 times its size", id="bzip2-bomb"
+            "a.osm.bz2",
+            packed_spaces(80, bz2.compress),
+            "more than 200 times its size",
+            id="bzip2-bomb",
         ),
     ],
 )
-def test_files_meant_to_do_harm_are_refused(
+def test_malicious_files_are_refused(
     tmp_path: Path, name: str, content: bytes, reason: str
 ) -> None:
-    """What would keep netconvert busy for ever, or fill memory and disk, is refused before anything
-    is converted."""
+    """Files that would block netconvert, or fill memory or disk, are refused before the
+    conversion."""
     source = tmp_path / name
-    before = kept()
+    before = stored_maps()
     source.write_bytes(content)
     with pytest.raises(MapError) as caught:
         import_map(source)
-    said = str(caught.value)
+    message = str(caught.value)
     assert (
-        said.startswith(f"{source}: ") and reason in said and "\n" not in said and len(said) < 400
+        message.startswith(f"{source}: ")
+        and reason in message
+        and "\n" not in message
+        and len(message) < 400
     )
-    assert kept() == before
+    assert stored_maps() == before
 
 
-def test_lanes_and_widths_of_real_streets_are_let_through(tmp_path: Path) -> None:
-    """Words, units and several values in one tag are netconvert's to read; other tags with lanes in
-    them as well."""
+def test_valid_lanes_and_widths_are_accepted(tmp_path: Path) -> None:
+    """Words, units and several values in a tag are left to netconvert, and so are other tags with
+    lanes."""
     from sumo_nets.maps.osm_file import osm_facts, unpack_map
 
     path = tmp_path / "town.osm"
@@ -188,10 +194,11 @@ def test_lanes_and_widths_of_real_streets_are_let_through(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "read", [import_map, read_net, read_facts], ids=["import", "read", "facts"]
 )
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
-    """A pipe that nobody writes to, a folder, a device, links to themselves and to nothing are told
-    what they are."""
-    before = kept()
+def test_paths_that_are_no_files_are_refused(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
+    """A pipe, a folder, a device, and links to themselves and to nothing are named."""
+    before = stored_maps()
     pipe, loop, nothing = tmp_path / "pipe.osm", tmp_path / "loop.osm", tmp_path / "nothing.osm"
     os.mkfifo(pipe)
     loop.symlink_to(loop)
@@ -208,13 +215,13 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path
         assert str(caught.value).startswith(f"{path}: cannot be read: ") and words in str(
             caught.value
         )
-    assert kept() == before
+    assert stored_maps() == before
 
 
 def test_a_file_that_may_not_be_read_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the right to read it the error says so."""
+    """The error of a file without read permission says so."""
     source = tmp_path / "a.osm"
     source.write_text(TOWN)
 
@@ -231,9 +238,9 @@ def test_a_file_that_may_not_be_read_is_refused(
 
 
 def test_memory_stays_bounded_while_a_bomb_is_read(tmp_path: Path) -> None:
-    """Of a packed net no more is unpacked than is allowed for its size."""
+    """No more of a packed net is unpacked than its size allows."""
     path = tmp_path / "bomb.net.xml.gz"
-    path.write_bytes(zeros(400, lambda data: gzip.compress(data, mtime=0)))
+    path.write_bytes(packed_spaces(400, lambda data: gzip.compress(data, mtime=0)))
     with (
         pytest.raises(MapError, match="more than 200 times its size"),
         rawfile.file_chunks(path, "gzip") as unpack_map,
@@ -244,8 +251,9 @@ def test_memory_stays_bounded_while_a_bomb_is_read(tmp_path: Path) -> None:
     assert most <= rawfile.TIMES_PACKED * path.stat().st_size < 400_000_000 / 4
 
 
-def test_the_damages_are_drawn_from_their_number() -> None:
-    """The same number gives the same damage; every kind changes the map in most of its draws."""
+def test_damages_are_functions_of_their_number() -> None:
+    """The same number gives the same damage, and every kind changes the map in most of its
+    draws."""
     town = TOWN.encode()
     assert all(damaged(town, n) == damaged(town, n) for n in range(len(DAMAGES)))
     changed = Counter(damaged(town, n)[0] for n in range(WHOLE) if damaged(town, n)[1] != town)
@@ -253,15 +261,11 @@ def test_the_damages_are_drawn_from_their_number() -> None:
 
 
 @pytest.mark.engine
-def test_damaged_maps_end_in_a_map_or_in_one_line(
+def test_damaged_maps_are_imported_or_refused_in_one_line(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """Whatever happened to a file, it is imported whole, or refused in one line that names it, and
-    nothing else stays.
-
-    By default one of each kind of damage is tried, on OpenStreetMap and on nets in turn; with
-    --whole 300.
-    """
+    """The line names the file, and no other file is left. By default one of each kind of damage is
+    tried, with --whole 300."""
     town = tmp_path / "town.osm"
     town.write_text(TOWN)
     import_map(town)
@@ -272,26 +276,26 @@ def test_damaged_maps_end_in_a_map_or_in_one_line(
         kind = ("osm", "net.xml")[number // len(DAMAGES) % 2]
         how, data = damaged(bases[kind], number)
         source = tmp_path / f"damaged.{kind}"
-        began = time.monotonic()
+        started = time.monotonic()
         source.write_bytes(data)
         try:
             import_map(source, "damaged", Options(as_is=kind == "net.xml" and number % 3 == 0))
         except MapError as refusal:
-            said = str(refusal)
+            message = str(refusal)
             outcome = "refused"
-            assert said.startswith(f"{source}: ") and "\n" not in said, (number, how, said)
-            assert len(said) > len(f"{source}: ") + 15 and "did not end" not in said, (
+            assert message.startswith(f"{source}: ") and "\n" not in message, (number, how, message)
+            assert len(message) > len(f"{source}: ") + 15 and "did not end" not in message, (
                 number,
                 how,
-                said,
+                message,
             )
             assert refusal.exit_code == WRONG_USE
         else:
             outcome = "imported"
             street_map, _, about = checked_map("damaged")
             assert street_map.strips and street_map.net_hash == about.net_hash, (number, how)
-        assert set(kept()) - {".lock"} <= {"town", "damaged"}, (number, how, kept())
+        assert set(stored_maps()) - {".lock"} <= {"town", "damaged"}, (number, how, stored_maps())
         outcomes[outcome] += 1
-        longest_s = max(longest_s, time.monotonic() - began)
+        longest_s = max(longest_s, time.monotonic() - started)
     print(f"{dict(outcomes)}; the longest took {longest_s:.1f} s")
     assert outcomes["refused"] >= 5 and outcomes["imported"] >= 1

@@ -1,5 +1,4 @@
-"""EmptyStreet: without crowd and vehicles a street needs no SUMO, and is the one that SUMO would
-have made."""
+"""EmptyStreet: without crowd and vehicles a street needs no SUMO and equals the one of SUMO."""
 
 from __future__ import annotations
 
@@ -59,9 +58,8 @@ def simulated(net: Path, begin_s: int = BEGIN_S) -> Iterator[None]:
         close()
 
 
-def differences(net: Path, street_map: StreetMap, ticks: int) -> int:
-    """How often a crossing's signal is not what SUMO shows, in so many ticks; each is asked in
-    every tick."""
+def count_differences(net: Path, street_map: StreetMap, ticks: int) -> int:
+    """Return how often a crossing's signal differs from SUMO's, over a number of ticks."""
     differ = 0
     with simulated(net):
         simulating, planned = SumoLights(sumo, street_map), PlannedLights(street_map, BEGIN_S)
@@ -70,18 +68,21 @@ def differences(net: Path, street_map: StreetMap, ticks: int) -> int:
             sumo.simulationStep()
             planned.now_ms += TICK_MS
             assert planned.now_s() == simulating.now_s()
-            differ += sum(told(planned, one) != told(simulating, one) for one in planned.crossings)
+            differ += sum(
+                signal_state(planned, one) != signal_state(simulating, one)
+                for one in planned.crossings
+            )
     return differ
 
 
-def told(lights: Lights, crossing: str) -> tuple[bool, float | None, float]:
+def signal_state(lights: Lights, crossing: str) -> tuple[bool, float | None, float]:
     walk, change_s, until_s = lights.showing(crossing)
     return walk, None if change_s is None else round(change_s - lights.now_s(), 3), until_s
 
 
-def rewritten(net: Path, to: Path, program: Callable[[int, str], str]) -> Path:
-    """A net with other programs. program: of a number and what stands there, what shall stand
-    there."""
+def with_programs(net: Path, to: Path, program: Callable[[int, str], str]) -> Path:
+    """Write a net with other signal programs. program: returns the new text for a number and the
+    old text."""
     numbers = iter(range(10**6))
     to.write_text(
         re.sub(
@@ -95,16 +96,16 @@ def rewritten(net: Path, to: Path, program: Callable[[int, str], str]) -> Path:
 
 
 @pytest.mark.engine
-def test_signals_go_by_the_clock_as_they_do_in_sumo(
+def test_fixed_time_signals_equal_those_of_sumo(
     net: Path, street_map: StreetMap, tmp_path: Path
 ) -> None:
-    """Every crossing of a city, every tick of the longest cycle: what it shows, until when, and
-    when it changes."""
+    """At every tick of the longest cycle, every crossing of a city has the same state, end and
+    change."""
     assert street_map.signals_fixed_time
     cycle_ms = max(
         sum(strip.plan.durations_ms) for strip in street_map.strips.values() if strip.plan
     )
-    assert differences(net, street_map, cycle_ms // TICK_MS + 40) == 0
+    assert count_differences(net, street_map, cycle_ms // TICK_MS + 40) == 0
 
     # Phases that end between two seconds, cycles that begin before SUMO or long after, and one
     # phase that goes on.
@@ -123,14 +124,14 @@ def test_signals_go_by_the_clock_as_they_do_in_sumo(
             else re.sub(r"(<phase [^>]*>).*(?=</tlLogic>)", r"\1", again, flags=re.DOTALL)
         )
 
-    other = rewritten(net, tmp_path / "odd.net.xml", odd)
-    assert differences(other, read_net(other), 600) == 0
+    other = with_programs(net, tmp_path / "odd.net.xml", odd)
+    assert count_differences(other, read_net(other), 600) == 0
 
 
 @pytest.mark.engine
-def test_an_empty_street_is_that_of_sumo(net: Path, street_map: StreetMap) -> None:
-    """The same people, signals and times to the bit, wherever the robot goes and whoever is put
-    there."""
+def test_an_empty_street_equals_that_of_sumo(net: Path, street_map: StreetMap) -> None:
+    """People, signals and times are equal to the bit at any place of the robot and with any
+    actors."""
     crossings = [
         strip.line.mean(axis=0) for strip in street_map.strips.values() if strip.plan is not None
     ]
@@ -168,7 +169,7 @@ def test_an_empty_street_is_that_of_sumo(net: Path, street_map: StreetMap) -> No
 
 
 def values(street: Street) -> tuple[object, ...]:
-    """Everything in a street, as what can be compared to the bit."""
+    """Return all values of a street in a form that can be compared to the bit."""
     columns = [
         np.asarray(getattr(group, name))
         for group in (street.people, street.vehicles)
@@ -181,10 +182,10 @@ def values(street: Street) -> tuple[object, ...]:
     )
 
 
-def test_who_comes_and_what_decides_while_it_runs_needs_sumo(
+def test_people_vehicles_and_actuated_signals_need_sumo(
     net: Path, street_map: StreetMap, tmp_path: Path
 ) -> None:
-    """Anybody in the crowd, anybody to be let in again, or one light whose program is not plain."""
+    """Any crowd, recorded entrances, or a light without a plain fixed program need SUMO."""
     assert needs_no_sumo(street_map, NOBODY)
     assert needs_no_sumo(street_map, CrowdSpec(density=0.0, vehicles=0, residents=3))
     for spec in (
@@ -193,10 +194,10 @@ def test_who_comes_and_what_decides_while_it_runs_needs_sumo(
         CrowdSpec(density=1, vehicles=0),
     ):
         assert not needs_no_sumo(street_map, spec)
-    came = Entrances()
-    assert needs_no_sumo(street_map, NOBODY, came)
-    came.vehicles[1.0].append("v0")
-    assert not needs_no_sumo(street_map, NOBODY, came)
+    entrances = Entrances()
+    assert needs_no_sumo(street_map, NOBODY, entrances)
+    entrances.vehicles[1.0].append("v0")
+    assert not needs_no_sumo(street_map, NOBODY, entrances)
 
     unplain: tuple[Callable[[str], str], ...] = (
         lambda was: was.replace('type="static"', 'type="actuated"'),
@@ -217,13 +218,13 @@ def test_who_comes_and_what_decides_while_it_runs_needs_sumo(
         changed.update(re.findall('tlLogic id="([^"]*)"', was))
         return unplain[k](was)
 
-    other = read_net(rewritten(net, tmp_path / "other.net.xml", worse))
+    other = read_net(with_programs(net, tmp_path / "other.net.xml", worse))
     assert not needs_no_sumo(other, NOBODY) and len(changed) == len(unplain)
     lit = [strip for strip in other.strips.values() if strip.signalised]
     assert {junction_of(strip.id) for strip in lit if strip.plan is None} == changed
     assert not {junction_of(strip.id) for strip in lit if strip.plan is not None} & changed
 
-    timed = rewritten(
+    timed = with_programs(
         net,
         tmp_path / "timed.net.xml",
         lambda k, was: was if k else f'{was}<WAUT id="w" startProg="0"/>',

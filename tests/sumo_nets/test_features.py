@@ -1,5 +1,5 @@
-"""What a map shows beside its streets: read, projected, brought among the streets, kept, built; and
-bad input."""
+"""Map features beside streets: reading, projection, placement, storage and construction, and
+invalid input."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Tags = dict[str, str]
 
 @pytest.fixture(autouse=True, scope="module")
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Maps are kept in a folder of this run's own."""
+    """Store maps in a separate folder for the module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -90,7 +90,7 @@ class Drawing:
         self.rows.append(f'<relation id="{self.count}">{inner}</relation>')
 
     def streets(self) -> None:
-        """Two streets that cross in the middle, with sidewalks."""
+        """Add two streets that cross in the middle, with sidewalks."""
         middle = self.node(0, 0)
         for ends in (((-150, 0), (150, 0)), ((0, -150), (0, 150))):
             refs = [self.node(*ends[0]), middle, self.node(*ends[1])]
@@ -101,7 +101,7 @@ class Drawing:
         path.write_text('<osm version="0.6">\n' + "\n".join(rows) + "\n</osm>\n", encoding="utf-8")
         return path
 
-    def found(self, path: Path) -> tuple[list[MappedFeature], Counter[str]]:
+    def read_features(self, path: Path) -> tuple[list[MappedFeature], Counter[str]]:
         self.write(path)
         found = osm_features(MapFile(path, path, "osm", ""))
         return list(found.things), Counter(found.skipped)
@@ -112,9 +112,9 @@ def _tags(tags: Tags) -> str:
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[str, ...]]:
-    """A small map with things in good places and in bad ones, imported; and what the importer says
-    it did."""
+def drawn_map(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[str, ...]]:
+    """Import a small map with features in good and in bad places; return it with the changes of the
+    importer."""
     drawing = Drawing()
     drawing.streets()
     for x in (30, 60, 90):
@@ -139,7 +139,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[st
 
 
 def road_axis(street_map: StreetMap) -> float:
-    """y of the middle of the street from west to east, at x of its crossing, from its lanes."""
+    """Return y of the middle of the street from west to east at its crossing, from its lanes."""
     lanes = [
         lane.polygon
         for lane in street_map.lanes.values()
@@ -150,10 +150,12 @@ def road_axis(street_map: StreetMap) -> float:
 
 
 @pytest.mark.engine
-def test_mapped_things_lie_beside_their_street(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
-    """A lamp 14 m from the street's middle line is there in the net too; its arm points at the
-    road, a bench faces the way the map says."""
-    street_map, _ = drawn
+def test_mapped_features_keep_their_place_beside_the_street(
+    drawn_map: tuple[StreetMap, tuple[str, ...]],
+) -> None:
+    """A lamp 14 m from the middle line has this distance in the net, its arm points at the road,
+    and a bench faces as mapped."""
+    street_map, _ = drawn_map
     lanes = [
         lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal
     ]
@@ -173,19 +175,21 @@ def test_mapped_things_lie_beside_their_street(drawn: tuple[StreetMap, tuple[str
 
 
 @pytest.mark.engine
-def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
-    """Buildings keep off everything walked or driven on and keep their courtyards; things off roads
-    and the middle of sidewalks; what was moved, cut back or left out is told."""
-    street_map, changes = drawn
-    told = " | ".join(changes)
-    assert "taken from the map: 2 x building, 3 x tree" in told
-    assert "buildings cut back where they reached into streets (what is walked on wins): 1" in told
-    assert "buildings left out that lay mostly on streets or are none: 1" in told
+def test_features_keep_off_streets(drawn_map: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """Buildings keep off all walked and driven ground and keep their courtyards; other features
+    keep off roads and the middle of sidewalks. Moved, cut and dropped ones are reported."""
+    street_map, changes = drawn_map
+    message = " | ".join(changes)
+    assert "taken from the map: 2 x building, 3 x tree" in message
+    assert (
+        "buildings cut back where they reached into streets (what is walked on wins): 1" in message
+    )
+    assert "buildings left out that lay mostly on streets or are none: 1" in message
     assert (
         "mapped things moved aside by up to 3 m, off the road or the middle of a sidewalk: 1"
-        in told
+        in message
     )
-    assert "mapped things left out on a road, a crossing or in a narrow passage: 2" in told
+    assert "mapped things left out on a road, a crossing or in a narrow passage: 2" in message
     lanes = [p.polygon for p in street_map.lanes.values() if p.kind == "road"]
     walked = [p.polygon for p in (*street_map.strips.values(), *street_map.corners.values())]
     streets = shapely.union_all([*lanes, *walked])
@@ -209,10 +213,10 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
 
 
 @pytest.mark.engine
-def test_what_lies_on_the_other_side_of_the_earth_is_left_out(
-    drawn: tuple[StreetMap, tuple[str, ...]],
+def test_features_far_outside_of_the_map_are_dropped(
+    drawn_map: tuple[StreetMap, tuple[str, ...]],
 ) -> None:
-    """Points anywhere on earth, where the projection has no value too, come to nothing."""
+    """Points anywhere on earth, also where the projection has no value, add no feature."""
     location = {
         "projParameter": "+proj=utm +zone=33 +datum=WGS84",
         "netOffset": "-391000.0,-5817000.0",
@@ -229,16 +233,16 @@ def test_what_lies_on_the_other_side_of_the_earth_is_left_out(
         for spot in spots
         for kind in ("building", "lawn")
     ]
-    assert fit_features(OsmFeatures(tuple(things), {}), location, drawn[0]) == ((), [])
+    assert fit_features(OsmFeatures(tuple(things), {}), location, drawn_map[0]) == ((), [])
 
 
 @pytest.mark.engine
-def test_nothing_is_made_up_where_the_map_shows_it(
-    drawn: tuple[StreetMap, tuple[str, ...]],
+def test_nothing_is_generated_near_mapped_features(
+    drawn_map: tuple[StreetMap, tuple[str, ...]],
 ) -> None:
-    """Near a mapped lamp or house there is no other, farther away there are; without features they
-    are near too."""
-    street_map, _ = drawn
+    """Near a mapped lamp or house no other is generated, and farther away or without features
+    others are."""
+    street_map, _ = drawn_map
     bare = dataclasses.replace(street_map, features=())
     (lamp,) = (f for f in street_map.features if f.kind == "lamp")
     away = [
@@ -271,11 +275,11 @@ def test_nothing_is_made_up_where_the_map_shows_it(
 
 
 @pytest.mark.engine
-def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(
-    drawn: tuple[StreetMap, tuple[str, ...]],
+def test_land_use_changes_only_looks_and_hash(
+    drawn_map: tuple[StreetMap, tuple[str, ...]],
 ) -> None:
-    """Land use changes the look and the hash of a map, and no bit of its objects and ground."""
-    street_map, changes = drawn
+    """Land use changes no bit of the objects and the ground of a map."""
+    street_map, changes = drawn_map
     (lot,) = (f for f in street_map.features if f.kind in LAND_KINDS)
     assert lot.kind == "yard" and "1 x yard" in " | ".join(changes)
     assert lot.polygon.area == pytest.approx(30.0 * 50.0, rel=0.01)
@@ -297,9 +301,9 @@ def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(
     assert "ground:yard" in shown
 
 
-def test_land_is_read_as_mappers_write_it(tmp_path: Path) -> None:
-    """Parks, woods with clearings, water, building sites and parking lots are land; what lies above
-    or below the ground, or is open, torn or a way rather than an area is none."""
+def test_land_use_is_read_from_osm_tags(tmp_path: Path) -> None:
+    """Parks, woods with clearings, water, building sites and parking lots are land. Areas above or
+    below the ground, and open or torn outlines, are not."""
     drawing = Drawing()
     for x, tags in enumerate(
         (
@@ -326,7 +330,7 @@ def test_land_is_read_as_mappers_write_it(tmp_path: Path) -> None:
     drawing.way([a, 99_999, b, a], {"leisure": "park"})
     drawing.way([a, c, b, d], {"leisure": "park"})
     drawing.relation([(99_998, "outer")], {"type": "multipolygon", "natural": "wood"})
-    things, skipped = drawing.found(tmp_path / "land.osm")
+    things, skipped = drawing.read_features(tmp_path / "land.osm")
     lands = [thing for thing in things if thing.kind in LAND_KINDS]
     assert [thing.kind for thing in lands] == ["lawn", "soil", "yard", "yard", "water", "planting"]
     assert len(lands[-1].rings) == 2
@@ -343,7 +347,7 @@ def house(*corners: tuple[float, float], height_m: float = 9.0) -> Feature:
 
 
 def lone_map(*features: Feature) -> StreetMap:
-    """A sidewalk along x, 3 m wide, on open ground."""
+    """Return a sidewalk along x, 3 m wide, on open ground."""
     line = np.array([[-60.0, 0.0], [60.0, 0.0]])
     strip = Strip(
         "s", "sidewalk", line, 3.0, shapely.box(-60, -1.5, 60, 1.5), (None, None), road_side=0
@@ -354,20 +358,20 @@ def lone_map(*features: Feature) -> StreetMap:
     )
 
 
-def test_a_house_is_cut_by_tiles_and_loses_nothing() -> None:
-    """The parts in the tiles cover the house once, their walls are its walls and no cut is one, and
-    the mesh has the walls' and the roof's area."""
+def test_a_house_is_divided_by_tiles_completely() -> None:
+    """The parts cover the house once, only its own walls are walls, and the mesh has the area of
+    walls and roof."""
     place = lone_map(
         house((-40, 4), (40, 4), (40, 60), (10, 60), (10, 20), (-40, 20), height_m=7.5)
     )
     things = MappedObjects(place)
-    whole = place.features[0].polygon
+    outline = place.features[0].polygon
     parts = [b for key in tiles_within(0.0, 0.0, 2.0 * TILE_M) for b in things.buildings(key)]
     assert len(parts) == 3
-    assert sum(b.polygon.area for b in parts) == pytest.approx(whole.area)
+    assert sum(b.polygon.area for b in parts) == pytest.approx(outline.area)
     assert {b.id for b in parts} == {"building:map:0"} and len({b.facade for b in parts}) == 1
     lengths = [math.dist(w[:2], w[2:]) for b in parts for w in b.walls]
-    assert sum(lengths) == pytest.approx(whole.length)
+    assert sum(lengths) == pytest.approx(outline.length)
     walls = [mesh for facade, mesh in facade_meshes(tuple(parts)).items() if facade >= 0]
     area = 0.0
     for mesh in walls:
@@ -376,12 +380,12 @@ def test_a_house_is_cut_by_tiles_and_loses_nothing() -> None:
         area += 0.5 * float(np.linalg.norm(cross, axis=1).sum())
         assert np.all((cross * mesh.normals[mesh.triangles[:, 0]]).sum(axis=1) > 0.0)
         assert mesh.vertices[:, 2].max() == pytest.approx(7.62)
-    assert area == pytest.approx(whole.area + 7.5 * whole.length)
+    assert area == pytest.approx(outline.area + 7.5 * outline.length)
 
 
 @pytest.mark.engine
 def test_the_robot_stops_at_a_mapped_wall() -> None:
-    """Driven at a wall that runs aslant the robot touches it as a wall and does not pass."""
+    """A robot that drives at a slanting wall touches it as a wall and does not pass."""
     place = lone_map(house((0, 3), (14, 12), (0, 20), (-14, 12)))
     with BulletWorld(StreetSurface(place, seed=1)) as world:
         world.place(Pose(3.0, -0.5, math.pi / 2))
@@ -393,7 +397,8 @@ def test_the_robot_stops_at_a_mapped_wall() -> None:
 
 
 def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None:
-    """Written and read they are the same; a broken file is named; a map's hash covers them."""
+    """Written features are read back equal, a broken file is named, and the hash of a map covers
+    them."""
     lot = Feature("yard", 24.0, 4.0, polygon=shapely.box(20.0, 0.0, 29.0, 8.0))
     features = (house((0, 0), (9, 0), (9, 9), (0, 9)), Feature("tree", 3.5, -2.25, 0.1, 6.0), lot)
     path = tmp_path / FEATURES_FILE
@@ -417,9 +422,11 @@ def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None
 
 
 @pytest.mark.engine
-def test_a_scenario_of_other_features_is_refused(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
-    """The hash in a scenario's place is that of net and features together."""
-    street_map, _ = drawn
+def test_a_scenario_of_other_features_is_refused(
+    drawn_map: tuple[StreetMap, tuple[str, ...]],
+) -> None:
+    """The hash in a scenario's place covers net and features together."""
+    street_map, _ = drawn_map
     net = map_net("drawn")
     assert street_map.net_hash == map_hash(net) == about_map("drawn").net_hash
     assert map_net(CityMap(map="drawn", net_hash=street_map.net_hash)) == net
@@ -452,15 +459,16 @@ def test_a_scenario_of_other_features_is_refused(drawn: tuple[StreetMap, tuple[s
         ({"building": "house"}, 6.4, 0),
     ],
 )
-def test_heights_are_read_as_mappers_write_them(tags: Tags, height_m: float, unread: int) -> None:
-    """Metres, feet, storeys; what cannot be read or cannot be is counted and the kind decides."""
+def test_building_heights_are_read_from_osm_tags(tags: Tags, height_m: float, unread: int) -> None:
+    """Metres, feet and storeys are read; invalid values are counted, and the kind of building gives
+    the height."""
     skipped: Counter[str] = Counter()
     assert building_height_m({"building": "yes"} | tags, 200.0, skipped) == pytest.approx(height_m)
     assert sum(skipped.values()) == unread
 
 
-def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
-    """Open, crossed, tiny, torn, hanging and underground buildings are no buildings; the good one
+def test_invalid_building_outlines_are_dropped_and_counted(tmp_path: Path) -> None:
+    """Open, crossed, tiny, torn, hanging and underground buildings are dropped, and the valid one
     stays."""
     drawing = Drawing()
     house_tags = {"building": "yes"}
@@ -479,7 +487,7 @@ def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
     drawing.relation(
         [(half, "outer"), (99_999, "outer")], {"type": "multipolygon", "building": "yes"}
     )
-    things, skipped = drawing.found(tmp_path / "broken.osm")
+    things, skipped = drawing.read_features(tmp_path / "broken.osm")
     assert [thing.kind for thing in things] == ["building"]
     assert skipped == {
         "buildings whose outline crosses itself": 1,
@@ -492,7 +500,7 @@ def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
 
 
 def test_the_projection_is_utm_or_none() -> None:
-    """Points worked out by PROJ's own test tables agree to the millimetre; other projections are
+    """Points agree with PROJ's own test tables to the millimetre, and other projections are
     recognised."""
     proj = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
     assert utm_zone(proj) == (32, False) and utm_zone(proj + " +south") == (32, True)
@@ -510,9 +518,9 @@ def test_the_projection_is_utm_or_none() -> None:
 
 @pytest.mark.engine
 @pytest.mark.skipif(not NEUKOELLN.exists(), reason="the shared maps are not here")
-def test_a_finely_mapped_place_is_built_as_mapped() -> None:
-    """Neukölln: most of its lamps, trees and houses stand; none on a road; every walk as free as
-    without them."""
+def test_a_detailed_place_is_built_as_mapped() -> None:
+    """In Neukölln most lamps, trees and houses remain, none on a road, and every walk has its free
+    width."""
     import_map(NEUKOELLN, "neukoelln")
     street_map = read_map("neukoelln")
     counts = Counter(f.kind for f in street_map.features)

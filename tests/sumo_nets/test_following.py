@@ -15,14 +15,14 @@ from sumo_nets.engine import NearPersons
 
 
 def walkers(*x_m: float, mps: float = 1.3) -> NearPersons:
-    """People in a row along x."""
+    """Return people in a row along x."""
     names = tuple(f"c{k}" for k in range(len(x_m)))
     xy = np.column_stack([x_m, np.zeros(len(x_m))])
     return NearPersons(names, xy, np.full(len(x_m), mps), [""] * len(x_m))
 
 
-def test_a_person_stands_closer_where_it_is_held_up_and_then_takes_up_its_gap_again() -> None:
-    """It does so only when its gap is free, so that it never has to stop for it."""
+def test_a_delayed_person_follows_closer_until_its_gap_is_free() -> None:
+    """The gap is restored only when it is free, so the person never has to stop for it."""
     written_m: dict[str, float] = {}
     engine: Any = SimpleNamespace(
         person=SimpleNamespace(
@@ -46,8 +46,8 @@ def test_a_person_stands_closer_where_it_is_held_up_and_then_takes_up_its_gap_ag
 
 @pytest.mark.engine
 def test_people_follow_each_other_at_many_distances() -> None:
-    """On one-way sidewalks the distances have no spike, a mean of 0.9 to 1.4 m, and nobody is
-    nearer than 0.45 m."""
+    """On one-way sidewalks the distances have no spike, a mean of 0.9 to 1.4 m, and a minimum above
+    0.45 m."""
     near_m = follow(FOLLOWED, seconds=20.0, seed=0, settle_s=15.0)
     assert len(near_m) > 1000 and largest_share(near_m) < 0.15
     assert 0.9 < near_m.mean() < 1.4 and near_m.std() > 0.25 and near_m.min() > 0.45

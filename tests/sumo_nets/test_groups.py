@@ -1,4 +1,4 @@
-"""People who walk in groups, elderly people and children."""
+"""People in groups, elderly people and children."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ class Spot(NamedTuple):
     y_m: float
 
 
-class Walkers:
-    """A SUMO of two who walk east: where they are, and at what speed they were told to walk."""
+class FakeSumo:
+    """A SUMO stand-in with people who walk east: their places, and the speeds that they were
+    given."""
 
     def __init__(self, **at: tuple[str, float, float]) -> None:
         self.at = dict(at)
@@ -55,25 +56,25 @@ class Walkers:
             getShape=lambda lane: LINE.tolist(), getLength=lambda lane: 50.0
         )
 
-    def seen(self) -> dict[str, Any]:
+    def positions(self) -> dict[str, Any]:
         return {name: Spot(x, y) for name, (_, x, y) in self.at.items()}
 
-    def advance(self, way_m: float) -> None:
-        self.at = {name: (edge, x + way_m, y) for name, (edge, x, y) in self.at.items()}
+    def advance(self, distance_m: float) -> None:
+        self.at = {name: (edge, x + distance_m, y) for name, (edge, x, y) in self.at.items()}
 
 
-def kept(walkers: Walkers, looks: int = 2) -> dict[str, float]:
-    """What two who walk together at 1.3 m/s are told in some looks, half a second apart."""
+def given_speeds(walkers: FakeSumo, updates: int = 2) -> dict[str, float]:
+    """Return the speeds that a group at 1.3 m/s is given in some updates, half a second apart."""
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)
     cohesion.form(tuple(walkers.at), 1.3, ("s",))
-    for _ in range(looks):
-        cohesion.update(walkers.seen())
+    for _ in range(updates):
+        cohesion.update(walkers.positions())
         walkers.advance(0.65)
     return walkers.told
 
 
-def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
-    """Of many persons 40 % walk in groups, 10 % are elderly, 15 % children; each child has an
+def test_shares_of_groups_elderly_and_children_are_as_requested() -> None:
+    """Of many persons 40 % walk in groups, 10 % are elderly and 15 % children; each child has an
     adult, and is slow."""
     companies = GroupDraws(
         CrowdSpec(groups=0.4, elderly=0.1, children=0.15), np.random.default_rng(1)
@@ -95,9 +96,8 @@ def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
     assert all(c.pace_mps == PERSON_MPS for c in drawn if set(c.ages) == {Age.ADULT})
 
 
-def test_without_groups_and_ages_nothing_is_drawn_but_looks() -> None:
-    """A plain crowd takes no numbers from the generator; everybody walks alone, and some look young
-    or old."""
+def test_a_plain_crowd_draws_no_groups() -> None:
+    """It takes no numbers from the generator, everybody walks alone, and some look young or old."""
     rng = np.random.default_rng(1)
     companies = GroupDraws(CrowdSpec(), rng)
     ages: Counter[Age] = Counter()
@@ -111,7 +111,7 @@ def test_without_groups_and_ages_nothing_is_drawn_but_looks() -> None:
 
 
 def test_a_group_walks_abreast_where_there_is_room() -> None:
-    """Three stand side by side on 1.92 m, two and one on 1.3 m, in file on 0.64 m; they walk slower
+    """Three walk side by side on 1.92 m, two and one on 1.3 m, and in file on 0.64 m, more slowly
     than one."""
     three = PersonGroup((Age.ADULT,) * 3)
     assert np.array(three.places(1.92)) == pytest.approx(
@@ -126,62 +126,61 @@ def test_a_group_walks_abreast_where_there_is_room() -> None:
     assert three.speed_at(1.5) == pytest.approx(1.42) and three.speed_at(1.12) == 1.1
 
 
-def test_who_is_ahead_slows_down_and_who_lags_hurries() -> None:
-    """The member of a group that is ahead slows down and the one behind hurries, except on a
-    crossing."""
-    told = kept(Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64)))
-    assert told["c0"] < 1.2 and 1.3 < told["c1"] < 1.44
-    assert kept(Walkers(c0=("s", 10.1, 0.0), c1=("s", 10.0, 0.64))) == {}
-    assert "c0" not in kept(Walkers(c0=(":c", 11.0, 0.0), c1=(":c", 10.0, 0.64)))
+def test_group_members_adjust_their_speed() -> None:
+    """The member ahead slows down and the one behind hurries, except on a crossing."""
+    speeds = given_speeds(FakeSumo(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64)))
+    assert speeds["c0"] < 1.2 and 1.3 < speeds["c1"] < 1.44
+    assert given_speeds(FakeSumo(c0=("s", 10.1, 0.0), c1=("s", 10.0, 0.64))) == {}
+    assert "c0" not in given_speeds(FakeSumo(c0=(":c", 11.0, 0.0), c1=(":c", 10.0, 0.64)))
 
 
-def test_who_is_far_ahead_waits() -> None:
-    """Three metres ahead one waits, and walks on when the fellow is near; also if a light has
-    parted them."""
-    walkers = Walkers(c0=("s", 13.0, 0.0), c1=("s", 10.0, 0.64))
+def test_a_member_far_ahead_waits() -> None:
+    """Three metres ahead a member waits until the other is near, also if a light has separated
+    them."""
+    walkers = FakeSumo(c0=("s", 13.0, 0.0), c1=("s", 10.0, 0.64))
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)
     cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(2):
-        cohesion.update(walkers.seen())
+        cohesion.update(walkers.positions())
         walkers.advance(0.65)
     assert walkers.told["c0"] == 0.0 and walkers.told["c1"] > 1.3
     walkers.at["c1"] = ("s", walkers.at["c0"][1] - 1.0, 0.64)
-    cohesion.update(walkers.seen())
+    cohesion.update(walkers.positions())
     assert walkers.told["c0"] > 1.0
 
-    parted = Walkers(c0=("t", 11.0, 0.0), c1=("s", 10.0, 0.64))
+    parted = FakeSumo(c0=("t", 11.0, 0.0), c1=("s", 10.0, 0.64))
     cohesion = GroupCohesion(parted, STRIPS, 0.05)
     cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(6):
         parted.at["c0"] = ("t", parted.at["c0"][1] + 0.65, 0.0)
-        cohesion.update(parted.seen())
+        cohesion.update(parted.positions())
     assert parted.told["c0"] == 0.0 and parted.told["c1"] > 1.3
 
 
-def test_who_walks_aside_steps_back_unless_somebody_comes() -> None:
-    """1.9 m beside its fellow somebody steps 0.34 m nearer; not where another comes towards that
+def test_a_member_walking_aside_steps_nearer_unless_blocked() -> None:
+    """1.9 m beside the other it steps 0.34 m nearer, but not where another person approaches that
     place."""
-    walkers = Walkers(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
-    kept(walkers, looks=3)
+    walkers = FakeSumo(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
+    given_speeds(walkers, updates=3)
     assert sorted(y for _, _, y in walkers.at.values()) in ([0.0, 1.58], [0.34, 1.92])
-    walkers = Walkers(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
+    walkers = FakeSumo(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)
     cohesion.form(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(3):
-        cohesion.update({**walkers.seen(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
+        cohesion.update({**walkers.positions(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
         walkers.advance(0.65)
     assert [y for _, _, y in walkers.at.values()] == [0.0, 1.92]
 
 
-def test_who_has_left_is_forgotten() -> None:
-    """Of three one leaves, and two are a group; the last one walks on at its own speed; two may
+def test_members_who_leave_are_removed() -> None:
+    """Of three one leaves, and two remain a group; the last one walks at its own speed. Two may
     leave at once."""
-    walkers = Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64), c2=("s", 10.0, 1.28))
+    walkers = FakeSumo(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64), c2=("s", 10.0, 1.28))
     cohesion = GroupCohesion(walkers, STRIPS, 0.05)
     cohesion.form(("c0", "c1", "c2"), 1.3, ("s",))
     cohesion.form(("c3", "c4"), 1.2, ("s",))
     for _ in range(2):
-        cohesion.update(walkers.seen())
+        cohesion.update(walkers.positions())
         walkers.advance(0.65)
     assert walkers.told["c0"] < 1.3
     cohesion.remove_absent(["c0", "c1"])
@@ -190,15 +189,15 @@ def test_who_has_left_is_forgotten() -> None:
     assert cohesion.groups == () and walkers.told["c0"] == 1.3
 
 
-def test_a_suite_can_be_asked_for_groups() -> None:
-    """`--groups 0.4` makes another suite, whose version says so; nothing asked leaves it; children
-    need groups."""
+def test_options_add_groups_to_a_suite() -> None:
+    """`--groups 0.4` gives another version and hash, no option leaves the suite, and children need
+    groups."""
     shipped = load_suite("reactive")
-    asked = with_crowd(shipped, groups=0.4, children=None)
-    assert {scenario.crowd.groups for scenario in asked.scenarios} == {0.4}
+    grouped = with_crowd(shipped, groups=0.4, children=None)
+    assert {scenario.crowd.groups for scenario in grouped.scenarios} == {0.4}
     assert (
-        asked.version == f"{shipped.version}-groups0.4"
-        and asked.content_hash != shipped.content_hash
+        grouped.version == f"{shipped.version}-groups0.4"
+        and grouped.content_hash != shipped.content_hash
     )
     assert with_crowd(shipped, groups=None) is shipped
     first = msgspec.structs.replace(shipped.scenarios[0], crowd=CrowdSpec(density=20.0))
@@ -210,8 +209,8 @@ def test_a_suite_can_be_asked_for_groups() -> None:
 
 @pytest.mark.engine
 def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
-    """For over a minute groups stay near, are as many as asked, of the right ages and paces; bit
-    for bit again."""
+    """For over a minute groups stay near and have the requested number, ages and paces, bit for bit
+    again."""
     net = tmp_path / "city.net.xml"
     build_city(City(seed=2, size_m=600.0), net)
     street_map = read_net(net)
@@ -264,7 +263,7 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
 
 
 @pytest.mark.engine
-def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_group_is_removed_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Members of a stuck group leave the street in the same tick."""
     monkeypatch.setattr("sumo_nets.crowd.demand.STUCK_S", -1.0)
     net = tmp_path / "city.net.xml"
@@ -280,7 +279,7 @@ def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.Mon
             before = set(crowd.street.people.ids)
             reply = EventReply(episode="test", tick=tick, states=(), actors=())
             after = set(crowd.step(RobotState(start), reply).people.ids)
-            whole = [set(names) for names in groups if set(names) <= before]
-            left += sum(not names & after for names in whole)
-            assert tick % 10 or all(names <= after or not names & after for names in whole)
+            complete = [set(names) for names in groups if set(names) <= before]
+            left += sum(not names & after for names in complete)
+            assert tick % 10 or all(names <= after or not names & after for names in complete)
     assert left > 10

@@ -1,5 +1,5 @@
-"""Importing city maps: OpenStreetMap and SUMO files, whole, packed, broken; the shared maps where
-they are."""
+"""Import of city maps: OpenStreetMap and SUMO files, complete, packed or broken; and the shared
+maps if present."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.signal_plans import SignalPrograms
 from tests.conftest import Cosim
-from tests.sumo_nets.conftest import kept
+from tests.sumo_nets.conftest import stored_maps
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -73,7 +73,7 @@ def osm(
     sidewalk: str = "both",
     blocks: int = 3,
 ) -> str:
-    """A grid of streets 120 m apart with a footway across one block."""
+    """Return a grid of streets 120 m apart with a footway across one block."""
     lon, lat = at
     number = {
         (i, k): 1 + i * (blocks + 1) + k for i in range(blocks + 1) for k in range(blocks + 1)
@@ -118,16 +118,16 @@ def written(path: Path, text: str) -> Path:
 
 @cache
 def small_city() -> bytes:
-    """The net of a city of 300 m."""
+    """Return the net of a city of 300 m."""
     path = cache_folder() / "small.net.xml"
     build_city(City(seed=3, size_m=300.0), path)
     return path.read_bytes()
 
 
 @pytest.mark.engine
-def test_osm_becomes_a_place_that_can_be_walked(tmp_path: Path) -> None:
-    """Streets get sidewalks, crossings and corners in one piece; source, changes and licence are
-    kept with the net."""
+def test_an_osm_file_becomes_a_walkable_place(tmp_path: Path) -> None:
+    """Streets get sidewalks, crossings and corners in one piece, and source, changes and licence
+    are stored with the net."""
     about = import_map(written(tmp_path / "Kleine Stadt.osm", osm()))
     street_map, check, again = checked_map("kleine-stadt")
     assert again == about and about.source == "Kleine Stadt.osm" and about.guessed_share == 0.0
@@ -148,7 +148,7 @@ def test_osm_becomes_a_place_that_can_be_walked(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_every_packing_gives_the_same_net(tmp_path: Path) -> None:
-    """Plain, gzip, bzip2 and PBF files of one map become one and the same net."""
+    """Plain, gzip, bzip2 and PBF files of one map become the same net."""
     import osmium
 
     plain = written(tmp_path / "town.osm", osm())
@@ -162,8 +162,9 @@ def test_every_packing_gives_the_same_net(tmp_path: Path) -> None:
 
 
 @pytest.mark.engine
-def test_driving_side_is_looked_up_and_can_be_said(tmp_path: Path) -> None:
-    """London drives on the left, unless told otherwise; the sidewalk is then left of the road."""
+def test_driving_side_follows_the_country_or_the_option(tmp_path: Path) -> None:
+    """London drives on the left unless the option says otherwise, and the sidewalk is then left of
+    the road."""
     source = written(tmp_path / "town.osm", osm(LONDON))
     assert "United Kingdom" in " ".join(import_map(source, "london").changes)
     left = read_map("london")
@@ -191,13 +192,13 @@ def test_driving_side_is_looked_up_and_can_be_said(tmp_path: Path) -> None:
     ],
 )
 def test_left_hand_countries(lon: float, lat: float, country: str | None) -> None:
-    """Capitals and border towns fall on the right side of the table."""
+    """Capitals and border towns have the driving side of their country."""
     assert left_hand_country(lon, lat) == country
 
 
 @pytest.mark.engine
-def test_a_good_net_is_kept_as_it_is(tmp_path: Path) -> None:
-    """A SUMO net with sidewalks and walking areas comes out as the same place, zones included."""
+def test_a_complete_net_is_imported_unchanged(tmp_path: Path) -> None:
+    """A SUMO net with sidewalks and walking areas gives the same place, zones included."""
     source = tmp_path / "good.net.xml.gz"
     source.write_bytes(gzip.compress(small_city()))
     before = read_net(source)
@@ -229,8 +230,8 @@ def test_a_good_net_is_kept_as_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.engine
-def test_nets_for_cars_alone_get_walkways(tmp_path: Path) -> None:
-    """A net without sidewalks gets them, as one of its changes, and they are said to be guessed."""
+def test_nets_without_sidewalks_get_walkways(tmp_path: Path) -> None:
+    """The sidewalks are listed as a change, and reported as guessed."""
     source = written(tmp_path / "town.osm", osm(sidewalk=""))
     net = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
     about = import_map(net)
@@ -241,7 +242,7 @@ def test_nets_for_cars_alone_get_walkways(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_as_is_leaves_a_net_unchanged(tmp_path: Path) -> None:
-    """With --as-is the net stays the same to the byte, and the changes say what is not possible on
+    """With --as-is the net stays the same to the byte, and the changes say what is impossible on
     it."""
     source = written(tmp_path / "town.osm", osm(sidewalk=""))
     net = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
@@ -255,8 +256,8 @@ def test_as_is_leaves_a_net_unchanged(tmp_path: Path) -> None:
 
 
 def streets_of_each_class() -> str:
-    """A town of residential streets, of which one is primary and two have sidewalks with tagged
-    widths."""
+    """Return a town of residential streets, of which one is primary and two have sidewalks with
+    tagged widths."""
     text = osm(sidewalk="")
     for way, tags in (
         ("100", {"highway": "primary"}),
@@ -269,15 +270,17 @@ def streets_of_each_class() -> str:
         head, tail = text.split(f'<way id="{way}">')
         refs, rest = tail.split("</way>", 1)
         kept_tags = "" if "highway" in tags else '<tag k="highway" v="residential"/>'
-        said = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
-        text = f'{head}<way id="{way}">{refs[: refs.index("<tag")]}{kept_tags}{said}</way>{rest}'
+        tag_rows = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+        text = (
+            f'{head}<way id="{way}">{refs[: refs.index("<tag")]}{kept_tags}{tag_rows}</way>{rest}'
+        )
     return text
 
 
 @pytest.mark.engine
 def test_guessed_sidewalks_have_the_width_of_their_street(tmp_path: Path, cosim: Cosim) -> None:
-    """Their width follows the street's class, tagged widths win, side by side; --sidewalk-width
-    sets all others."""
+    """Widths follow the street's class, tagged widths have priority on each side, and
+    --sidewalk-width sets all others."""
     source = written(tmp_path / "town.osm", streets_of_each_class())
     about = import_map(source, "town")
     strips = read_map("town").strips
@@ -294,8 +297,9 @@ def test_guessed_sidewalks_have_the_width_of_their_street(tmp_path: Path, cosim:
         "-202#1": 1.6,
         "300": 2.0,
     }
-    (said,) = [change for change in about.changes if change.startswith("sidewalks are")]
-    assert "2.5 m beside residential streets (" in said and "as tagged beside others (" in said
+    (widths_change,) = [one for one in about.changes if one.startswith("sidewalks are")]
+    assert "2.5 m beside residential streets (" in widths_change
+    assert "as tagged beside others (" in widths_change
     cars = netconvert(["--osm-files", str(source), "--speed.factor=0.5"], tmp_path / "cars.net.xml")
     import_map(cars)
     strips = read_map("cars").strips
@@ -312,7 +316,7 @@ def test_guessed_sidewalks_have_the_width_of_their_street(tmp_path: Path, cosim:
 @pytest.mark.engine
 @pytest.mark.parametrize("name", ["ingolstadt-1", "braunschweig-2"])
 def test_shipped_places_have_the_hashes_of_their_suites(name: str) -> None:
-    """The shipped places are imported to the nets on which the scenarios were drawn."""
+    """Shipped places are imported to the nets on which the scenarios were drawn."""
     about = about_map(name)
     frozen = {
         s.place.net_hash for s in load_suite("unit").scenarios if s.place.name == f"map-{name}"
@@ -324,7 +328,7 @@ def test_shipped_places_have_the_hashes_of_their_suites(name: str) -> None:
 def test_a_shipped_place_of_an_older_importer_is_imported_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What an installation of version 3 left in the cache is replaced on first use."""
+    """A place that version 3 stored in the cache is replaced on first use."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     path = map_net("braunschweig-1").with_name(ABOUT)
     old = json.loads(path.read_bytes())
@@ -336,7 +340,7 @@ def test_a_shipped_place_of_an_older_importer_is_imported_again(
 
 @pytest.mark.engine
 def test_an_imported_map_can_be_deleted(tmp_path: Path) -> None:
-    """It is unknown then; maps that are not imported are refused with those that are."""
+    """A deleted map is unknown, and maps that are not imported are refused with those that are."""
     import_map(written(tmp_path / "town.osm", osm()), "to-delete")
     folder = delete_map("to-delete")
     assert not folder.exists() and "to-delete" not in known_maps()
@@ -347,8 +351,8 @@ def test_an_imported_map_can_be_deleted(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_maps_of_an_older_importer_stay_usable(tmp_path: Path) -> None:
-    """A map that version 3 kept is read as it was, its check advises a new import, and that
-    replaces it."""
+    """A map of version 3 is read unchanged, its check advises a new import, and that replaces
+    it."""
     source = written(tmp_path / "town.osm", osm())
     import_map(source, "old")
     path = map_net("old").with_name(ABOUT)
@@ -360,8 +364,8 @@ def test_maps_of_an_older_importer_stay_usable(tmp_path: Path) -> None:
     assert street_map.strips and outdated(about) and not outdated(import_map(source, "old"))
 
 
-class Stages:
-    """What an import says of itself: its stages, and the shares of each."""
+class RecordedStages:
+    """Records the stages of an import, and the shares of each."""
 
     def __init__(self) -> None:
         self.shares: dict[str, list[float]] = {}
@@ -374,17 +378,17 @@ class Stages:
 def test_a_box_is_cut_out_before_the_conversion(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a packed file only the streets in the box and its margin are converted, and the part is
-    that of the whole."""
+    """Only the streets in the box and its margin are converted, and the result is that of cropping
+    afterwards."""
     monkeypatch.setattr(osmcrop, "MARGIN_M", 130.0)
     (lon, lat) = BERLIN
-    told = Stages()
+    progress = RecordedStages()
     plain = written(tmp_path / "town.osm", osm(blocks=5))
     source = tmp_path / "town.osm.gz"
     source.write_bytes(gzip.compress(plain.read_bytes()))
     box = (lon + 0.0001, lat + 0.0001, lon + 0.0018, lat + 0.0012)
-    about = import_map(source, "part", Options(bbox=box), told)
-    stages = list(told.shares)
+    about = import_map(source, "part", Options(bbox=box), progress)
+    stages = list(progress.shares)
     assert stages[0] == "reading town.osm.gz" and stages[1] == "converting 8 streets and paths"
     assert set(stages) >= {
         "cropping",
@@ -392,7 +396,7 @@ def test_a_box_is_cut_out_before_the_conversion(
         "mending corners",
         "starting SUMO on the net",
     }
-    done = told.shares["converting 8 streets and paths"]
+    done = progress.shares["converting 8 streets and paths"]
     assert done == sorted(done) and done[0] == 0.0 and done[-1] > 0.7
     part = set(read_map("part").strips)
     assert (
@@ -401,7 +405,7 @@ def test_a_box_is_cut_out_before_the_conversion(
 
 
 def cut_afterwards(source: Path, box: tuple[float, float, float, float]) -> StreetMap:
-    """The part of a town that is converted whole and then cropped."""
+    """Return the part of a town that is converted completely and then cropped."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(osmcrop, "MARGIN_M", 1e6)
         import_map(source, "afterwards", Options(bbox=box))
@@ -412,11 +416,11 @@ def cut_afterwards(source: Path, box: tuple[float, float, float, float]) -> Stre
 def test_a_bad_box_is_refused_with_the_bounds(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A box outside of a file, with its sides swapped, or without a street: the error gives the
-    file's bounds."""
+    """A box outside of a file, with swapped sides, or without a street is refused with the file's
+    bounds."""
     monkeypatch.setattr(osmcrop, "MARGIN_M", 1.0)
     source = written(tmp_path / "town.osm", osm())
-    before = kept()
+    before = stored_maps()
     done = cosim("map", "import", str(source), "--bbox", "1,1,2,2")
     assert (
         done.returncode == 2
@@ -442,14 +446,14 @@ def test_a_bad_box_is_refused_with_the_bounds(
     flat.write_bytes(small_city())
     with pytest.raises(MapError, match=r"which covers .* in metres: the net has no projection\)"):
         import_map(flat, options=Options(bbox=(5000.0, 5000.0, 6000.0, 6000.0)))
-    assert kept() == before
+    assert stored_maps() == before
 
 
 @pytest.mark.engine
-def test_large_files_are_told_of_the_box(
+def test_a_slow_import_names_the_option_for_a_box(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An import that takes minutes says so when it begins, with the option that makes it faster."""
+    """An import that takes minutes says so at its begin, with the option that makes it faster."""
     monkeypatch.setattr(importer, "SLOW_IMPORT_EDGES", 5)
     source = written(tmp_path / "town.osm", osm(blocks=2))
     done = cosim("map", "import", str(source))
@@ -460,8 +464,8 @@ def test_large_files_are_told_of_the_box(
 
 
 @pytest.mark.engine
-def test_a_net_says_itself_where_it_drives(tmp_path: Path) -> None:
-    """--lefthand on a right-hand net is refused: it would turn the net into nonsense."""
+def test_lefthand_is_refused_for_a_right_hand_net(tmp_path: Path) -> None:
+    """The driving side of a net is fixed by the net."""
     source = tmp_path / "good.net.xml"
     source.write_bytes(small_city())
     with pytest.raises(MapError, match="on the right in this one"):
@@ -518,20 +522,18 @@ def test_a_net_says_itself_where_it_drives(tmp_path: Path) -> None:
 def test_bad_files_are_refused_and_leave_nothing(
     tmp_path: Path, name: str, content: bytes, reason: str
 ) -> None:
-    """Whatever the file is, one MapError names it and says what was found, and nothing
-    half-imported stays."""
-    before = kept()
+    """One MapError names the file and the fault, and no partial import is left."""
+    before = stored_maps()
     source = tmp_path / name
     source.write_bytes(content)
     with pytest.raises(MapError) as caught:
         import_map(source)
     assert str(caught.value).startswith(f"{source}: ") and reason in str(caught.value)
-    assert kept() == before
+    assert stored_maps() == before
 
 
 def test_missing_files_and_bad_names_are_refused(tmp_path: Path) -> None:
-    """A file that is not there, a name that is no name, a name that SUMO's nets have, a box that is
-    none."""
+    """A missing file, an invalid name, a name of SUMO's nets and an invalid box are refused."""
     with pytest.raises(MapError, match="cannot be read: No such file"):
         import_map(tmp_path / "none.osm")
     with pytest.raises(MapError, match="cannot be read: it is a folder, not a file"):
@@ -547,7 +549,8 @@ def test_missing_files_and_bad_names_are_refused(tmp_path: Path) -> None:
 
 
 def test_names_come_from_files() -> None:
-    """Endings go, odd letters become dashes, names that say nothing give way to the folder's."""
+    """Endings are removed, other letters become dashes, and generic names are replaced by the
+    folder's."""
     assert map_name(Path("x/West Oakland.osm.bz2")) == "west-oakland"
     assert map_name(Path("x/fokr_bs.net.xml.gz")) == "fokr_bs"
     assert map_name(Path("/maps/Taipei/input.osm.gz")) == "taipei"
@@ -555,10 +558,10 @@ def test_names_come_from_files() -> None:
 
 
 @pytest.mark.engine
-def test_a_slow_netconvert_is_told_with_the_remedy(
+def test_a_slow_netconvert_is_stopped_with_a_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A conversion that does not end is stopped; one line names the user's file and what to do."""
+    """One line names the user's file and the remedy."""
     monkeypatch.setattr(netsteps, "TIMEOUT_S", 0.001)
     source = written(tmp_path / "town.osm", osm())
     with pytest.raises(MapError) as caught:
@@ -580,8 +583,8 @@ def test_nets_that_come_with_sumo_are_imported_when_used() -> None:
 
 
 def test_crossings_that_never_have_green_get_a_phase() -> None:
-    """One phase more, in which only they go, with yellow before and time to clear the road after;
-    others stay."""
+    """The additional phase is for them alone, with yellow before it and time to clear the road
+    after it; other phases stay."""
     net = """<net version="1.20"><edge id=":J_c0" function="crossing"><lane id=":J_c0_0" length="11"/></edge>
       <edge id=":J_c1" function="crossing"><lane id=":J_c1_0" length="5"/></edge>
       <tlLogic id="J" type="static" programID="0" offset="0"><phase duration="30" state="GrG"/>
@@ -603,8 +606,8 @@ def test_crossings_that_never_have_green_get_a_phase() -> None:
 
 
 def with_ways(ways: dict[str, tuple[list[tuple[float, float]], dict[str, str]]]) -> str:
-    """The town of `osm` with further ways: places in blocks east and north of its corner, and
-    tags."""
+    """Return the town of `osm` with further ways: places in blocks east and north of its corner,
+    and tags."""
     (lon, lat) = BERLIN
     nodes = list[str]()
     rows = list[str]()
@@ -629,10 +632,7 @@ def with_ways(ways: dict[str, tuple[list[tuple[float, float]], dict[str, str]]])
 @pytest.mark.engine
 def test_a_layer_alone_closes_no_sidewalk(tmp_path: Path) -> None:
     """A layer counts with a bridge, a tunnel, a roof or a street over or under it; level and
-    location count alone.
-
-    A bridge closes its own part of a street, not the streets before and after it.
-    """
+    location count alone. A bridge closes only its own part of a street."""
     street = {"highway": "residential", "sidewalk": "both"}
     text = with_ways(
         {
@@ -679,12 +679,8 @@ def test_a_layer_alone_closes_no_sidewalk(tmp_path: Path) -> None:
 
 
 def test_greens_too_short_to_walk_are_lengthened() -> None:
-    """Each green lasts as long as the crossing takes; no state changes, so nothing goes together
-    that did not before.
-
-    The seconds come from the program's long phases; a program that is not fixed is left alone, and
-    named.
-    """
+    """Each green lasts as long as the crossing takes, with seconds of the program's long phases and
+    unchanged states. A program that is not fixed is left alone, and named."""
     net = """<net version="1.20"><edge id=":J_c0" function="crossing"><lane id=":J_c0_0" length="12"/></edge>
       <edge id=":J_c1" function="crossing"><lane id=":J_c1_0" length="6"/></edge>
       <tlLogic id="J" type="static" programID="0" offset="0"><phase duration="40" state="Grr"/>
@@ -692,8 +688,8 @@ def test_greens_too_short_to_walk_are_lengthened() -> None:
       <connection from=":J_w0" to=":J_c0" tl="J" linkIndex="1"/>
       <connection from=":J_w0" to=":J_c1" tl="J" linkIndex="2"/></net>"""
     root = ET.fromstring(net)
-    (said,) = extend_greens(root)
-    assert said.endswith("longer for 2 crossings of 1 signals, by up to 9 s; no cycle is longer")
+    (change,) = extend_greens(root)
+    assert change.endswith("longer for 2 crossings of 1 signals, by up to 9 s; no cycle is longer")
     phases = [(p.get("duration"), p.get("state")) for p in root.iter("phase")]
     assert phases == [("31", "Grr"), ("3", "yrr"), ("14", "rGG"), ("4", "rrr")]
     assert extend_greens(root) == []
@@ -721,8 +717,8 @@ def test_crossings_with_greens_too_short_to_walk_are_found() -> None:
 
 @pytest.mark.engine
 def test_greens_of_imported_signals_are_long_enough(tmp_path: Path) -> None:
-    """In a town of one-way streets with signals netconvert's greens of 5 s are too short; after the
-    import none is."""
+    """In a town of one-way streets netconvert's greens of 5 s are too short, and after the import
+    none is."""
     signal = '><tag k="highway" v="traffic_signals"/></node>\n<node'
     text = osm(highway="primary", blocks=2).replace("/>\n<node", signal)
     text = text.replace(
@@ -742,9 +738,9 @@ def test_greens_of_imported_signals_are_long_enough(tmp_path: Path) -> None:
         assert min(greens) >= strip.length_m / 1.2 + 4.0 - 0.01, strip.id
 
 
-def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> None:
-    """A walking area that crosses itself between two sidewalks becomes ground a robot can pass; a
-    whole one stays."""
+def test_broken_corners_are_repaired_and_valid_ones_unchanged(tmp_path: Path) -> None:
+    """A walking area that crosses itself between two sidewalks becomes ground that a robot can
+    pass."""
     net = """<net version="1.9"><location convBoundary="0,0,30,9"/>
       <edge id=":J_w0" function="walkingarea"><lane id=":J_w0_0" allow="pedestrian" length="4" width="2"
         shape="10,-1 14,1 14,-1 10,1"/></edge>
@@ -774,7 +770,7 @@ def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> No
 
 @pytest.mark.engine
 def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
-    """import and check, their output and exit codes."""
+    """import and check have the documented output and exit codes."""
     source = written(tmp_path / "town.osm", osm())
     picture = tmp_path / "town.png"
     done = cosim("map", "import", str(source), "--name", "town")
@@ -796,7 +792,7 @@ def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
 @pytest.mark.skipif(not NAMES, reason="no shared maps beside the repository")
 @pytest.mark.parametrize("name", [n for n in NAMES if not n.startswith("zz-")])
 def test_shared_maps_import(request: pytest.FixtureRequest, name: str) -> None:
-    """Every open map imports with the walkable length that was measured, and can be used."""
+    """Every open map imports with the measured walkable length, and can be used."""
     if name not in SAMPLE and not request.config.getoption("--whole"):
         pytest.skip("imported with --whole")
     stats = json.loads((MAPS / name / "stats.json").read_text())
@@ -817,8 +813,8 @@ def test_shared_maps_import(request: pytest.FixtureRequest, name: str) -> None:
 
 @pytest.mark.engine
 @pytest.mark.skipif(not NAMES, reason="no shared maps beside the repository")
-def test_a_shared_map_that_is_refused() -> None:
-    """The map of which nothing is left is refused with the reason."""
+def test_a_shared_map_without_walkable_streets_is_refused() -> None:
+    """A map of which no street remains is refused with the reason."""
     with pytest.raises(MapError, match="no street of the file survived"):
         import_map(MAPS / "zz-empty-roundabout" / "input.osm.gz", "refused")
-    assert "refused" not in kept()
+    assert "refused" not in stored_maps()

@@ -57,8 +57,8 @@ def written(folder: Path, text: str, name: str = "small.net.xml") -> Path:
 
 
 def test_trains_and_ships_have_no_road_but_trams_do(tmp_path: Path) -> None:
-    """A railway, a ferry and what OpenStreetMap calls any rail are not read as lanes; a tram's and
-    a bus's are."""
+    """Lanes of railways, ferries and generic rail are not read, and those of trams and buses
+    are."""
     row = (
         '<edge id="{0}" from="L" to="M"><lane id="{0}_0" index="0" allow="{1}" length="9" '
         'shape="900,0 909,0"/></edge>'
@@ -80,10 +80,10 @@ def test_trains_and_ships_have_no_road_but_trams_do(tmp_path: Path) -> None:
     }
 
 
-def test_stairs_bridges_and_tunnels_are_told_from_plain_ground(tmp_path: Path) -> None:
-    """By the type of the edge or by what it says of bridge, tunnel and layer; a passage through a
-    house is plain."""
-    said = {
+def test_stairs_bridges_and_tunnels_are_recognised(tmp_path: Path) -> None:
+    """The type of the edge and its bridge, tunnel and layer decide; a passage through a house is
+    plain."""
+    edges = {
         "stairs": ("highway.footway|highway.steps", "", ""),
         "deck": ("highway.footway", "bridge", "viaduct"),
         "subway": ("highway.footway", "tunnel", "yes"),
@@ -96,7 +96,7 @@ def test_stairs_bridges_and_tunnels_are_told_from_plain_ground(tmp_path: Path) -
         + lane
         + '<param key="{2}" value="{3}"/></edge>'
     )
-    rows = "".join(row.format(name, *words) for name, words in said.items())
+    rows = "".join(row.format(name, *words) for name, words in edges.items())
     strips = read_net(written(tmp_path, NET.replace("<junction", rows + "<junction", 1))).strips
     going = {
         "stairs": "steps",
@@ -105,11 +105,11 @@ def test_stairs_bridges_and_tunnels_are_told_from_plain_ground(tmp_path: Path) -
         "above": "bridge",
         "passage": "plain",
     }
-    assert {name: strips[name].going for name in said} == going and strips["path"].going == "plain"
+    assert {name: strips[name].going for name in edges} == going and strips["path"].going == "plain"
 
 
-def test_strips_lanes_and_corners_are_told_apart(tmp_path: Path) -> None:
-    """Sidewalks, shared paths and crossings are strips; verges and carriageways lanes; walking
+def test_edges_become_strips_lanes_and_corners(tmp_path: Path) -> None:
+    """Sidewalks, shared paths and crossings are strips, verges and carriageways lanes, and walking
     areas corners."""
     place = read_net(written(tmp_path, NET))
     assert {strip.id: strip.kind for strip in place.strips.values()} == {
@@ -127,8 +127,8 @@ def test_strips_lanes_and_corners_are_told_apart(tmp_path: Path) -> None:
     assert not place.left_hand
 
 
-def test_strip_knows_its_street(tmp_path: Path) -> None:
-    """Params win over defaults, a missing width is 3.2 m, elevations are dropped, a path has no
+def test_a_strip_has_the_values_of_its_street(tmp_path: Path) -> None:
+    """Params override defaults, a missing width is 3.2 m, elevations are dropped, and a path has no
     road."""
     place = read_net(written(tmp_path, NET))
     side, path, crossing = place.strips["in"], place.strips["path"], place.strips[":J_c0"]
@@ -149,7 +149,8 @@ def test_ports_follow_geometry_where_connections_run_backwards(tmp_path: Path) -
 
 
 def test_broken_walking_areas_are_repaired_and_specks_dropped(tmp_path: Path) -> None:
-    """A self-intersecting ring becomes a valid polygon; an area of nothing at a dead end goes."""
+    """A self-intersecting ring becomes a valid polygon, and an empty area at a dead end is
+    dropped."""
     place = read_net(written(tmp_path, NET))
     assert place.corners[":J_w1"].polygon.is_valid and place.corners[":J_w1"].polygon.area > 5.0
     assert ":K_w0" not in place.corners
@@ -157,13 +158,13 @@ def test_broken_walking_areas_are_repaired_and_specks_dropped(tmp_path: Path) ->
 
 
 def test_left_hand_nets_have_the_road_on_the_other_side(tmp_path: Path) -> None:
-    """lefthand="true" turns road_side round."""
+    """lefthand="true" reverses road_side."""
     place = read_net(written(tmp_path, NET.replace("<net ", '<net lefthand="true" ')))
     assert place.left_hand and place.strips["in"].road_side == -1
 
 
 def test_hash_ignores_comments_and_packing_but_not_content(tmp_path: Path) -> None:
-    """Time stamps, folders, line ends and gzip do not count; one centimetre does."""
+    """Time stamps, folders, line ends and gzip do not count, and one centimetre does."""
     plain = written(tmp_path, NET)
     packed = tmp_path / "packed.net.xml.gz"
     packed.write_bytes(
@@ -176,7 +177,7 @@ def test_hash_ignores_comments_and_packing_but_not_content(tmp_path: Path) -> No
 
 
 def test_stubs_of_no_length_become_tiny_strips(tmp_path: Path) -> None:
-    """A sidewalk drawn as one point twice still has a valid polygon and a length."""
+    """A sidewalk with the same point twice has a valid polygon and a length."""
     place = read_net(written(tmp_path, NET.replace("58,1.6 108,1.6", "58,1.6 58,1.6")))
     stub = place.strips["path"]
     assert stub.polygon.is_valid and stub.polygon.area > 0.1 and stub.length_m > 0.0
@@ -218,7 +219,7 @@ def test_stubs_of_no_length_become_tiny_strips(tmp_path: Path) -> None:
 def test_broken_nets_are_refused_with_file_and_reason(
     tmp_path: Path, text: str, reason: str
 ) -> None:
-    """Whatever is wrong inside, the error is a MapError that names the file."""
+    """For any fault inside, the error is a MapError that names the file."""
     with pytest.raises(MapError) as caught:
         read_net(written(tmp_path, text))
     assert str(caught.value).startswith(f"{tmp_path / 'small.net.xml'}: ")
@@ -226,7 +227,7 @@ def test_broken_nets_are_refused_with_file_and_reason(
 
 
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
-    """A missing file, a folder and a truncated gzip are MapErrors too."""
+    """A missing file, a folder and a truncated gzip are MapErrors, too."""
     with pytest.raises(MapError, match="cannot be read: No such file"):
         read_net(tmp_path / "none.net.xml")
     with pytest.raises(MapError, match="cannot be read: it is a folder, not a file"):
@@ -239,14 +240,17 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_no_carriageway_is_behind_a_sidewalk() -> None:
-    """Every part of a junction between its sidewalks and corners is reached by a lane; SUMO draws
-    outlines of T-junctions beyond the far sidewalk."""
+    """Every part of a junction between its sidewalks and corners is reached by a lane, though SUMO
+    draws outlines of T-junctions beyond the far sidewalk."""
     street_map = street_map_of(city_net(City(seed=2, size_m=600.0)))
     strips = [s.polygon for s in street_map.strips.values() if s.kind == "sidewalk"]
     walks = shapely.STRtree([*strips, *(c.polygon for c in street_map.corners.values())])
     lanes = shapely.union_all([lane.polygon for lane in street_map.lanes.values()])
+    checked = 0
     for junction in street_map.junctions.values():
         beside = walks.geometries[walks.query(junction.polygon, predicate="intersects")]
         parts = shapely.get_parts(junction.polygon.difference(shapely.union_all(beside)))
         wide = [p for p in parts if not shapely.is_empty(p.buffer(-0.02))]
         assert all(part.distance(lanes) < 0.2 for part in wide), junction.id
+        checked += len(wide)
+    assert checked

@@ -1,5 +1,5 @@
-"""Whatever a user calls a place can be run on: maps by name, folders of cities and maps, nets; and
-the store of maps holds whole ones only, whoever dies or comes at the same moment."""
+"""Places that a user can run on: maps by name, folders of cities and maps, and nets. The store
+holds only complete maps, also with concurrent or killed processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tests.sumo_nets.test_damaged_maps import TOWN
 
 @pytest.fixture(autouse=True, scope="module")
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Maps are kept in a folder of this module's own."""
+    """Store maps in a separate folder for the module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -45,15 +45,14 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of `cosim city make`."""
+    """Return a folder of `cosim city make`."""
     folder = tmp_path_factory.mktemp("cities") / "seven"
     write_city(City(seed=7, size_m=400.0), folder)
     return folder
 
 
-def test_what_is_no_place_is_told_with_what_there_is(tmp_path: Path) -> None:
-    """An unknown name, a folder of something else and a file that must be imported first: each with
-    the remedy."""
+def test_an_unknown_place_is_refused_with_a_remedy(tmp_path: Path) -> None:
+    """An unknown name, another folder and a file that must be imported first each have a remedy."""
     with pytest.raises(
         UsageError, match=r"unknown map 'nowhere'.*sumo-fkk-in.*Or give a path: the folder of"
     ):
@@ -73,8 +72,8 @@ def test_what_is_no_place_is_told_with_what_there_is(tmp_path: Path) -> None:
 
 
 def test_suites_that_cannot_be_drawn_are_refused() -> None:
-    """Another kind of suite, or an event that does not exist, with the valid ones; before any map
-    is looked for."""
+    """An unknown kind of suite and an unknown event are refused with the valid ones, before the map
+    is read."""
     with pytest.raises(
         UsageError, match=r"suite for --map 'static'\. Valid choices: long-horizon, reactive, unit"
     ):
@@ -84,7 +83,7 @@ def test_suites_that_cannot_be_drawn_are_refused() -> None:
 
 
 def test_names_that_lead_out_of_the_store_are_unknown() -> None:
-    """A scenario cannot name a map by a way through folders."""
+    """A scenario cannot name a map by a path through folders."""
     for name in ("../other", "..", "a/b", "", "/etc"):
         with pytest.raises(UsageError, match="unknown map"):
             map_net(CityMap(map=name))
@@ -92,8 +91,7 @@ def test_names_that_lead_out_of_the_store_are_unknown() -> None:
 
 @pytest.mark.engine
 def test_the_folder_of_a_city_is_that_city(city: Path) -> None:
-    """It is the same place as by its seed, with the hash of its net, so that a run of it needs no
-    folder."""
+    """Its place has the seed and the hash of its net, so a run needs no folder."""
     where = resolve_place(str(city), roughness=0.2)
     assert where == resolve_place(str(city / NET_NAME), roughness=0.2)
     assert isinstance(where, City) and (where.seed, where.size_m, where.roughness) == (
@@ -111,8 +109,7 @@ def test_the_folder_of_a_city_is_that_city(city: Path) -> None:
 
 @pytest.mark.engine
 def test_a_changed_city_is_a_map(city: Path, tmp_path: Path) -> None:
-    """When its net is not the one of its seed any more, the folder's net is what is run on; it is
-    imported once."""
+    """If its net is not the one of its seed, the net of the folder is imported once and used."""
     mine = tmp_path / "mine"
     shutil.copytree(city, mine)
     net = (mine / NET_NAME).read_text()
@@ -131,8 +128,8 @@ def test_a_changed_city_is_a_map(city: Path, tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path: Path) -> None:
-    """A net gets its file's name, another of that name one with its hash; a map's folder brings its
-    buildings along."""
+    """A net has its file's name, another of that name one with its hash, and a map's folder
+    includes its buildings."""
     net = tmp_path / "street.net.xml"
     other = tmp_path / "b" / "street.net.xml"
     shutil.copy(city / NET_NAME, net)
@@ -178,11 +175,11 @@ def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path
 
 @pytest.mark.engine
 def test_reactive_scenarios_are_drawn_where_there_is_room() -> None:
-    """Events take turns over the seeds; those without room are left out and named, unless they were
-    asked for."""
-    whole = suite_on_map("reactive", "sumo-fkk-in", 0, None)
-    kinds = [s.events[0].kind for s in whole.scenarios]
-    left_out = [kind for kind in EVENT_KINDS if f"No '{kind}'" in whole.description]
+    """Events take turns over the seeds; those without room are left out and named, or refused on
+    request."""
+    suite = suite_on_map("reactive", "sumo-fkk-in", 0, None)
+    kinds = [s.events[0].kind for s in suite.scenarios]
+    left_out = [kind for kind in EVENT_KINDS if f"No '{kind}'" in suite.description]
     assert kinds and left_out and sorted([*kinds, *left_out]) == sorted(EVENT_KINDS)
     some = suite_on_map("reactive", "sumo-fkk-in", 5, 3, events=kinds[:2])
     assert [s.events[0].kind for s in some.scenarios] == [kinds[0], kinds[1], kinds[0]]
@@ -194,12 +191,12 @@ def test_reactive_scenarios_are_drawn_where_there_is_room() -> None:
 
 
 @pytest.mark.engine
-def test_a_run_on_a_city_of_ones_own_is_replayed(cosim: Cosim, city: Path) -> None:
-    """`cosim run reactive --map FOLDER` runs, and its replay gives the recorded hash from the run's
+def test_a_run_on_a_users_city_is_replayed(cosim: Cosim, city: Path) -> None:
+    """`cosim run reactive --map FOLDER` runs, and its replay gives the recorded hash from the run
     folder alone."""
     words = ("--map", "seven", "--event", "frontal", "--policy", "schedule:stand", "--out", "run")
-    said = cosim("run", "reactive", *words, cwd=city.parent)
-    assert said.returncode == 0, said.stderr
+    done = cosim("run", "reactive", *words, cwd=city.parent)
+    assert done.returncode == 0, done.stderr
     (episode,) = (p.name for p in (city.parent / "run" / "episodes").iterdir())
     assert episode == "frontal-city-mixed-400m-7-000"
     shutil.move(city, city.parent / "gone")
@@ -223,15 +220,14 @@ assert read_map("shared").strips
 
 @pytest.mark.engine
 def test_two_processes_import_one_name_at_once(tmp_path: Path) -> None:
-    """Each ends well and reads a whole map at any moment; one whole map is left, and no scratch
-    folder."""
+    """Both end well and read a complete map, and one map and no scratch folder is left."""
     (tmp_path / "town.osm").write_text(TOWN)
     before = sorted(p.name for p in maps_folder().glob("*"))
     command = [sys.executable, "-c", IMPORTER, str(tmp_path / "town.osm")]
     both = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     for process in both:
-        _, said = process.communicate(timeout=PATIENCE_S)
-        assert process.returncode == 0, said
+        _, errors = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, errors
     assert sorted(p.name for p in maps_folder().glob("*")) == sorted({*before, "shared"})
     assert about_map("shared").net_hash == read_map("shared").net_hash
 
@@ -239,8 +235,7 @@ def test_two_processes_import_one_name_at_once(tmp_path: Path) -> None:
 def test_a_damaged_map_does_not_hide_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The list shows it as damaged; a name that is unknown is still answered with those that are
-    known."""
+    """The list shows it as damaged, and an unknown name is refused with the known ones."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     (maps_folder() / "broken").mkdir(parents=True)
     (maps_folder() / "broken" / "net.xml").write_text("<net/>")

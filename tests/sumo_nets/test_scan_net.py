@@ -36,21 +36,21 @@ NAME = "flat-street"
 
 
 def reply(tick: int) -> EventReply:
-    """Nobody of an event."""
+    """Return a reply without event pedestrians."""
     return EventReply(episode="test", tick=tick, states=(), actors=())
 
 
 @pytest.fixture(scope="module")
 def street(own_cache: None) -> Iterator[StreetMap]:
-    """The map of the drawn street."""
+    """Store and return the map of the drawn street."""
     findings = store_flat(NAME, street_areas())
     assert any("865 m2 are walkable" in words for words in findings)
     yield read_map(NAME)
 
 
 def test_the_map_has_the_drawn_ground_and_sumo_its_inner_part(street: StreetMap) -> None:
-    """Shares of strips and corners are the drawn ground to the square millimetre; SUMO's lanes and
-    corners are within 5 cm of it, and are most of it."""
+    """Strips and corners together are the drawn ground to the square millimetre, and SUMO's lanes
+    and corners are most of it."""
     drawn = walkable_ground(street_areas(), STREET_GRID)
     assert street.scanned
     assert shapely.symmetric_difference(drawn, street.walkable).area < 1e-6
@@ -67,7 +67,8 @@ def test_the_map_has_the_drawn_ground_and_sumo_its_inner_part(street: StreetMap)
 
 
 def test_places_are_in_their_pieces(street: StreetMap) -> None:
-    """Every strip's middle is located on it, also beside SUMO's lanes; the road is a road."""
+    """The middle of every strip is located on it, also beside SUMO's lanes, and the road is a
+    road."""
     for strip in street.strips.values():
         x, y = shapely.get_coordinates(shapely.point_on_surface(strip.polygon))[0]
         assert street.locate(x, y).edge == strip.id
@@ -77,7 +78,7 @@ def test_places_are_in_their_pieces(street: StreetMap) -> None:
 
 
 def test_a_drawn_crossing_leads_over_the_drawn_road(street: StreetMap) -> None:
-    """It is a crossing of the road's edges, its ends are at the curbs, and it joins both sides."""
+    """It crosses the edges of the road, ends at the curbs, and joins both sides."""
     (crossing,) = (strip for strip in street.strips.values() if strip.kind == "crossing")
     assert sorted(crossing.line[:, 1].tolist()) == pytest.approx([3.0, 10.0], abs=0.05)
     assert crossing.line[:, 0].tolist() == pytest.approx([50.0, 50.0], abs=0.05)
@@ -94,14 +95,16 @@ def test_a_drawn_crossing_leads_over_the_drawn_road(street: StreetMap) -> None:
 
 
 @pytest.mark.parametrize(
-    "there", [None, Georeference(latitude_deg=51.5, longitude_deg=-0.1)], ids=["right", "left"]
+    "georeference",
+    [None, Georeference(latitude_deg=51.5, longitude_deg=-0.1)],
+    ids=["right", "left"],
 )
 def test_traffic_keeps_to_the_side_of_the_country(
-    tmp_path: Path, there: Georeference | None
+    tmp_path: Path, georeference: Georeference | None
 ) -> None:
-    """In London a road's lanes are on the left, and the crossing is there, too."""
-    net = read_net(build_scan_net(street_areas(), STREET_GRID, there, tmp_path).path)
-    assert net.left_hand == (there is not None)
+    """In London the lanes of a road are on the left, and the crossing exists, too."""
+    net = read_net(build_scan_net(street_areas(), STREET_GRID, georeference, tmp_path).path)
+    assert net.left_hand == (georeference is not None)
     east = next(
         lane
         for lane in net.lanes.values()
@@ -112,8 +115,8 @@ def test_traffic_keeps_to_the_side_of_the_country(
 
 
 def test_the_crowd_stays_on_the_drawn_ground(street: StreetMap) -> None:
-    """In a minute with a robot on a sidewalk, SUMO's people are on it to 99.5 % of the time and the
-    displayed ones to 99.9 %, over the crossing too; they come and go at the edge of the scan."""
+    """In a minute, SUMO's people are on it for 99.5 % of the time and the displayed ones for 99.9
+    %, also on the crossing; they enter and leave at the edge of the scan."""
     spec = CrowdSpec(persons=40, radius_m=80.0, vehicles=2)
     ground = shapely.buffer(street.walkable, 1e-6)
     shapely.prepare(ground)
@@ -140,7 +143,7 @@ def test_the_crowd_stays_on_the_drawn_ground(street: StreetMap) -> None:
 
 
 def test_narrow_places_carry_the_robot_but_no_crowd(own_cache: None) -> None:
-    """Nobody of the crowd is in a passage of 1 m; it is reported, and robots may use it."""
+    """No person of the crowd is in a passage of 1 m, which is reported, and robots may use it."""
     box = shapely.box
     areas = [ScanArea("sidewalk", box(0, 0, 40, 3)), ScanArea("sidewalk", box(60, 0, 100, 3))]
     areas.append(ScanArea("sidewalk", box(40, 1, 60, 2)))
@@ -201,7 +204,7 @@ def test_a_crossing_of_a_short_road_is_a_crossing(tmp_path: Path) -> None:
 
 
 def test_a_crossing_that_leads_nowhere_stays_walkable(tmp_path: Path) -> None:
-    """A crossing without a sidewalk at one end is ground to walk on, and the finding says why."""
+    """A crossing without a sidewalk at one end is walkable ground, and the finding says why."""
     box = shapely.box
     areas = [
         ScanArea("sidewalk", box(0, 0, 30, 3)),

@@ -1,4 +1,4 @@
-"""Snapshots of street maps: what was read is what comes back, and nothing depends on them."""
+"""Snapshots of street maps: they restore the map exactly, and results do not depend on them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_snapshot_holds_every_value_of_the_map(net: Path) -> None:
-    """Ids, numbers, lines and polygons come back equal to the bit, in the same order."""
+    """Ids, numbers, lines and polygons are restored equal to the bit, in the same order."""
     read = read_net(net)
     back = map_from_bytes(map_as_bytes(read))
     assert map_as_bytes(back) == map_as_bytes(read)
@@ -55,29 +55,28 @@ def test_a_snapshot_holds_every_value_of_the_map(net: Path) -> None:
 def test_the_second_reading_comes_from_the_snapshot(
     net: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once a snapshot lies there the net itself is not parsed again."""
+    """With a snapshot the net itself is not parsed again."""
     first = street_map_of(net)
     assert len(list(cache.iterdir())) == 1
     monkeypatch.setattr("sumo_nets.net.net_file.read_net", lambda _: pytest.fail("parsed again"))
     assert map_as_bytes(street_map_of(net)) == map_as_bytes(first)
 
 
-def test_a_damaged_snapshot_is_made_anew(net: Path, cache: Path) -> None:
-    """A flipped bit or a cut file costs a reading, not a wrong map."""
-    whole = map_as_bytes(street_map_of(net))
-    (kept,) = cache.iterdir()
-    sound = kept.read_bytes()
-    flipped = bytearray(sound)
-    flipped[len(sound) // 2] ^= 16
-    for bad in (bytes(flipped), sound[:1000], b""):
-        kept.write_bytes(bad)
-        assert map_as_bytes(street_map_of(net)) == whole
-        assert kept.read_bytes() == sound
+def test_a_damaged_snapshot_is_replaced(net: Path, cache: Path) -> None:
+    """A flipped bit or a truncated file costs another parse, and never gives a wrong map."""
+    expected = map_as_bytes(street_map_of(net))
+    (snapshot,) = cache.iterdir()
+    undamaged = snapshot.read_bytes()
+    flipped = bytearray(undamaged)
+    flipped[len(undamaged) // 2] ^= 16
+    for bad in (bytes(flipped), undamaged[:1000], b""):
+        snapshot.write_bytes(bad)
+        assert map_as_bytes(street_map_of(net)) == expected
+        assert snapshot.read_bytes() == undamaged
 
 
 def test_another_net_has_another_snapshot(net: Path, cache: Path, tmp_path: Path) -> None:
-    """The net's bytes are part of a snapshot's name: an edited net is never answered from an old
-    one."""
+    """The name of a snapshot has a hash of the net's bytes, so an edited net is parsed again."""
     street_map_of(net)
     edited = tmp_path / net.name
     edited.write_bytes(net.read_bytes().replace(b'"frontage_m" value="', b'"frontage_m" value="1'))
@@ -86,6 +85,6 @@ def test_another_net_has_another_snapshot(net: Path, cache: Path, tmp_path: Path
 
 
 def test_a_missing_net_is_an_error_that_names_it(tmp_path: Path, cache: Path) -> None:
-    """The reader's own message, not the cache's."""
+    """The message is the reader's own."""
     with pytest.raises(MapError, match="nowhere"):
         street_map_of(tmp_path / "nowhere.net.xml")

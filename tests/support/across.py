@@ -1,11 +1,6 @@
-"""A run across network namespaces, over TLS, while links go down and packets are lost in one
-direction.
-
-    python -m tests.support.across --episodes 60
-
-The coordinator, two workers and a viewer have addresses of their own. The results must be those of
-a quiet run on one machine to the byte: none missing, none twice, none other.
-"""
+"""A run across network namespaces with TLS, while links fail. Usage: python -m tests.support.across
+--episodes 60. The coordinator, two workers and a viewer have separate addresses. The results must
+equal those of an undisturbed run on one machine to the byte."""
 
 from __future__ import annotations
 
@@ -31,7 +26,7 @@ from scenarios.tools.verify.doctor import small_scenario
 from tests.support.namespaces import Network, network
 
 _OUTAGE_S: Final = 6.0
-"""Longer than a session's lease (2 s), so that it is lost, and shorter than a job's."""
+"""Longer than a session's lease (2 s), which expires, and shorter than a job's lease."""
 FAULTS: dict[str, Callable[[Network], None]] = {
     "link of worker one down": lambda net: net.cut("one"),
     "what worker two sends is lost": lambda net: net.lose("two", sent=True),
@@ -62,7 +57,7 @@ with plain_zenoh(sys.argv[1], Path(sys.argv[2]), "viewer") as session:
 
 
 def prepare(folder: Path, net: Network, episodes: int, limit_s: float) -> None:
-    """Certificates, a policy, and a suite of tiny episodes."""
+    """Write certificates, a policy, and a suite of tiny episodes."""
     make_authority(folder / "certs", [net.address("hub")], 365)
     roles: tuple[Role, ...] = ("worker", "viewer")
     for role in roles:
@@ -79,16 +74,16 @@ def prepare(folder: Path, net: Network, episodes: int, limit_s: float) -> None:
 def run_across(
     folder: Path, net: Network, faults: Sequence[str], every: int, tell: Callable[[str], None]
 ) -> int:
-    """Run the suite in a folder by two workers, into the run folder `run`; a fault comes whenever
-    `every` more episodes are finished. Returns the exit code of the coordinator."""
+    """Run the suite in a folder by two workers, into the run folder `run`, with a fault whenever
+    `every` more episodes are finished. Return the exit code of the coordinator."""
     at = _hub(net)
     with ExitStack() as stack:
 
         def start(host: str, *words: str) -> subprocess.Popen[bytes]:
             role = "worker" if "worker" in words else "coordinator"
             words = (sys.executable, "-m", "cosim", *words, "--tls", f"certs/{role}")
-            said = stack.enter_context((folder / f"{host}.log").open("wb"))
-            process = subprocess.Popen(net.on(host, *words), cwd=folder, stdout=said, stderr=said)
+            log = stack.enter_context((folder / f"{host}.log").open("wb"))
+            process = subprocess.Popen(net.on(host, *words), cwd=folder, stdout=log, stderr=log)
             stack.callback(process.wait)
             stack.callback(process.terminate)
             return process
@@ -110,9 +105,9 @@ def run_across(
         return coordinator.wait()
 
 
-def watched(folder: Path, net: Network) -> str:
-    """What a viewer on a host of its own is answered who looks for the run, and tries to have a
-    hand in its jobs."""
+def viewer_output(folder: Path, net: Network) -> str:
+    """Return the output of a viewer on a separate host that looks for the run and queries its
+    jobs."""
     words = net.on("viewer", sys.executable, "-c", _VIEWER, _hub(net), "certs")
     env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     return subprocess.run(
@@ -124,8 +119,8 @@ def _hub(net: Network) -> str:
     return f"tls/{net.address('hub')}:7447"
 
 
-def wrong_with(folder: Path, scenarios: int) -> list[str]:
-    """What is wrong with the run, in words."""
+def faults_of_run(folder: Path, scenarios: int) -> list[str]:
+    """Return the faults of the run, one line each."""
     records = [record.scenario.id for record in read_records(folder / "run")]
     wrong = (
         []
@@ -156,10 +151,10 @@ def _main() -> int:
         def tell(line: str) -> None:
             print(line, flush=True)
             if "coordinator" not in line:
-                print(f"a viewer sees: {watched(folder, net).strip()}", flush=True)
+                print(f"a viewer sees: {viewer_output(folder, net).strip()}", flush=True)
 
         code = run_across(folder, net, list(FAULTS), given.episodes // (len(FAULTS) + 1), tell)
-    wrong = wrong_with(folder, given.episodes)
+    wrong = faults_of_run(folder, given.episodes)
     quiet, across = ((folder / run / "results.csv").read_bytes() for run in ("quiet", "run"))
     wrong += [] if quiet == across else ["results.csv differs from that of a quiet run"]
     ends = "; ".join(wrong) or "as in the quiet run to the byte"

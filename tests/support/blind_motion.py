@@ -1,4 +1,4 @@
-"""Kinematic robots that drive by a schedule, without looking."""
+"""Kinematic robots that drive by a schedule without sensors."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ class Schedule(NamedTuple):
 
 
 def outcome(
-    one: Event, schedule: Schedule, before_m: float, limit_s: float, after_m: float = 13.0
+    planned: Event, schedule: Schedule, before_m: float, limit_s: float, after_m: float = 13.0
 ) -> Outcome:
-    """Drive along the x axis from `before_m` before an event at x = 0 to `after_m` beyond it."""
+    """Drive along the x axis from `before_m` before an event at x = 0 to `after_m` beyond it, and
+    return the result."""
     x_m, y_m, heading, v_mps, w_radps, driven_m = -before_m, 0.0, 0.0, 0.0, 0.0, 0.0
     stops = list(schedule.stops)
     stands_until_s = math.inf
@@ -44,10 +45,10 @@ def outcome(
             robot_heading_rad=heading,
             robot_v_mps=v_mps,
             robot_w_radps=w_radps,
-            route_s_m=one.route_s_m + x_m,
+            route_s_m=planned.route_s_m + x_m,
             robot_length_m=COURIER.length_m,
             robot_width_m=COURIER.width_m,
-            events=(one,),
+            events=(planned,),
             states=states,
         )
         states = react(query).states
@@ -72,7 +73,7 @@ def outcome(
             gaps = box_disk_gap(np.array([Pose(x_m, y_m, heading)]), *HALF_M, at[None])
             if float(gaps.min()) < 0.3:
                 return "hit"
-        if abs(y_m) > one.half_width_m:
+        if abs(y_m) > planned.half_width_m:
             return "out"
         if x_m > after_m:
             return "solved"

@@ -1,4 +1,4 @@
-"""A policy that drives straight on and sees nothing."""
+"""A policy that drives straight ahead without a camera."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ BEND = np.column_stack([0.5 * np.arange(1, 9), [0.0, 0.0, 0.0, 0.1, 0.3, 0.6, 1.
 
 
 class Blind:
-    """1.2 m/s, whatever comes; no camera, so that nothing is drawn for it. From 1 s on it answers
-    BEND for that."""
+    """Drives at 1.2 m/s without a camera, so nothing is drawn. From 1 s on it answers BEND."""
 
     manifest = Manifest(
         "blind", rate_hz=5.0, camera=None, waypoints=WaypointRule(index=2, dt_s=1.25)
     )
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command | Floats:
-        """Straight on."""
+        """Return the command straight ahead, or BEND."""
         return BEND if observation.time_s >= 1.0 else Command(1.2, 0.0)

@@ -1,11 +1,7 @@
-"""Chaos: a run of tiny episodes by several workers, while these and the coordinator are killed,
-stopped and replaced.
-
-    python -m tests.support.chaos --episodes 500 --workers 4 --seeds 5
-
-Its results must be those of a quiet `cosim run` to the byte: none missing, none twice, none other.
-One scenario is poison: it kills whatever process runs it.
-"""
+"""Chaos test: a run of tiny episodes by several workers, while workers and coordinator are killed,
+stopped and replaced. Usage: python -m tests.support.chaos --episodes 500 --workers 4 --seeds 5. The
+results must equal those of an undisturbed `cosim run` to the byte. One scenario kills whatever
+process runs it."""
 
 from __future__ import annotations
 
@@ -52,8 +48,7 @@ _POLL_S: Final = 0.05
 
 
 class Poisoned:
-    """Drives straight on; of the episode that is named in the environment it kills its own
-    process."""
+    """Drives straight ahead; kills its own process in the episode that the environment names."""
 
     manifest = Manifest("poisoned", camera=None)
 
@@ -65,16 +60,16 @@ class Poisoned:
         return Command(0.8, 0.0)
 
 
-class PlannedBlow(NamedTuple):
-    """A fault, and how many episodes are finished when it happens."""
+class PlannedFault(NamedTuple):
+    """A fault, and the number of finished episodes at which it happens."""
 
     finished: int
     fault: Blow
 
 
-class UnderFire(NamedTuple):
-    """What came out: episodes, faults that happened, seconds, and why it did not come to its
-    end, in words."""
+class ChaosResult(NamedTuple):
+    """Result of a chaos run: episodes, faults that happened, seconds, and why it did not end, in
+    words."""
 
     episodes: int
     faults: Counter[str]
@@ -82,19 +77,19 @@ class UnderFire(NamedTuple):
     wrong: list[str]
 
 
-def planned_blows(episodes: int, seed: int) -> list[PlannedBlow]:
-    """Random faults, one for about ten episodes, and two of environment processes."""
+def planned_faults(episodes: int, seed: int) -> list[PlannedFault]:
+    """Return random faults, one for about ten episodes, and two of environment processes."""
     draw = random.Random(seed)
     faults: list[Blow] = [draw.choice(_BLOWS) for _ in range(max(episodes // 10, 4))]
     planned = [
-        PlannedBlow(draw.randrange(1, max(int(0.95 * episodes), 2)), fault) for fault in faults
+        PlannedFault(draw.randrange(1, max(int(0.95 * episodes), 2)), fault) for fault in faults
     ]
-    apart = [PlannedBlow(share * episodes // 3, "kill process") for share in (1, 2)]
+    apart = [PlannedFault(share * episodes // 3, "kill process") for share in (1, 2)]
     return sorted([*planned, *apart])
 
 
 def tiny_suite(folder: Path, episodes: int) -> None:
-    """Write the suite of all runs in `folder`, and what its poison is called before the policy."""
+    """Write the suite of all runs in `folder`, and the episode name of its poison."""
     one = small_scenario()
     suite = Suite(
         name="chaos",
@@ -109,8 +104,8 @@ def tiny_suite(folder: Path, episodes: int) -> None:
     (folder / "poison").write_text(poison)
 
 
-def quiet(folder: Path, jobs: int) -> Path:
-    """The run that chaos is held against, of the suite in `folder`. Returns its run folder."""
+def undisturbed(folder: Path, jobs: int) -> Path:
+    """Run the suite in `folder` without faults, and return the run folder."""
     done = subprocess.run(
         _command(folder, "run", "quiet", "--jobs", str(jobs)),
         env=_env(folder),
@@ -129,29 +124,27 @@ def chaos(
     folder: Path,
     name: str,
     workers: int,
-    planned: Sequence[PlannedBlow],
+    planned: Sequence[PlannedFault],
     seed: int,
     *,
     replaced: bool = True,
-) -> UnderFire:
-    """Run the suite in `folder` by `workers` workers and with faults, into the run folder `name`
-    there.
-
-    replaced: who is gone is replaced by another worker."""
+) -> ChaosResult:
+    """Run the suite in `folder` by `workers` workers and with faults, into the run folder `name`.
+    replaced: whether ended workers are replaced."""
     run = folder / name
     began_s = time.monotonic()
     happened = Counter[str]()
     draw = random.Random(seed)
     left = list(planned)
-    with _crew(folder, name, workers, replaced) as crew:
+    with _processes(folder, name, workers, replaced) as crew:
         while (code := crew.coordinator.poll()) is None or code not in (0, 1):
             if code is not None:
-                said = (folder / f"{name}.log").read_text(errors="replace")[-1000:]
-                return UnderFire(
+                log = (folder / f"{name}.log").read_text(errors="replace")[-1000:]
+                return ChaosResult(
                     0,
                     happened,
                     time.monotonic() - began_s,
-                    [f"coordinator: exit code {code}: {said}"],
+                    [f"coordinator: exit code {code}: {log}"],
                 )
             crew.tend()
             finished = len(list(run.glob("episodes/*/record.json")))
@@ -160,10 +153,10 @@ def chaos(
                 if crew.suffer(fault, draw):
                     happened[left.pop(0).fault] += 1
             time.sleep(_POLL_S)
-    return UnderFire(len(read_records(run)), happened, time.monotonic() - began_s, [])
+    return ChaosResult(len(read_records(run)), happened, time.monotonic() - began_s, [])
 
 
-class _Crew:
+class _Processes:
     """The processes of a run."""
 
     def __init__(self, folder: Path, name: str, workers: int, replaced: bool) -> None:
@@ -176,16 +169,18 @@ class _Crew:
         self.workers = [self._work() for _ in range(workers)]
 
     def tend(self) -> None:
-        """Wake who was stopped for long enough, and replace workers that are gone."""
+        """Continue workers that were stopped for long enough, and replace ended ones."""
         for at, (until_s, one) in reversed(list(enumerate(self._stopped))):
             if time.monotonic() > until_s:
                 one.send_signal(signal.SIGCONT)
                 del self._stopped[at]
-        there = [one for one in self.workers if one.poll() is None]
-        self.workers = there + [self._work() for _ in self.workers[len(there) :] if self._replaced]
+        running = [one for one in self.workers if one.poll() is None]
+        self.workers = running + [
+            self._work() for _ in self.workers[len(running) :] if self._replaced
+        ]
 
     def suffer(self, fault: Blow, draw: random.Random) -> bool:
-        """Let something happen to somebody. Returns whether it could."""
+        """Apply a fault, and return whether it was possible."""
         one = draw.choice(self.workers)
         if fault == "kill worker":
             one.kill()
@@ -195,7 +190,7 @@ class _Crew:
             one.send_signal(signal.SIGSTOP)
             self._stopped.append((time.monotonic() + draw.uniform(*_STOPPED_S), one))
         elif fault == "kill process":
-            return any(_kill_below(one.pid) for one in self.workers)
+            return any(_kill_environment_process(one.pid) for one in self.workers)
         else:
             self.coordinator.kill()
             self.coordinator.wait()
@@ -227,8 +222,8 @@ class _Crew:
 
 
 @contextmanager
-def _crew(folder: Path, name: str, workers: int, replaced: bool) -> Iterator[_Crew]:
-    crew = _Crew(folder, name, workers, replaced)
+def _processes(folder: Path, name: str, workers: int, replaced: bool) -> Iterator[_Processes]:
+    crew = _Processes(folder, name, workers, replaced)
     try:
         yield crew
     finally:
@@ -254,9 +249,9 @@ def _env(folder: Path) -> dict[str, str]:
     return os.environ | {_POISON: (folder / "poison").read_text()}
 
 
-def _kill_below(pid: int) -> bool:
-    """Kill an environment process of a worker: the child of its shepherd. False where there is
-    none now."""
+def _kill_environment_process(pid: int) -> bool:
+    """Kill an environment process of a worker, the child of its shepherd. Return False if there is
+    none."""
     for shepherd in _children(pid):
         for process in _children(shepherd):
             with suppress(ProcessLookupError):
@@ -274,7 +269,7 @@ def _children(pid: int) -> list[int]:
 
 
 def differences(reference: Path, run: Path) -> list[str]:
-    """What is wrong with a run, held against a quiet one, in words."""
+    """Return the differences of a run from an undisturbed one, in words."""
     wrong = []
     quiet_csv, csv = ((one / "results.csv").read_bytes() for one in (reference, run))
     if quiet_csv != csv:
@@ -303,12 +298,12 @@ def _main() -> int:
     folder.mkdir(parents=True, exist_ok=True)
     began_s = time.monotonic()
     tiny_suite(folder, given.episodes)
-    reference = quiet(folder, given.workers)
+    reference = undisturbed(folder, given.workers)
     print(f"quiet run: {time.monotonic() - began_s:.0f} s", flush=True)
     wrong = 0
     for seed in range(given.first, given.first + given.seeds):
         found = chaos(
-            folder, f"chaos-{seed}", given.workers, planned_blows(given.episodes, seed), seed
+            folder, f"chaos-{seed}", given.workers, planned_faults(given.episodes, seed), seed
         )
         faulty = found.wrong or differences(reference, folder / f"chaos-{seed}")
         wrong += bool(faulty)

@@ -1,5 +1,4 @@
-"""Policies that try to score by other means than driving well: what no rule may reward. Policies
-only."""
+"""Policies that try to score without driving well, which no rule may reward."""
 
 from __future__ import annotations
 
@@ -30,14 +29,14 @@ class Crawl:
         self._command = Command(v_mps, 0.0)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command:
         return self._command
 
 
 class Stander(Crawl):
-    """Drives straight ahead for a while and then stands for good."""
+    """Drives straight ahead for a while and then stands forever."""
 
     def __init__(self, v_mps: float = 1.0, after_s: float = 2.0) -> None:
         super().__init__(v_mps)
@@ -49,7 +48,7 @@ class Stander(Crawl):
 
 
 class StopAndGo(Crawl):
-    """Drives for a while, stands for a while, and so on."""
+    """Drives and stands in turns."""
 
     def __init__(self, v_mps: float = 1.2, goes_s: float = 1.2, stands_s: float = 1.2) -> None:
         super().__init__(v_mps)
@@ -63,9 +62,7 @@ class StopAndGo(Crawl):
 
 class EdgeDriver(Crawl):
     """Turns aside first, to one side (left is 1), by about v w t^2 metres, and then drives along
-    there.
-
-    It skids less as it turns than as it turns back, which takes two answers more."""
+    there. It skids less as it turns than as it turns back, which takes two answers more."""
 
     ASIDE_M = 0.8
     TURN_RADPS = 0.5
@@ -83,7 +80,7 @@ class EdgeDriver(Crawl):
 
 
 class Spinner(Crawl):
-    """Turns on the spot as fast as it can, and so looks at nobody for long."""
+    """Turns in place at full rate, and so looks at no person for long."""
 
     def __init__(self) -> None:
         super().__init__(0.0)
@@ -100,8 +97,7 @@ class WallHugger(EdgeDriver):
 
 
 class EarlyLeaver(Crawl):
-    """Looks at what the simulator knows, and wherever people come near leaves the sidewalk rather
-    than meet them."""
+    """Uses privileged state, and leaves the sidewalk wherever people come near."""
 
     def __init__(self) -> None:
         super().__init__(1.0)
@@ -112,7 +108,7 @@ class EarlyLeaver(Crawl):
 
 
 class Quitter(EarlyLeaver):
-    """The same, and ends its process before it would fail."""
+    """Uses privileged state, and ends its process before it would fail."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -134,7 +130,7 @@ def _person_within(observation: Observation, far_m: float) -> bool:
 
 
 def _crawls_at(v_mps: float) -> type[Crawl]:
-    """A crawl that can be made by its name alone, as by `cosim run --policy
+    """Return a crawl that can be made by its name alone, as by `cosim run --policy
     tests.support.cheats:Crawl04`."""
 
     class CrawlHere(Crawl):
@@ -155,17 +151,16 @@ CHEATS: Mapping[str, Callable[[], Crawl]] = {
     "EarlyLeaver": EarlyLeaver,
     "Quitter": Quitter,
 }
-"""By the names that `tests.support.cheats` has them."""
+"""By their names in `tests.support.cheats`."""
 
 _SHORT_M = 2.0
-"""So far before an event's people the name reader stands."""
+"""Distance at which the name reader stands before an event's people."""
 _PACE_MPS = 1.0
 
 
 class NameReader:
-    """Blind. Looks up in the shipped suites what it is told that its episode is called, also as
-    runs of small seeds would call it, and does what is right there: it stands before a stopping
-    hand."""
+    """A blind policy that looks up its episode's name in the shipped suites, also under names of
+    runs with small seeds, and stands before a stopping hand."""
 
     manifest = Manifest("name-reader", camera=None)
 
@@ -182,7 +177,8 @@ class NameReader:
 
 
 class Counter(NameReader):
-    """The same by counting: its first episode is the first one of the event."""
+    """A blind policy that counts its episodes, and takes the first for the first one of the
+    event."""
 
     manifest = Manifest("counter", camera=None)
 
@@ -194,12 +190,12 @@ class Counter(NameReader):
 
 
 class FarEye:
-    """Sees by a camera 6 m before it and 18 m above the ground, which no robot carries."""
+    """Has a camera 6 m ahead and 18 m above the ground, which no robot carries."""
 
     manifest = Manifest("far-eye", camera=CameraSpec(64, 64, mount=Mount((6.0, 0.0, 18.0), 80.0)))
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command:
         return Command(_PACE_MPS, 0.0)
@@ -207,7 +203,7 @@ class FarEye:
 
 @cache
 def _names() -> dict[str, Scenario]:
-    """All that a shipped scenario may be told to be, as can be known before the run."""
+    """Return the scenarios by all names that can be known before a run."""
     found: dict[str, Scenario] = {}
     for scenario in _shipped():
         found[scenario.id] = scenario

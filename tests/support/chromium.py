@@ -1,4 +1,4 @@
-"""A headless Chromium to look at pages with: the DevTools protocol over a pipe, no driver and no
+"""A headless Chromium for tests of pages, by the DevTools protocol over a pipe, without driver and
 socket."""
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _FLAGS = (
 
 
 class Page:
-    """One tab. wrong: what went to the console as an error, and exceptions that nobody caught;
-    asked: addresses that the page wanted to load, but for itself and what is in it."""
+    """One tab. wrong: console errors and uncaught exceptions; asked: addresses that the page
+    requested, except itself and embedded data."""
 
     def __init__(self, read: int, write: int) -> None:
         self._read = read
@@ -56,20 +56,20 @@ class Page:
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """One command of the protocol, and its answer."""
+        """Call a command of the protocol, and return its answer."""
         number = next(self._numbers)
         message = {"id": number, "method": method, "params": parameters}
         if self._session:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
         while True:
-            told = self._next()
-            if told.get("id") == number:
-                assert "error" not in told, (method, told)
-                return dict(told["result"])
+            message_in = self._next()
+            if message_in.get("id") == number:
+                assert "error" not in message_in, (method, message_in)
+                return dict(message_in["result"])
 
     def size(self, width: int, height: int, *, phone: bool = False) -> None:
-        """So large is the window from now on."""
+        """Set the size of the window."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -79,13 +79,13 @@ class Page:
         )
 
     def open(self, path: Path) -> None:
-        """A file from disk, until its script is through."""
+        """Open a file from disk, and wait until its script has ended."""
         self.call("Page.navigate", url="about:blank")
         self.call("Page.navigate", url=path.resolve().as_uri())
         self.until("document.documentElement?.dataset.ready === 'true'")
 
     def js(self, expression: str) -> Any:
-        """The value of an expression in the page; a promise is waited for."""
+        """Return the value of an expression in the page, after waiting for a promise."""
         came = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
@@ -114,7 +114,7 @@ class Page:
             )
 
     def shot(self, path: Path, *, whole: bool = False) -> None:
-        """A picture of what is in the window, or of all of the page."""
+        """Write a picture of the window, or of the whole page."""
         data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)[
             "data"
         ]
@@ -126,9 +126,9 @@ class Page:
             assert more, "Chromium has ended"
             self._rest += more
         line, self._rest = self._rest.split(b"\0", 1)
-        told: dict[str, Any] = json.loads(line)
-        about = told.get("params", {})
-        match told.get("method"):
+        message: dict[str, Any] = json.loads(line)
+        about = message.get("params", {})
+        match message.get("method"):
             case "Runtime.exceptionThrown":
                 self.wrong.append(str(about["exceptionDetails"]))
             case "Runtime.consoleAPICalled" if about["type"] in ("error", "assert"):
@@ -139,19 +139,20 @@ class Page:
                 ("data:", "blob:", "file:")
             ):
                 self.asked.append(about["request"]["url"])
-        return told
+        return message
 
 
 @contextmanager
 def chromium() -> Iterator[Page]:
-    """A browser with one page; it is gone afterwards."""
+    """Start a browser with one page, and end it afterwards."""
     assert CHROMIUM is not None
     inward, ours_out = os.pipe()
     ours_in, outward = os.pipe()
     with tempfile.TemporaryDirectory(prefix="chromium-") as folder:
 
         def wire() -> None:
-            """To 3 and 4, by numbers that nothing has: either may be one of the two."""
+            """Connect the pipe to 3 and 4, by unused numbers, as either end may be one of the
+            two."""
             ends = [fcntl.fcntl(one, fcntl.F_DUPFD, 10) for one in (inward, outward)]
             os.dup2(ends[0], 3)
             os.dup2(ends[1], 4)

@@ -1,9 +1,6 @@
-"""Measures a run's coordinator: its cost per episode, and how many workers it serves.
-
-Coordinator, transport and run folder are real; the workers make up their results.
-
-    python -m tests.support.coordinating --workers 200 --jobs 100000
-"""
+"""Measures a run's coordinator: its cost per episode, and how many workers it serves. Coordinator,
+transport and run folder are real; the workers fabricate their results. Usage: python -m
+tests.support.coordinating --workers 200 --jobs 100000"""
 
 from __future__ import annotations
 
@@ -50,27 +47,27 @@ from scenarios.runs.zenoh_transport import workers_of_run
 _MODULE: Final = "tests.support.coordinating"
 _POLICY: Final = f"{_MODULE}:Unseeing"
 _LOG_BYTES: Final = 30_000
-"""Of the log of a short episode."""
+"""Size of the log of a short episode."""
 _WORKERS: Final = 200
 _JOBS: Final = 3000
 
 
 class Unseeing:
-    """A policy that is never asked."""
+    """A policy that is never queried."""
 
     manifest = Manifest("unseeing", camera=None)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: object) -> Command:
         return STILL
 
 
 class Served(NamedTuple):
-    """What a run of made-up results took. wall_s, cpu_s: of the coordinator from the first job on;
-    memory_mb: at most; round_s: median from a result that is ready to the next job, for one of the
-    workers."""
+    """Cost of a run with fabricated results. wall_s, cpu_s: of the coordinator from the first job
+    on; memory_mb: maximum; round_s: median from a result that is ready to the next job, for one of
+    the workers."""
 
     jobs: int
     wall_s: float
@@ -79,8 +76,8 @@ class Served(NamedTuple):
     round_s: float
 
 
-def serve_made_up(workers: int, jobs: int) -> Served:
-    """Coordinate so many jobs of so many workers, which are all in one process beside this one."""
+def serve_fabricated(workers: int, jobs: int) -> Served:
+    """Coordinate a number of jobs of a number of workers, which are all in one other process."""
     one = Scenario(
         id="j",
         suite="load",
@@ -100,27 +97,30 @@ def serve_made_up(workers: int, jobs: int) -> Served:
         endpoint = f"unixsock-stream/{folder}/hub.sock"
         command = [sys.executable, "-m", _MODULE, "--load", endpoint, "--workers", str(workers)]
         with (
-            RunFolder.create(Path(folder) / "run", spec, suite) as held,
+            RunFolder.create(Path(folder) / "run", spec, suite) as run_folder,
             open_session(Connection(role="coordinator", listen=endpoint)) as session,
             workers_of_run(
-                session, LockedRun(held, hello, scenarios, scenarios), lambda _: None, resumed=False
-            ) as of,
+                session,
+                LockedRun(run_folder, hello, scenarios, scenarios),
+                lambda _: None,
+                resumed=False,
+            ) as transport_and_handle,
         ):
             load = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-            transport, handle = of
+            transport, handle = transport_and_handle
             while not transport.room(0):
                 transport.wait(1.0)
             began_s, cpu_s = time.monotonic(), time.process_time()
-            run_all(held, scenarios, hello, transport, handle=handle, options=options)
+            run_all(run_folder, scenarios, hello, transport, handle=handle, options=options)
             took_s, cpu_s = time.monotonic() - began_s, time.process_time() - cpu_s
-        said, _ = load.communicate()
+        output, _ = load.communicate()
     if load.returncode:
         raise EngineError(f"the made-up workers ended with exit code {load.returncode}")
     memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-    return Served(jobs, took_s, cpu_s, memory_mb, float(said))
+    return Served(jobs, took_s, cpu_s, memory_mb, float(output))
 
 
-class _MadeUp:
+class _FabricatingWorker:
     """A worker that has every result at once."""
 
     def __init__(
@@ -128,7 +128,7 @@ class _MadeUp:
         session: Session,
         run: str,
         number: int,
-        replies: queue.SimpleQueue[tuple[_MadeUp, bytes]],
+        replies: queue.SimpleQueue[tuple[_FabricatingWorker, bytes]],
     ) -> None:
         self._session = session
         self._run = run
@@ -145,7 +145,7 @@ class _MadeUp:
         self._say("claim", self._claim)
 
     def take(self, payload: bytes | None) -> bool:
-        """A reply. Returns whether the run is over."""
+        """Handle a reply, and return whether the run is over."""
         if payload is None:
             time.sleep(0.001)
             self._say(*self._said)
@@ -185,18 +185,20 @@ class _MadeUp:
 
 
 def _load(endpoint: str, workers: int) -> None:
-    """So many made-up workers, until the run is over."""
-    replies: queue.SimpleQueue[tuple[_MadeUp, bytes]] = queue.SimpleQueue()
+    """Run a number of fabricating workers until the run is over."""
+    replies: queue.SimpleQueue[tuple[_FabricatingWorker, bytes]] = queue.SimpleQueue()
     with open_session(Connection(role="worker", connect=endpoint)) as session:
         while not (runs := session.query_all(keys.EVERY_RUN, timeout_s=5.0)):
             time.sleep(0.05)
         run = next(iter(runs)).split("/")[1]
-        there = [_MadeUp(session, run, number, replies) for number in range(workers)]
+        fabricating = [
+            _FabricatingWorker(session, run, number, replies) for number in range(workers)
+        ]
         over = 0
         while over < workers:
             one, payload = replies.get()
             over += one.take(payload)
-    rounds_s = sorted(took for one in there for took in one.rounds_s)
+    rounds_s = sorted(took for one in fabricating for took in one.rounds_s)
     print(rounds_s[len(rounds_s) // 2] if rounds_s else 0.0)
 
 
@@ -209,7 +211,7 @@ def _main() -> None:
     if given.load:
         _load(given.load, given.workers)
         return
-    found = serve_made_up(given.workers, given.jobs)
+    found = serve_fabricated(given.workers, given.jobs)
     print(
         f"{found.jobs} jobs by {given.workers} workers: {found.jobs / found.wall_s:.0f} a second, "
         f"{1000.0 * found.cpu_s / found.jobs:.2f} ms CPU each, {found.memory_mb:.0f} MB, "

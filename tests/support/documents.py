@@ -1,4 +1,4 @@
-"""README and docs/ as tests read them: pages, code blocks, and the commands in them."""
+"""README and docs/ as tests read them: pages, code blocks, and their commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PAGES = {path.relative_to(ROOT).as_posix(): path for path in _PATHS}
 
 
 class Block(NamedTuple):
-    """A fenced block of a page. line: of its first line, counted from 1."""
+    """A fenced block of a page. line: number of its first line, from 1."""
 
     page: str
     line: int
@@ -23,17 +23,17 @@ class Block(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For the ids of tests."""
+        """Return a name for the ids of tests."""
         return f"{Path(self.page).stem}-{self.line}"
 
 
 def text_of(page: str) -> str:
-    """The text of a page, such as "docs/trust.md"."""
+    """Return the text of a page, such as "docs/trust.md"."""
     return PAGES[page].read_text()
 
 
 def blocks(language: str, page: str | None = None) -> list[Block]:
-    """The fenced blocks of a language, of all pages or of one."""
+    """Return the fenced blocks of a language, of all pages or of one."""
     found: list[Block] = []
     for name in PAGES if page is None else (page,):
         text = text_of(name)
@@ -47,8 +47,8 @@ def blocks(language: str, page: str | None = None) -> list[Block]:
 
 
 def shell_lines(page: str | None = None) -> list[tuple[str, list[str]]]:
-    """(page and line, words) of every command in bash blocks, without comments and settings of
-    variables before it."""
+    """Return (page and line, words) of every command in bash blocks, without comments and leading
+    variable assignments."""
     found = []
     for block in blocks("bash", page):
         line = block.line

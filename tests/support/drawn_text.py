@@ -1,4 +1,4 @@
-"""Texts of matplotlib figures that are cut off or cover another."""
+"""Texts of matplotlib figures that are cut off or overlap."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from matplotlib.text import Text
 
 _SLACK_PX = 1.0
-"""Boxes of letters are so much larger than their ink."""
+"""Margin by which boxes of letters are larger than their ink."""
 
 
 def clipped_texts(monkeypatch: pytest.MonkeyPatch, draw: Callable[[], object]) -> list[str]:
-    """Draw a figure; return each text that is not whole within it, and each pair of which one
-    covers the other."""
+    """Draw a figure; return each text that is not completely within it, and each pair of
+    overlapping texts."""
     from matplotlib.backends.backend_agg import RendererAgg
     from matplotlib.figure import Figure
     from matplotlib.text import Text

@@ -1,5 +1,4 @@
-"""Run folders as runs leave them, of episodes on a straight way that are told here and driven by
-nobody."""
+"""Run folders of made-up episodes on a straight way, without driving."""
 
 from __future__ import annotations
 
@@ -27,11 +26,11 @@ from tests.run_specs import record_of, spec_of
 
 SPEED_MPS = 1.0
 HIT = "hit"
-"""Of an episode: it ends half-way, by a collision with a wall."""
+"""Kind of episode that ends half-way by a collision with a wall."""
 
 
 def short_way(name: str, **fields: object) -> Scenario:
-    """9 m straight on, over at the first failure or after 12 s."""
+    """Return 9 m straight ahead, over at the first failure or after 12 s."""
     known: dict[str, object] = {
         "id": name,
         "suite": "s",
@@ -50,8 +49,8 @@ def short_way(name: str, **fields: object) -> Scenario:
 def driven(
     scenario: Scenario, speeds_mps: Sequence[float], resets: dict[int, float] | None = None
 ) -> Log:
-    """The log of a robot on the x axis that drives so fast, tick by tick; resets: tick -> arc
-    length it is put at."""
+    """Return the log of a robot on the x axis with these speeds, tick by tick; resets: tick -> arc
+    length of the reset."""
     tick_s = Clock().tick_s
     count = len(speeds_mps)
     x_m = before_m = 0.0
@@ -84,7 +83,7 @@ def driven(
 
 
 def failure_at(log: Log, tick: int, kind: str = "collision") -> Failure:
-    """What a log says of a failure at a tick."""
+    """Return the log's data of a failure at a tick."""
     x_m, y_m, _ = log.pose[tick].tolist()
     speed_mps = (
         abs(float(log.speed[tick - 1, 0])) if tick and np.isnan(log.reset_s_m[tick - 1]) else 0.0
@@ -96,12 +95,12 @@ def failure_at(log: Log, tick: int, kind: str = "collision") -> Failure:
 def episode_of(
     scenario: Scenario, suite_hash: str, how: str = "goal", policy: str = "p"
 ) -> tuple[Record, Log | None]:
-    """The record and log of a short way. how: "goal"; HIT; "crashed"; "invalid"."""
+    """Return the record and log of a short way. how: "goal"; HIT; "crashed"; "invalid"."""
     record = record_of(scenario, Manifest(policy, camera=None), suite_hash=suite_hash)
     if how in ("crashed", "invalid"):
         return msgspec.structs.replace(record, status=how, reason="it said so"), None
-    whole = driven(scenario, [SPEED_MPS] * 161)
-    ticks = int(np.argmax(whole.pose[:, 0] >= 8.0)) + 1 if how == "goal" else 80
+    complete_log = driven(scenario, [SPEED_MPS] * 161)
+    ticks = int(np.argmax(complete_log.pose[:, 0] >= 8.0)) + 1 if how == "goal" else 80
     log = driven(scenario, [SPEED_MPS] * ticks)
     failures = (failure_at(log, ticks - 1),) if how == HIT else ()
     ended = "goal" if how == "goal" else "failure"
@@ -128,7 +127,7 @@ def episode_of(
 
 
 def with_decoys(*ways: Scenario) -> tuple[Scenario, ...]:
-    """Scenarios, each followed by its decoy."""
+    """Return scenarios, each followed by its decoy."""
     return tuple(
         one
         for way in ways
@@ -148,8 +147,8 @@ def run_of(
     weather: str = "",
     gait: str = "",
 ) -> Path:
-    """A finished run of one short way after the other, each as `episode_of` says; s-000, s-001 and
-    so on. robot, weather: applied to the scenarios, as by `--robot`; gait: as by `--gait`"""
+    """Write a finished run of short ways, each as `episode_of` makes it, with ids s-000, s-001 and
+    so on. robot, weather: applied to the scenarios, as by `--robot`; gait: as by `--gait`."""
     ways = tuple(scenarios) or tuple(short_way(f"s-{i:03d}") for i in range(len(hows)))
     suite = Suite(name=ways[0].suite, version="1", scenarios=ways)
     of_run = with_weather(with_robot(suite, robot), weather)

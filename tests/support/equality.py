@@ -1,12 +1,7 @@
-"""Equality: thirty scenarios, run by each mechanism, give the same results.csv to the byte.
-
-They are of `unit`, `reactive` and `long-horizon`.
-
-    python -m tests.support.equality [FOLDER]
-
-By one process, by four, in three shards that are merged, by Ray, and by a coordinator with three
-workers that are killed in turn. Prints the hash of each table; exit code 1 if one differs.
-"""
+"""Equality test: thirty scenarios of `unit`, `reactive` and `long-horizon`, run by each mechanism,
+give the same results.csv to the byte. Usage: python -m tests.support.equality [FOLDER]. The
+mechanisms are one process, four, three merged shards, Ray, and a coordinator whose three workers
+are killed in turn. Prints the hash of each table; exit code 1 if one differs."""
 
 from __future__ import annotations
 
@@ -28,7 +23,7 @@ from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.suites.catalog import load_suite
 
 _EACH: Final = {"unit": 4, "reactive": 2, "long-horizon": 2}
-"""Number of scenarios of each structure or event of a suite, the shortest first."""
+"""Number of scenarios of each structure or event of a suite; the shortest are taken."""
 _SEED: Final = 7
 _SHARDS = 3
 _WORKERS = 3
@@ -36,8 +31,8 @@ _KILLS = 5
 _LIMIT_S: Final = 3600.0
 
 
-def thirty() -> Suite:
-    """Thirty scenarios without decoys, as a suite."""
+def thirty_scenarios() -> Suite:
+    """Return a suite of thirty scenarios without decoys."""
     found: list[Scenario] = []
     for name, count in _EACH.items():
         suite = load_suite(name).scenarios
@@ -51,13 +46,13 @@ def thirty() -> Suite:
     return Suite(name="thirty", version="1", scenarios=chosen)
 
 
-def _kind(one: Scenario) -> str:
-    of = {"long-horizon": one.suite, "unit": one.structure}
-    return of.get(one.suite, one.id.rpartition("-")[0])
+def _kind(scenario: Scenario) -> str:
+    of = {"long-horizon": scenario.suite, "unit": scenario.structure}
+    return of.get(scenario.suite, scenario.id.rpartition("-")[0])
 
 
-def _kind_and_length(one: Scenario) -> tuple[str, float]:
-    return _kind(one), one.route_line.length_m
+def _kind_and_length(scenario: Scenario) -> tuple[str, float]:
+    return _kind(scenario), scenario.route_line.length_m
 
 
 def _cosim(*words: str) -> subprocess.Popen[bytes]:
@@ -73,8 +68,8 @@ def _done(process: subprocess.Popen[bytes]) -> None:
         raise SystemExit(f"{' '.join(map(str, process.args))}: exit code {code}")  # type: ignore[arg-type]
 
 
-class _Ways:
-    """Each runs the suite into a folder of its own, and returns it."""
+class _Mechanisms:
+    """Each method runs the suite by one mechanism into a separate folder, and returns it."""
 
     def __init__(self, suite: Path, folder: Path) -> None:
         self._folder = folder
@@ -103,7 +98,9 @@ class _Ways:
         coordinator = _cosim("coordinator", *self._words, "--out", str(out), "--listen", at)
         workers = [_cosim("worker", "--connect", at, "--once") for _ in range(_WORKERS)]
         kills = _at_each(
-            _KILLS, lambda: len([*out.glob("episodes/*/record.json")]), len(thirty().scenarios)
+            _KILLS,
+            lambda: len([*out.glob("episodes/*/record.json")]),
+            len(thirty_scenarios().scenarios),
         )
         try:
             while coordinator.poll() is None:
@@ -125,12 +122,11 @@ class _Ways:
         return out
 
 
-def _at_each(times: int, done: Callable[[], int], of: int) -> Iterator[int | None]:
-    """Asked again and again, says a number from 0 on, spread over the run, when it has come so
-    far; else None."""
+def _at_each(times: int, done: Callable[[], int], total: int) -> Iterator[int | None]:
+    """Yield numbers from 0 on, spread over the run, as it reaches each share; else None."""
     number = 0
     while True:
-        if number < times and done() > (number + 0.5) * of / times:
+        if number < times and done() > (number + 0.5) * total / times:
             yield number
             number += 1
         else:
@@ -138,27 +134,27 @@ def _at_each(times: int, done: Callable[[], int], of: int) -> Iterator[int | Non
 
 
 def main_of(arguments: Sequence[str]) -> int:
-    """Run all ways and print what came out."""
+    """Run all mechanisms and print the results."""
     with tempfile.TemporaryDirectory(prefix="cosim-equality-") as name:
         folder = Path(arguments[0]).absolute() if arguments else Path(name)
         folder.mkdir(parents=True, exist_ok=True)
-        suite = thirty()
+        suite = thirty_scenarios()
         write_suite(suite, folder / "thirty.json")
         print(f"{len(suite.scenarios)} scenarios", flush=True)
         hashes = []
-        ways = _Ways(folder / "thirty.json", folder)
-        for way in (
-            ways.one_process,
-            ways.four_processes,
-            ways.shards_merged,
-            ways.ray,
-            ways.workers_killed,
+        mechanisms = _Mechanisms(folder / "thirty.json", folder)
+        for mechanism in (
+            mechanisms.one_process,
+            mechanisms.four_processes,
+            mechanisms.shards_merged,
+            mechanisms.ray,
+            mechanisms.workers_killed,
         ):
             began_s = time.monotonic()
-            table = (way() / "results.csv").read_bytes()
+            table = (mechanism() / "results.csv").read_bytes()
             hashes.append(hashlib.sha256(table).hexdigest())
             rows = table.count(b"\n") - 1
-            name = way.__name__.replace("_", " ")
+            name = mechanism.__name__.replace("_", " ")
             print(
                 f"{hashes[-1][:16]}  {name}, {rows} rows, {time.monotonic() - began_s:.0f} s",
                 flush=True,

@@ -38,7 +38,7 @@ def event_way(
     time_s: float = 45.0,
     ends_at: str = "goal",
 ) -> Scenario:
-    """Build a scenario that ends on a failure and whose event is `at_m` along its way."""
+    """Return a scenario that ends on a failure and whose event is `at_m` along its way."""
     text = _WAY.format(kind=kind, at_m=at_m, length_m=length_m, time_s=time_s, ends_at=ends_at)
     with TemporaryDirectory() as folder:
         path = Path(folder, "way.toml")

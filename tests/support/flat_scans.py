@@ -1,4 +1,4 @@
-"""Flat scans and drawn areas, small enough to be told by hand."""
+"""Flat scans and drawn areas, small enough to check by hand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sumo_nets.maps.scan_net import build_scan_net
 def flat_grid(
     x0: float, y0: float, x1: float, y1: float, step_m: float = 0.25, height_m: float = 0.0
 ) -> HeightGrid:
-    """Level ground, all of it measured and free."""
+    """Return level ground, all of it measured and free."""
     shape = (round((y1 - y0) / step_m) + 1, round((x1 - x0) / step_m) + 1)
     return HeightGrid(
         np.array([x0, y0]),
@@ -32,7 +32,8 @@ STREET_GRID = flat_grid(-5.0, -5.0, 105.0, 65.0)
 
 
 def street_areas() -> list[ScanArea]:
-    """A street of 100 m with sidewalks of 3 and 4 m, a crossing, an obstacle, and a side path."""
+    """Return a street of 100 m with sidewalks of 3 and 4 m, a crossing, an obstacle, and a side
+    path."""
     box = shapely.box
     return [
         ScanArea("sidewalk", box(0.0, 0.0, 100.0, 3.0)),
@@ -45,7 +46,7 @@ def street_areas() -> list[ScanArea]:
 
 
 def store_flat(name: str, areas: list[ScanArea], grid: HeightGrid = STREET_GRID) -> tuple[str, ...]:
-    """Store a flat scan as a map, without a mesh. Returns the findings of its net."""
+    """Store a flat scan as a map, without a mesh, and return the findings of its net."""
     findings: list[str] = []
 
     def fill(ready: Path) -> About:

@@ -1,4 +1,4 @@
-"""The published networks of `follow` and `cosim bench realism`, where they are at hand."""
+"""The published networks of `follow` and `cosim bench realism`, if they are available."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WEIGHTS = Path(os.environ.get("COSIM_WEIGHTS") or Path(__file__).parents[3] / "s
 
 
 def make_weights(folder: Path, *more: NetworkFile) -> Path:
-    """Fill a folder with the graphs of `follow` and more; the test is skipped without them."""
+    """Fill a folder with the graphs of `follow` and more; skip the test without them."""
     linked = (YOLOX_NANO, *more)
     if missing := [
         one.name for one in (ESPNET_WEIGHTS, *linked) if not (WEIGHTS / one.name).is_file()

@@ -39,11 +39,11 @@ MANIFEST: dict[str, Any] = {
     "joints": JOINTS,
     "observation": OBSERVATION,
 }
-"""Of a dog that hardly moves its joints."""
+"""Manifest of a gait of the dog with small movements."""
 
 
 def layers_graph(seed: int = 0, sizes: tuple[int, ...] = (45, 16, 12), scale: float = 0.1) -> bytes:
-    """Layers with ELU between them."""
+    """Return a graph of random layers with ELU between them."""
     rng = np.random.default_rng(seed)
     return graph_of_layers(
         [
@@ -57,7 +57,7 @@ def layers_graph(seed: int = 0, sizes: tuple[int, ...] = (45, 16, 12), scale: fl
 
 
 def graph_of_layers(layers: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> bytes:
-    """Layers of weights (outputs, inputs) and biases, with ELU between them."""
+    """Return a graph of layers with weights (outputs, inputs) and biases, with ELU between them."""
     nodes, weights, name = [], {}, "obs"
     for k, (weight, bias) in enumerate(layers):
         last = k == len(layers) - 1
@@ -73,7 +73,8 @@ def graph_of_layers(layers: Sequence[tuple[NDArray[np.float32], NDArray[np.float
 
 
 def robot_lab_gait(folder: Path, published: Path) -> Path:
-    """The published network of a Go2 as a gait of the dog, with the manifest of the documents."""
+    """Write the published network of a Go2 as a gait of the dog, with the manifest of the
+    documents."""
     arrays = read_torch_file((published / "policy.pt").read_bytes())
     graph = graph_of_layers(
         [(arrays[f"actor.{k}.weight"], arrays[f"actor.{k}.bias"]) for k in (0, 2, 4, 6)]
@@ -86,7 +87,7 @@ def robot_lab_gait(folder: Path, published: Path) -> Path:
 
 
 def written_gait(folder: Path, graph: bytes | None = None, **changes: Any) -> Path:
-    """The graph's file, with its manifest beside it."""
+    """Write a graph with its manifest beside it, and return the graph's path."""
     path = folder / "tiny.onnx"
     path.write_bytes(layers_graph() if graph is None else graph)
     path.with_suffix(".json").write_text(json.dumps(MANIFEST | changes))

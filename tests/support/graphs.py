@@ -21,11 +21,11 @@ MANIFEST: Mapping[str, Any] = {
     "inputs": {"obs": PICTURE, "goal": POINT},
     "output": {"what": "waypoints", "name": "action", "index": 2},
 }
-"""Of the graph `tiny_graph`."""
+"""Manifest of the graph `tiny_graph`."""
 
 
 def port(name: str, *shape: int | str, kind: int = TensorProto.FLOAT) -> ValueInfoProto:
-    """An input or an output; a text for an axis of any length."""
+    """Return an input or an output; a text stands for an axis of any length."""
     return helper.make_tensor_value_info(name, kind, shape)
 
 
@@ -36,7 +36,7 @@ def graph_bytes(
     weights: Mapping[str, np.ndarray[Any, Any]] | None = None,
     opset: int = 17,
 ) -> bytes:
-    """The file of a graph."""
+    """Return the bytes of a graph file."""
     tensors = [numpy_helper.from_array(array, name) for name, array in (weights or {}).items()]
     graph = helper.make_graph(list(nodes), "graph", list(inputs), list(outputs), tensors)
     domains = {"": opset} | {node.domain: 1 for node in nodes if node.domain}
@@ -47,8 +47,8 @@ def graph_bytes(
 
 
 def tiny_graph(**weights: np.ndarray[Any, Any]) -> bytes:
-    """Two frames (b, 6, 4, 8) and a point (b, 2) become five waypoints (b, 5, 2): the point, a
-    fifth of the way each, and `bright` of all pixels."""
+    """Return a graph that makes five waypoints (b, 5, 2) of two frames (b, 6, 4, 8) and a point (b,
+    2): the point, a fifth of the way each, and `bright` of all pixels."""
     share = np.outer(np.arange(1, 6) / 5, [1, 1]).astype(np.float32)
     held = {
         "bright": np.full((6 * 4 * 8, 1), 1e-3, np.float32),
@@ -70,7 +70,7 @@ def tiny_graph(**weights: np.ndarray[Any, Any]) -> bytes:
 
 
 def echo(*shape: int | str, kind: int = TensorProto.FLOAT, out: str = "action") -> bytes:
-    """A graph whose output is its input `obs`."""
+    """Return a graph whose output is its input `obs`."""
     return graph_bytes(
         [helper.make_node("Identity", ["obs"], [out])],
         [port("obs", *shape, kind=kind)],
@@ -81,7 +81,7 @@ def echo(*shape: int | str, kind: int = TensorProto.FLOAT, out: str = "action") 
 def bundle(
     folder: Path, graph: bytes, manifest: Mapping[str, Any] = MANIFEST, **fields: Any
 ) -> Path:
-    """A bundle's folder; fields: in place of those of the manifest."""
+    """Write a bundle's folder; fields: values that replace those of the manifest."""
     folder.mkdir(exist_ok=True)
     (folder / "model.onnx").write_bytes(graph)
     (folder / "manifest.json").write_text(json.dumps({**manifest, **fields}))
@@ -89,7 +89,7 @@ def bundle(
 
 
 def external(folder: Path) -> Path:
-    """A bundle whose weights lie in a file of their own."""
+    """Write a bundle whose weights are in a separate file."""
     bundle(folder, tiny_graph())
     model = onnx.load(folder / "model.onnx")
     onnx.save(

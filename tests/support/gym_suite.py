@@ -1,9 +1,7 @@
-"""Short ways in one small city, and eight environments of them in processes of their own.
-
-`python -m tests.support.gym_suite killed` prints the ids of its processes and waits to be killed;
-`told` prints which error came out of one environment of several, `alike` which of them differ from
-those that are driven one by one here.
-"""
+"""Short ways in one small city, and environments of them in separate processes. `python -m
+tests.support.gym_suite killed` prints the ids of its processes and waits to be killed; `error`
+prints the error of one environment of several; `differences` prints which of them differ from
+single ones."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ COUNT = 4
 
 
 def short_ways(**more: Any) -> Suite:
-    """Six straight ways of 12 m on sidewalks, 2 s each. more: fields of all of them."""
+    """Return six straight ways of 12 m on sidewalks, 2 s each. more: fields of all of them."""
     strips = [
         s for s in place(CITY)[1].strips.values() if s.kind == "sidewalk" and s.length_m > 25.0
     ][:6]
@@ -54,7 +52,7 @@ def _way(k: int, line: Polyline, more: dict[str, Any]) -> Scenario:
 
 
 def one_env() -> SidewalkEnv:
-    """An environment of these ways for a learner without a camera."""
+    """Return an environment of these ways for a learner without a camera."""
     return cosim.make_env(short_ways(), BLIND)
 
 
@@ -62,40 +60,40 @@ def _speeds(k: int) -> np.ndarray:
     return np.float32([[0.5 + 0.2 * i, 0.02 * (k % 5)] for i in range(COUNT)])
 
 
-def _alike(envs: AsyncVectorEnv) -> list[int]:
-    """Which of the environments see, or are given, anything else than one that is driven here with
-    the same seed."""
+def _differences(envs: AsyncVectorEnv) -> list[int]:
+    """Return the numbers of environments that differ from one that is driven here with the same
+    seed."""
     seen, _ = envs.reset(seed=5)
-    told = [seen, *(envs.step(_speeds(k)) for k in range(8))]
+    vectorized = [seen, *(envs.step(_speeds(k)) for k in range(8))]
     differ = []
     with one_env() as env:
         for i in range(COUNT):
             seen, _ = env.reset(seed=5 + i)
-            same = all((told[0][name][i] == seen[name]).all() for name in seen)
+            same = all((vectorized[0][name][i] == seen[name]).all() for name in seen)
             for k in range(8):
                 seen, reward, terminated, truncated, _ = env.step(_speeds(k)[i])
-                there = told[k + 1]
-                same &= all((there[0][name][i] == seen[name]).all() for name in seen)
-                same &= (there[1][i], there[2][i], there[3][i]) == (reward, terminated, truncated)
+                step = vectorized[k + 1]
+                same &= all((step[0][name][i] == seen[name]).all() for name in seen)
+                same &= (step[1][i], step[2][i], step[3][i]) == (reward, terminated, truncated)
             differ += [] if same and truncated else [i]
     return differ
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    asked = sys.argv[1]
-    count = COUNT if sys.argv[1] == "alike" else 2
+    mode = sys.argv[1]
+    count = COUNT if mode == "differences" else 2
     multiprocessing.set_forkserver_preload(
         ["tests.support.gym_suite", "scenarios.episodes.episode"]
     )
     envs = AsyncVectorEnv([partial(one_env)] * count, context="forkserver")
     try:
-        if asked == "alike":
-            print(_alike(envs))
+        if mode == "differences":
+            print(_differences(envs))
         else:
             envs.reset(seed=1)
             print(*(process.pid for process in envs.processes), flush=True)
-            if asked == "killed":
+            if mode == "killed":
                 sys.stdin.read()
             envs.step(np.float32([[1.0, 0.0], [np.nan, 0.0]]))
     except cosim.CosimError as error:

@@ -1,8 +1,6 @@
-"""Hostile policies: one behaviour for each episode, with its expected outcome in each hosting.
-
-A test copies this file to a folder of its own. `names.json` there maps the names of a run's episodes
-to behaviours. In the simulator's process, each attempt is noted in `began.txt` outside.
-"""
+"""Hostile policies: one behaviour for each episode, with its expected outcome in each hosting. A
+test copies this file to a separate folder, whose `names.json` maps the names of a run's episodes to
+behaviours. In the simulator's process, each attempt is noted in `began.txt` outside."""
 
 from __future__ import annotations
 
@@ -36,7 +34,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest, WaypointRule
 
 ANSWER_S = 4.0
-"""Timeout of answers and of ticks in the runs of those that hang."""
+"""Timeout of answers and of ticks in runs of hanging behaviours."""
 START_S = 12.0
 """Timeout of loading and of reset in the runs of those that hang: a slow machine loads a policy in it."""
 FLOOD_BYTES = 16 << 20
@@ -53,7 +51,7 @@ class Honest:
     )
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, seen: Observation) -> Command:
         assert seen.rgb is not None and seen.rgb.shape == (40, 64, 3) and seen.camera is not None
@@ -61,15 +59,15 @@ class Honest:
 
 
 class Hanging(Honest):
-    """Is never made."""
+    """A policy whose construction never ends."""
 
     def __init__(self) -> None:
         time.sleep(3600)
 
 
 class Hostile(Honest):
-    """Does in its second answer, or in another call, what its episode is named for. It drives
-    without a camera, so that its processes start fast."""
+    """Does what its episode is named for in its second answer or in another call. It drives without
+    a camera, so that its processes start fast."""
 
     manifest = Manifest("honest", rate_hz=4.0, camera=None, odometry="wheel")
 
@@ -107,7 +105,7 @@ class Hostile(Honest):
 
 
 class SeeingHostile(Hostile):
-    """The same with a camera."""
+    """A hostile policy with a camera."""
 
     manifest = Honest.manifest
 
@@ -116,7 +114,7 @@ class SeeingHostile(Hostile):
 
 
 class Leaves(Honest):
-    """Leaves processes behind that outlive it, and hangs."""
+    """Starts processes that outlive it, and hangs."""
 
     def act(self, seen: Observation) -> Command:
         _leave_processes()
@@ -136,21 +134,21 @@ class Endless:
 
 
 class Unprintable(Exception):
-    """An error without words."""
+    """An error that cannot be converted to text."""
 
     def __str__(self) -> str:
         raise ValueError("no words")
 
 
 class HostileArray:
-    """Is no array when it is asked for one."""
+    """Raises an error when it is converted to an array."""
 
     def __array__(self, *_: object, **__: object) -> Any:
         raise SystemExit("no array")
 
 
 class HostileFloat(float):
-    """Is no number, cannot be compared and cannot be shown."""
+    """Is no number, and cannot be compared or printed."""
 
     def __float__(self) -> float:
         raise KeyboardInterrupt
@@ -184,7 +182,7 @@ def _recurses(self: Hostile, seen: Any) -> Any:
 
 
 def _soon(does: Callable[[], object], after_s: float = 0.01) -> None:
-    """Do something a moment later, in another thread."""
+    """Call a function a moment later, in another thread."""
     threading.Timer(after_s, does).start()
 
 
@@ -199,7 +197,7 @@ def _leave_processes() -> None:
 
 
 def _patches_the_referee(self: Hostile, seen: Any) -> None:
-    """Win, until the episode has ended: what is patched stays for the next one."""
+    """Win until the episode has ended; the patch would stay for the next episode."""
     from cosim.results.referee import Referee, Verdict
 
     judge = Referee.judge
@@ -239,7 +237,7 @@ def _empties_sys_modules(self: Hostile, seen: Any) -> None:
 
 
 def _peeks(self: Hostile, seen: Any) -> None:
-    """Find the engines in this process and what there is of the street; then query SUMO."""
+    """Find the engines and the street in this process; then query SUMO."""
     found = [name for name in ENGINES if name in sys.modules]
     known = [
         one for one in gc.get_objects() if type(one).__name__ in ("Street", "People", "Scenario")
@@ -312,7 +310,7 @@ def _limit_memory(more: int) -> None:
 
 
 def _takes_all_memory(self: Hostile, seen: Any) -> None:
-    """Leave no memory to this process, and answer."""
+    """Use all memory of this process, and answer."""
     _limit_memory(32 << 20)
     for size in (1 << 20, 1 << 16, 1 << 10, 64):
         with suppress(MemoryError):
@@ -380,7 +378,7 @@ def _writes_garbage(self: Hostile, seen: Any) -> None:
 
 
 def _overwrites_shared_memory(self: Hostile, seen: Any) -> None:
-    """Write to every memory file that is open here."""
+    """Write to every memory file that is open in this process."""
     for descriptor in range(3, 64):
         with suppress(OSError, ValueError):
             if "memfd" in Path(f"/proc/self/fd/{descriptor}").readlink().name:
@@ -394,7 +392,7 @@ def _closes_its_output(self: Hostile, seen: Any) -> None:
 
 
 def _freezes_later(self: Hostile, seen: Any) -> None:
-    """Hold the interpreter's lock once the answer is given."""
+    """Hold the interpreter's lock after the answer."""
     main = threading.main_thread().ident or 0
 
     def freeze() -> None:
@@ -417,7 +415,7 @@ def _interrupts_later(self: Hostile, seen: Any) -> None:
 
 
 def _stops_later(self: Hostile, seen: Any) -> None:
-    """Stop this process from a child, again and again."""
+    """Stop this process from a child, repeatedly."""
     parent = os.getpid()
     if os.fork() == 0:
         for _ in range(20):
@@ -454,7 +452,7 @@ def _dies_and_leaves_processes(self: Hostile, seen: Any) -> None:
 
 
 def _sends(number: signal.Signals, process_of: Callable[[], int]) -> Callable[[Hostile, Any], None]:
-    """Send a signal to a process, and wait for what comes of it. A sandbox may deny it."""
+    """Send a signal to a process, and wait for its effect. A sandbox may deny it."""
 
     def send(self: Hostile, seen: Any) -> None:
         with suppress(PermissionError):
@@ -472,14 +470,14 @@ def _slower(self: Hostile, seen: Any) -> None:
     time.sleep(0.02 * self.count)
 
 
-def _calls(what: Callable[[], object]) -> Callable[[Hostile, Any], Any]:
-    return lambda self, seen: what()
+def _calls(function: Callable[[], object]) -> Callable[[Hostile, Any], Any]:
+    return lambda self, seen: function()
 
 
 DONE = "done"
-"""The episode is to the bit that of `honest`."""
+"""The episode equals that of `honest` to the bit."""
 FORGED = "forged"
-"""Not preventable in the simulator's process: the record is what the policy has made of it. Only
+"""Not preventable in the simulator's process: the policy forges its record. Only
 `--isolated` prevents it (docs/hosting.md)."""
 BLAMED = "the policy is at fault, because the simulator survives its commands without it"
 

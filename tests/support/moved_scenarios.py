@@ -17,10 +17,8 @@ Move = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def moved_scenario(scenario: Scenario, name: str, street_map: StreetMap, move: Move) -> Scenario:
-    """The same scenario on the map `name`, whose net is `street_map`.
-
-    move: points (N, 2) of the scenario's map to points of the other one; a rotation and a shift.
-    """
+    """Return the same scenario on the map `name`, whose net is `street_map`. move: points (N, 2) of
+    the scenario's map to points of the other one; a rotation and a shift."""
     (x0, y0), (x1, y1) = move(np.array([[0.0, 0.0], [1.0, 0.0]]))
     turn = float(np.arctan2(y1 - y0, x1 - x0))
     route = tuple((float(x), float(y)) for x, y in move(np.array(scenario.route)))

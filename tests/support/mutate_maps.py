@@ -1,5 +1,4 @@
-"""Damaged maps, drawn from a seed: what disks, editors, converters and hostile people make of a map
-file."""
+"""Damaged maps, drawn from a seed: typical damage by disks, editors, converters and attackers."""
 
 from __future__ import annotations
 
@@ -72,7 +71,7 @@ def absurd_values(data: bytes, draw: random.Random) -> bytes:
 
 
 def every_value_absurd(data: bytes, draw: random.Random) -> bytes:
-    """All of one attribute."""
+    """Set all values of one attribute to absurd ones."""
     name = draw.choice(sorted({place[1] for place in ATTRIBUTE.finditer(data)}))
     value = draw.choice(ABSURD).encode()
     return re.sub(rb" " + name + rb'="[^"]*"', b" " + name + b'="' + value + b'"', data)
@@ -245,8 +244,8 @@ DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
 
 
 def damaged(data: bytes, number: int) -> tuple[str, bytes]:
-    """The damage of this number and what is left of a map: the kinds take turns, the rest is drawn
-    from the number."""
+    """Return the kind of damage of this number and the damaged map: kinds take turns, and the rest
+    is drawn from the number."""
     draw = random.Random(number)
     damage = DAMAGES[number % len(DAMAGES)]
     return damage.__name__, damage(data, draw)
@@ -265,7 +264,7 @@ def _changed(
     value: Callable[[bytes, bytes], bytes],
     names: tuple[bytes, ...] = (),
 ) -> bytes:
-    """A few attributes, of these names or of any, with other values."""
+    """Give a few attributes, of these names or of any, other values."""
     places = [place for place in ATTRIBUTE.finditer(data) if not names or place[1] in names]
     for place in sorted(
         draw.sample(places, min(len(places), draw.randint(1, 8))), key=lambda p: -p.start()

@@ -1,10 +1,6 @@
-"""Suite files as an enemy writes them: a sound one, changed in one to four places, from a seed.
-
-    python -m tests.support.mutate_suites --drive 200
-
-goes on until so many were accepted and driven for two simulated seconds each, and prints what
-became of all.
-"""
+"""Malicious suite files: a valid file, changed in one to four places, from a seed. Usage: python -m
+tests.support.mutate_suites --drive 200. It continues until so many files were accepted and driven
+for two simulated seconds each, and prints the outcomes."""
 
 from __future__ import annotations
 
@@ -77,7 +73,7 @@ NUMBERS: Final = (
     50_000,
     2**32 - 1,
 )
-"""What no field may be, and the ends of the ranges of those that there are."""
+"""Invalid numbers, and the ends of the valid ranges of fields."""
 WORDS: Final = (
     "",
     "../../x",
@@ -120,10 +116,10 @@ JUNK: Final = (
 )
 
 
-def mutated(whole: Tree, seed: int) -> bytes:
-    """The file of a suite, changed; the same for the same seed."""
+def mutated(suite: Tree, seed: int) -> bytes:
+    """Return the file of a suite with changes; the same for the same seed."""
     rng = Random(seed)
-    tree = copy.deepcopy(whole)
+    tree = copy.deepcopy(suite)
     tree = {
         **tree,
         "scenarios": rng.sample(tree["scenarios"], k=rng.randint(1, len(tree["scenarios"]))),
@@ -205,7 +201,7 @@ def _swap(holder: Any, key: Any, rng: Random) -> None:
 
 
 def _bytes_changed(data: bytes, rng: Random) -> bytes:
-    """A file that is damaged as bytes are."""
+    """Return a file with damage at the level of bytes."""
     at, to = sorted(rng.randrange(len(data)) for _ in range(2))
     deep = rng.choice((b"[", b'{"a":', b'{"scenarios":[')) * 100_000
     noise = rng.randbytes(rng.randint(1, 40))
@@ -235,63 +231,62 @@ def _bytes_changed(data: bytes, rng: Random) -> bytes:
 
 
 class Ahead:
-    """Drives straight ahead without looking."""
+    """Drives straight ahead without a camera."""
 
     manifest = Manifest("ahead", camera=None)
 
     def reset(self, scenario_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command:
         return Command(1.2, 0.0)
 
 
-class Fate(NamedTuple):
-    """What became of a file. words: of the refusal, or why the episode crashed."""
+class Outcome(NamedTuple):
+    """Outcome of a file. words: of the refusal, or why the episode crashed."""
 
     seed: int
     what: Literal["refused", "does not fit its place", "driven", "crashed", "raw error"]
     words: str = ""
 
 
-def fates(whole: Tree, folder: Path, seeds: Iterator[int]) -> Iterator[Fate]:
-    """What becomes of each file: if it is accepted, the first scenario that is another than before
-    is driven."""
+def outcomes(suite_tree: Tree, folder: Path, seeds: Iterator[int]) -> Iterator[Outcome]:
+    """Yield the outcome of each file; of an accepted one the first changed scenario is driven."""
     from scenarios.suites.fits import check_places
 
-    sound = msgspec.convert(whole, Suite).scenarios
+    unchanged = msgspec.convert(suite_tree, Suite).scenarios
     path = folder / "mutated.json"
     for seed in seeds:
-        path.write_bytes(mutated(whole, seed))
+        path.write_bytes(mutated(suite_tree, seed))
         try:
             suite = read_suite(path, EVENT_KINDS)
         except SpecError as error:
-            yield Fate(seed, "refused", str(error))
+            yield Outcome(seed, "refused", str(error))
             continue
         try:
             check_places(suite, suite.scenarios)
         except SpecError as error:
-            yield Fate(seed, "does not fit its place", str(error))
+            yield Outcome(seed, "does not fit its place", str(error))
             continue
         yield _driven(
-            next((s for s in suite.scenarios if s not in sound), suite.scenarios[0]), seed
+            next((s for s in suite.scenarios if s not in unchanged), suite.scenarios[0]), seed
         )
 
 
-def _driven(scenario: Scenario, seed: int) -> Fate:
+def _driven(scenario: Scenario, seed: int) -> Outcome:
     from scenarios.episodes.run_episode import run_episode
 
     outcome = run_episode(msgspec.structs.replace(scenario, time_limit_s=DRIVEN_S), Ahead())
     record = outcome.record
     if record.status != "crashed":
-        return Fate(seed, "driven", record.state_hash)
+        return Outcome(seed, "driven", record.state_hash)
     raw = record.reason.partition(":")[0].isidentifier()
-    return Fate(seed, "raw error" if raw else "crashed", f"{record.reason}\n{outcome.traceback}")
+    return Outcome(seed, "raw error" if raw else "crashed", f"{record.reason}\n{outcome.traceback}")
 
 
 def small_suite(city: City) -> Tree:
-    """The file of a suite in a small city: a long way, and short ones with people who talk, queue,
-    cross, stop it."""
+    """Return the file of a suite in a small city: a long way, and short ones with people who talk,
+    cross and stop the robot."""
     from cosim.place.walk_graph import WalkGraph
     from scenarios.places.nets import place
     from scenarios.suites import long_horizon, reactive
@@ -299,27 +294,27 @@ def small_suite(city: City) -> Tree:
     _, street_map = place(city)
     graph = WalkGraph(street_map)
     kinds = ("conversing", "ped_crossing", "gesturing")
-    whole = [long_horizon.build_long_horizon(city, street_map, graph, 1, "long")]
-    whole += [
+    drawn = [long_horizon.build_long_horizon(city, street_map, graph, 1, "long")]
+    drawn += [
         reactive.build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
         for kind in kinds
     ]
     few = CrowdSpec(persons=6, radius_m=40.0, vehicles=2)
-    scenarios = [msgspec.structs.replace(s, crowd=few) for s in whole]
+    scenarios = [msgspec.structs.replace(s, crowd=few) for s in drawn]
     return json.loads(
         msgspec.json.encode(Suite(name="small", version="1", scenarios=tuple(scenarios)))
     )  # type: ignore[no-any-return]
 
 
 def main() -> None:
-    """Drive as many accepted ones as asked for. Exit code 1 if any crashed."""
+    """Drive the requested number of accepted files. Exit code 1 if any crashed."""
     parser = argparse.ArgumentParser(prog="python -m tests.support.mutate_suites")
     parser.add_argument("--drive", type=int, default=200, help="how many accepted ones are driven")
     parser.add_argument("--from-seed", type=int, default=0)
     asked = parser.parse_args()
     seen: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for fate in fates(
+        for fate in outcomes(
             small_suite(City(seed=1, size_m=500.0)), Path(folder), count(asked.from_seed)
         ):
             seen[fate.what] += 1

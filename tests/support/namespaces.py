@@ -1,5 +1,5 @@
-"""Several machines on one: network namespaces with addresses of their own round a router, whose
-links can be cut."""
+"""Several machines on one: network namespaces with separate addresses around a router, whose links
+can be cut."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 _NOBODY = "02:00:00:00:00:99"
-"""An address of no network card: what is sent there arrives nowhere, and nobody is told."""
+"""An address of no network card: packets to it are lost silently."""
 
 
 class NotPermitted(Exception):
-    """This machine has no network namespaces, or does not let us make any."""
+    """This machine has no network namespaces, or does not permit them."""
 
 
 class Network:
-    """Hosts by name, each a namespace that has a link to the router's."""
+    """Hosts by name, each a namespace with a link to the router's."""
 
     def __init__(self, hosts: Sequence[str]) -> None:
         self._hosts = list(hosts)
         self._router = f"cosim{os.getpid()}-router"
 
     def on(self, host: str, *words: str) -> list[str]:
-        """The command that runs a command on a host."""
+        """Return the command that runs a command on a host."""
         return ["ip", "netns", "exec", self._space(host), *words]
 
     def address(self, host: str) -> str:
         return f"10.77.{self._hosts.index(host)}.2"
 
     def cut(self, host: str) -> None:
-        """Take a host's link down: both ends see it."""
+        """Take a host's link down, which both ends notice."""
         _ip("-n", self._router, "link", "set", self._link(host), "down")
 
     def lose(self, host: str, *, sent: bool) -> None:
-        """Lose, in silence, all that a host sends, or all that is sent to it."""
+        """Drop silently all packets that a host sends, or all that are sent to it."""
         if sent:
             _ip(
                 "-n",
@@ -64,7 +64,7 @@ class Network:
             )
 
     def mend(self, host: str) -> None:
-        """Undo what was done to a host's link."""
+        """Restore a host's link."""
         _ip("-n", self._router, "link", "set", self._link(host), "up")
         for space, neighbour, link in (
             (self._space(host), self._gate(host), "eth0"),
@@ -86,7 +86,7 @@ class Network:
             _ip("-n", space, "neigh", "del", neighbour, "dev", link)
 
     def build(self) -> None:
-        """Raises CalledProcessError where this machine does not let one."""
+        """Make the namespaces. Raises CalledProcessError where this machine does not permit one."""
         _ip("netns", "add", self._router)
         subprocess.run(
             [
@@ -139,7 +139,8 @@ class Network:
 
 @contextmanager
 def network(*hosts: str) -> Iterator[Network]:
-    """Hosts that reach each other by `Network.address`. Raises NotPermitted, with the reason."""
+    """Yield hosts that reach each other by `Network.address`. Raises NotPermitted, with the
+    reason."""
     if shutil.which("ip") is None:
         raise NotPermitted("network namespaces need `ip`: on Debian, apt-get install iproute2")
     built = Network(hosts)
@@ -147,8 +148,8 @@ def network(*hosts: str) -> Iterator[Network]:
         try:
             built.build()
         except subprocess.CalledProcessError as error:
-            said = (error.stderr or b"").decode().strip()
-            raise NotPermitted(f"no network namespaces here: {said}") from error
+            errors = (error.stderr or b"").decode().strip()
+            raise NotPermitted(f"no network namespaces here: {errors}") from error
         yield built
     finally:
         built.remove()

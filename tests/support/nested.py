@@ -13,7 +13,7 @@ FLOOD = b"flood\n" * 1_000_000
 
 
 def starts_another(pipe: int, _call: int) -> None:
-    """Wait until the other has flooded its output, send the own process id, and wait."""
+    """Wait until the other worker has flooded its output, send this process's id, and wait."""
     inner = ChildProcess(None, "tests.support.nested:floods", "policy")
     inner.wire.receive()
     MessageSocket(socket(fileno=pipe)).send(str(os.getpid()).encode())

@@ -1,4 +1,4 @@
-"""How alike two pictures of one view are."""
+"""Agreement of two pictures of one view."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from cosim.core.state import Frame
 
 
 def off_edges(*labels: np.ndarray) -> np.ndarray:
-    """Where no label changes within 2 pixels, in any of the pictures."""
+    """Return where no label changes within 2 pixels, in any of the pictures."""
     window = np.ones((5, 5), dtype=np.uint8)
     return np.logical_and.reduce([cv2.dilate(a, window) == cv2.erode(a, window) for a in labels])
 
 
-def agreement(one: Frame, other: Frame) -> tuple[float, float]:
-    """Share of the pixels off edges whose labels agree, and the median difference of depths in
-    metres."""
+def agreement(first: Frame, second: Frame) -> tuple[float, float]:
+    """Return the share of the pixels off edges whose labels agree, and the median difference of
+    depths in metres."""
     assert (
-        one.labels is not None
-        and other.labels is not None
-        and one.depth is not None
-        and other.depth is not None
+        first.labels is not None
+        and second.labels is not None
+        and first.depth is not None
+        and second.depth is not None
     )
-    clear = off_edges(one.labels, other.labels)
-    near = clear & (one.depth < 100.0) & (other.depth < 100.0)
-    alike = (one.labels == other.labels)[clear].mean()
-    return float(alike), float(np.median(np.abs(one.depth - other.depth)[near]))
+    clear = off_edges(first.labels, second.labels)
+    near = clear & (first.depth < 100.0) & (second.depth < 100.0)
+    label_share = (first.labels == second.labels)[clear].mean()
+    return float(label_share), float(np.median(np.abs(first.depth - second.depth)[near]))

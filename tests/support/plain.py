@@ -1,4 +1,4 @@
-"""Zenoh as a stranger uses it, with none of our code."""
+"""Zenoh without any code of this project, as another program uses it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def free_port() -> int:
 def plain_zenoh(
     endpoint: str, certs: Path | None, role: str, wait_ms: int = 60_000
 ) -> Iterator[zenoh.Session]:
-    """A client with a role's certificate if there is one. Raises ZError where no link comes."""
+    """Open a client, with a role's certificate if there is one. Raises ZError without a link."""
     settings: dict[str, Any] = {
         "mode": "client",
         "connect/endpoints": [endpoint],

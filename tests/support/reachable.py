@@ -1,4 +1,4 @@
-"""Everything that can be reached from a value, and what of it a policy must not have."""
+"""Everything that can be reached from a value, and parts of it that a policy must not have."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ _PRIVILEGED = (
 
 
 def reached(root: object) -> Iterator[object]:
-    """Attributes, slots, items, keys, closures, defaults, weak references, what arrays are views
-    of; each once. Not what every program has: types, modules, and the globals of functions."""
+    """Yield attributes, slots, items, keys, closures, defaults, weak references and viewed arrays,
+    each once. Types, modules and globals of functions are left out."""
     found = {id(root): root}
     coming = [root]
     while coming:
@@ -69,7 +69,7 @@ def reached(root: object) -> Iterator[object]:
 
 
 def leaks(root: object, scenario: Scenario, now: Moment) -> list[str]:
-    """What can be reached from a value and only the simulator knows: values of its types, names,
+    """Return reachable values that only the simulator knows: values of its types, names, and
     numbers of a map."""
     names = {
         scenario.id,

@@ -1,8 +1,6 @@
-"""A policy that tries to leave its sandbox, and prints what came of each attempt.
-
-The test copies this file to a folder of its own, beside `neighbour.py`, `beside.txt` and
-`targets.json`, which names what it tries to reach.
-"""
+"""A policy that tries to leave its sandbox, and prints the result of each attempt. The test copies
+this file to a separate folder, beside `neighbour.py`, `beside.txt` and `targets.json`, which names
+the targets."""
 
 from __future__ import annotations
 
@@ -33,7 +31,7 @@ _COLUMN = seccomp.MACHINES[os.uname().machine][0]
 
 
 class Probe:
-    """Tries everything when it is reset."""
+    """Makes all attempts when it is reset."""
 
     manifest = Manifest("probe", rate_hz=4.0)
 
@@ -46,7 +44,7 @@ class Probe:
 
 
 class Lost(Probe):
-    """Reads a file that it is not given."""
+    """Reads a file that it is not permitted to read."""
 
     def __init__(self) -> None:
         Path(json.loads((HERE / "targets.json").read_text())["outside"]).read_text()
@@ -111,8 +109,8 @@ def _kills(process: int, number: int) -> str:
 
 
 def _vm_reads(process: int) -> str:
-    there = ctypes.create_string_buffer(struct.pack("PN", 0x400000, 8))
-    return called("process_vm_readv", process, ctypes.addressof(there), 1, 1, 1)
+    remote = ctypes.create_string_buffer(struct.pack("PN", 0x400000, 8))
+    return called("process_vm_readv", process, ctypes.addressof(remote), 1, 1, 1)
 
 
 def _descriptors(_: object) -> list[str]:

@@ -37,7 +37,7 @@ class Street:
         )
 
     def moved(self, matrix: NDArray[Any]) -> Street:
-        """The street after a 3 x 3 or 4 x 4 matrix."""
+        """Return the street after a 3 x 3 or 4 x 4 matrix."""
         found = self.vertices @ matrix[:3, :3].T
         if matrix.shape == (4, 4):
             found = found + matrix[:3, 3]
@@ -76,7 +76,7 @@ def street() -> Street:
 def _sheet(
     corner: tuple[float, ...], u: tuple[float, ...], v: tuple[float, ...], step_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A rectangle, counter-clockwise as seen from u x v."""
+    """Return a rectangle, counter-clockwise as seen from u x v."""
     n, m = (max(1, round(np.linalg.norm(side) / step_m)) for side in (u, v))
     i, j = np.meshgrid(np.arange(n + 1), np.arange(m + 1), indexing="ij")
     vertices = np.array(corner, float) + np.outer(i / n, u) + np.outer(j / m, v)
@@ -86,7 +86,7 @@ def _sheet(
 
 
 def splats_of(place: Street, count: int = 12_000, seed: int = 0) -> Cloud:
-    """Flat splats on the surfaces of a street, opacity 0.9."""
+    """Return flat splats on the surfaces of a street, with opacity 0.9."""
     random = np.random.default_rng(seed)
     mesh = place.mesh()
     ends = np.cumsum(mesh.area_faces)
@@ -110,7 +110,7 @@ def splats_of(place: Street, count: int = 12_000, seed: int = 0) -> Cloud:
 
 
 def glb(place: Street) -> bytes:
-    """As glTF: y up."""
+    """Return a street as glTF, y up."""
     y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], float)
     written: bytes = place.moved(y_up).mesh().export(file_type="glb")
     return written
@@ -119,7 +119,7 @@ def glb(place: Street) -> bytes:
 def gaussian_ply(
     cloud: Cloud, *, linear: bool = False, order: str = "wxyz", extra: tuple[str, ...] = ()
 ) -> bytes:
-    """As 3DGS writes it: log scales and logit opacities, unless `linear`."""
+    """Return splats as 3DGS writes them: log scales and logit opacities, unless `linear`."""
     opacity = cloud.rgba[:, 3]
     q = cloud.quaternions if order == "wxyz" else cloud.quaternions[:, [1, 2, 3, 0]]
     columns = [
@@ -136,7 +136,7 @@ def gaussian_ply(
 
 
 def splat_file(cloud: Cloud) -> bytes:
-    """As .splat: 32 bytes a row."""
+    """Return splats as .splat: 32 bytes a row."""
     rows = np.zeros(
         len(cloud.centres), [("c", "<f4", 3), ("s", "<f4", 3), ("k", "u1", 4), ("q", "u1", 4)]
     )
@@ -147,7 +147,7 @@ def splat_file(cloud: Cloud) -> bytes:
 
 
 def spz_file(cloud: Cloud, version: int, bits: int = 12) -> bytes:
-    """As .spz of version 1, 2 or 3."""
+    """Return splats as .spz of version 1, 2 or 3."""
     count = len(cloud.centres)
     if version == 1:
         centres = cloud.centres.astype("<f2").tobytes()
@@ -180,7 +180,7 @@ def _smallest_three(q: NDArray[np.float64]) -> bytes:
 
 
 def write_street(folder: Path, place: Street | None = None, cloud: Cloud | None = None) -> Path:
-    """A folder with mesh.glb and splats.ply, in metres; the splats have z up."""
+    """Write a folder with mesh.glb and splats.ply, in metres; the splats have z up."""
     folder.mkdir(parents=True, exist_ok=True)
     place = place or street()
     (folder / "mesh.glb").write_bytes(glb(place))

@@ -34,8 +34,8 @@ class Steady:
 
 
 class Dying(Steady):
-    """Kills its process at the third question of an episode, but for the second time that it comes
-    so far; the fifth time it gives no answer."""
+    """Kills its process at the third query of an episode, except the second time; its fifth query
+    is never answered."""
 
     def act(self, seen):
         answer = super().act(seen)
@@ -51,7 +51,7 @@ class Dying(Steady):
 
 
 class Stuck(Steady):
-    """Never answers a question."""
+    """Never answers a query."""
 
     def act(self, seen):
         Path("asked").touch()

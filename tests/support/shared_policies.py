@@ -1,5 +1,5 @@
-"""Policies for test_shared_renderer.py, in the processes of its runs: what they do depends on what
-they see."""
+"""Policies for test_shared_renderer.py, in the processes of its runs, whose answers depend on their
+observations."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from cosim.spec.goal import ImageGoal
 from cosim.spec.manifest import Manifest
 
 NOTES = "SHARED_NOTES"
-"""In the environment: a file that is told who is asked together, and by which process."""
+"""Environment variable with the path of a file for notes: queried episodes and the process."""
 
 
 class Seeing:
-    """Drives by the brightness of its picture, a part of 48 x 32 pixels of a whole one: another bit
-    in it, another state hash."""
+    """Drives by the brightness of a part of 48 x 32 pixels of its picture, so that any changed bit
+    changes the state hash."""
 
     manifest = Manifest("seeing", rate_hz=4.0, camera=CameraSpec(64, 40, crop=(8, 4, 56, 36)))
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command:
         assert observation.rgb is not None
@@ -43,7 +43,7 @@ class Seeing:
 
 
 class Together(Seeing):
-    """The same, asked for all episodes at once."""
+    """Drives by the brightness of its picture, queried for all episodes together."""
 
     def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
         if NOTES in os.environ:
@@ -58,8 +58,8 @@ class Together(Seeing):
 
 
 class Guided(Together):
-    """Drives by all that it is given beside its picture: a goal that is one, labels, odometry, the
-    calibration. Every other answer is waypoints."""
+    """Drives by all parts of its observation: a picture goal, labels, odometry and calibration.
+    Every other answer is waypoints."""
 
     manifest = Manifest(
         "guided",
@@ -89,8 +89,8 @@ class Guided(Together):
 
 
 class Spy:
-    """Stands, and notes every text that it is given or that its process has: arguments,
-    environment, folder, names."""
+    """Stands, and notes every text of its observations and of its process: arguments, environment,
+    folder, names."""
 
     manifest = Manifest("spy", rate_hz=4.0, camera=None, privileged=True)
 
@@ -114,7 +114,7 @@ class Spy:
 
 
 def texts_in(value: object, known: set[int]) -> list[str]:
-    """Every text that can be reached from a value by fields, attributes and items."""
+    """Yield every text that can be reached from a value by fields, attributes and items."""
     if isinstance(value, str | bytes):
         return [value if isinstance(value, str) else repr(value)]
     if (
@@ -138,8 +138,7 @@ def texts_in(value: object, known: set[int]) -> list[str]:
 
 
 class Knowing:
-    """Blind and privileged; does what its episode is called, when it is asked for the third
-    time."""
+    """A blind and privileged policy that does what its episode is called at the third query."""
 
     manifest = Manifest("knowing", rate_hz=4.0, camera=None, privileged=True)
 

@@ -1,4 +1,4 @@
-"""Shipped suites, each loaded once in a process when a test first needs it."""
+"""Shipped suites, each loaded once in a process on first use."""
 
 from __future__ import annotations
 

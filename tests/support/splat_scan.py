@@ -28,8 +28,8 @@ _SPACING_M = 0.12
 def covariances(axes: Floats, sizes: Floats) -> np.ndarray:
     """Return (N, 6) covariances of (N, 3, 3) axes in columns with (N, 3) standard deviations."""
     factors = axes * sizes[:, None, :]
-    whole = factors @ factors.transpose(0, 2, 1)
-    return whole[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)].astype(np.float32)
+    matrices = factors @ factors.transpose(0, 2, 1)
+    return matrices[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)].astype(np.float32)
 
 
 def turns(rng: np.random.Generator, count: int) -> Floats:
@@ -75,13 +75,13 @@ def street_scan(
 
 
 def _facts(sun: ScanSun | None, walled: bool) -> ScanFacts:
-    whole = tuple(tuple(map(float, row)) for row in np.eye(4))
+    identity = tuple(tuple(map(float, row)) for row in np.eye(4))
     return ScanFacts(
         name="street",
         files={},
         scale=1.0,
         up="+z",
-        transform=whole,
+        transform=identity,
         sun=sun,
         mesh_hash="splat-street" if walled else "splat-street without a wall",
         areas_hash="splat-street",
@@ -185,15 +185,15 @@ def reference_picture(splats: Splats, taken: Shot) -> tuple[Floats, Floats]:
         if z <= 0.2 or opacity == 0.0:
             continue
         xx, xy, xz, yy, yz, zz = splats.covariances[i].astype(float)
-        whole = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         limit = 1.3 * np.array(taken.half_picture)
         tu, tv = np.clip((u / z, v / z), -limit, limit)
         jacobian = focal / z * np.array([[1.0, 0.0, -tu], [0.0, 1.0, -tv]]) @ view
-        flatter = whole @ whole
+        flatter = covariance @ covariance
         (a, b), (_, c) = jacobian @ flatter @ jacobian.T
         zu, zv = jacobian @ flatter @ view[2]
         slope = np.array([c * zu - b * zv, a * zv - b * zu]) / ((1.0 + 1e-4) * a * c - b * b)
-        flat = np.linalg.inv(jacobian @ whole @ jacobian.T + 0.3 * np.eye(2))
+        flat = np.linalg.inv(jacobian @ covariance @ jacobian.T + 0.3 * np.eye(2))
         dx, dy = x - 0.5 * width - focal * u / z, y - 0.5 * height - focal * v / z
         power = flat[0, 0] * dx * dx + 2.0 * flat[0, 1] * dx * dy + flat[1, 1] * dy * dy
         alpha = opacity * np.exp(-0.5 * power)

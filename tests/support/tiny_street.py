@@ -1,5 +1,5 @@
-"""One street with a crossing, small enough to be told by hand, and what is asked of the triangles
-of its ground."""
+"""One street with a crossing, small enough to check by hand, and measures of the triangles of its
+ground."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ KEYS = tiles_within(0.0, 0.0, 60.0)
 
 
 def tiny_map() -> StreetMap:
-    """A street along x with sidewalks on both sides, one crossing at x = 0, and a verge on the
-    south side."""
+    """Return a street along x with sidewalks on both sides, one crossing at x = 0, and a verge on
+    the south side."""
 
     def strip(
         name: str, x0: float, x1: float, y0: float, y1: float, corner: str, end: int, side: int
@@ -89,19 +89,20 @@ def tiny_map() -> StreetMap:
 
 
 def triangles(tile: Tile, name: str) -> np.ndarray:
-    """(T, 3, 3) corners of one kind of ground."""
+    """Return (T, 3, 3) corners of one kind of ground."""
     mesh = tile.parts[name]
     return mesh.vertices[mesh.triangles]
 
 
 def plan_areas(corners: np.ndarray) -> np.ndarray:
-    """(T,) signed areas seen from above."""
+    """Return (T,) signed areas seen from above."""
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return 0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
 
 
-def no_cracks(key: Key, corners: np.ndarray) -> None:
-    """Every edge off the border of a tile of (N, 3, 3) triangles is shared by two of them."""
+def assert_no_cracks(key: Key, corners: np.ndarray) -> None:
+    """Assert that every edge off the border of a tile of (N, 3, 3) triangles is shared by two of
+    them."""
     edges: dict[frozenset[tuple[int, ...]], int] = {}
     for triangle in np.rint(corners * 1e3).astype(int).tolist():
         for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):

@@ -1,7 +1,5 @@
-"""Whether the people that sensors report are in pictures from the same eye.
-
-python -m tests.support.tracked [FRAMES]    in crowds of a generated and of an imported place
-"""
+"""Whether people that sensors report are in pictures from the same eye. Usage: python -m
+tests.support.tracked [FRAMES], in crowds of a generated and of an imported place."""
 
 from __future__ import annotations
 

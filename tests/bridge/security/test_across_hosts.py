@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.across import prepare, run_across, watched, wrong_with
+from tests.support.across import faults_of_run, prepare, run_across, viewer_output
 from tests.support.namespaces import NotPermitted, network
 
 pytestmark = pytest.mark.engine
@@ -29,9 +29,9 @@ def test_a_run_across_hosts_loses_nothing_when_a_link_goes_down(
                 net,
                 ["link of worker one down"],
                 1,
-                lambda _: seen.append(watched(tmp_path, net)),
+                lambda _: seen.append(viewer_output(tmp_path, net)),
             )
     except NotPermitted as error:
         pytest.skip(str(error))
-    assert wrong_with(tmp_path, 4) == [] and code == 0
+    assert faults_of_run(tmp_path, 4) == [] and code == 0
     assert seen == ["status 0 answers about its jobs\n"]

@@ -20,8 +20,8 @@ from bridge.session import open_session
 from cosim.core.errors import EngineError
 from cosim.spec.connection import Connection, Role
 from tests.conftest import PATIENCE_S, wait_until
-from tests.support.ends import listening_at
 from tests.support.plain import free_port, plain_zenoh
+from tests.support.session_pair import listening_at
 
 pytestmark = pytest.mark.engine
 

@@ -18,7 +18,7 @@ from physics.cameras.choice import camera_of_choice
 from scenarios.tools.policy_check.checks import checked_policy
 from scenarios.tools.policy_check.drives import shown_drives
 from tests.conftest import Cosim
-from tests.support.likenesses import Shapes, likeness
+from tests.support.stand_in_graphs import Shapes, likeness
 
 ADAPTERS = Path(__file__).parents[3] / "cosim" / "policies" / "adapters"
 GNM: Shapes = {

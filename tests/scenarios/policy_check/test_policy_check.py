@@ -1,4 +1,4 @@
-"""`cosim policy check`: right policies pass, and each planted fault is told by its check."""
+"""`cosim policy check`: correct policies pass, and each planted fault fails its check."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scenarios.tools.policy_check.checks import POLICY_CHECKS, CheckedPolicy, ch
 from scenarios.tools.policy_check.drives import SceneName, ShownDrive, shown_drives
 from scenarios.tools.policy_check.query import PolicyQuery
 from tests.conftest import Cosim
-from tests.support import planted
+from tests.support import faulty_policies
 from tests.support.graphs import bundle, tiny_graph
 
 Drives = Mapping[SceneName, ShownDrive]
@@ -28,7 +28,7 @@ Drives = Mapping[SceneName, ShownDrive]
 
 @pytest.fixture(scope="module")
 def drives() -> Drives:
-    return shown_drives(planted.Right.manifest, 6, camera_of_choice("auto"))
+    return shown_drives(faulty_policies.Right.manifest, 6, camera_of_choice("auto"))
 
 
 def outcomes_of(policy: Policy, drives: Drives) -> CheckedPolicy:
@@ -37,24 +37,27 @@ def outcomes_of(policy: Policy, drives: Drives) -> CheckedPolicy:
 
 
 @pytest.mark.engine
-def test_a_right_policy_passes_every_check(drives: Drives) -> None:
-    """A policy that sees, takes goals and remembers pictures passes, and every check applies to
+def test_a_correct_policy_passes_every_check(drives: Drives) -> None:
+    """A policy with camera, goals and a memory of pictures passes, and every check applies to
     it."""
-    found = outcomes_of(planted.Right(), drives)
+    found = outcomes_of(faulty_policies.Right(), drives)
     assert {
         name: one for name, one in found.outcomes.items() if one.outcome != "passed"
     }.keys() == {"example"}
     assert (
-        {*planted.FAULTS, *planted.DOUBTS, "example"} == set(POLICY_CHECKS) == set(found.outcomes)
+        {*faulty_policies.FAULTS, *faulty_policies.DOUBTS, "example"}
+        == set(POLICY_CHECKS)
+        == set(found.outcomes)
     )
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize(
-    ("check", "fault"), [(check, one) for check, faults in planted.FAULTS.items() for one in faults]
+    ("check", "fault"),
+    [(check, one) for check, faults in faulty_policies.FAULTS.items() for one in faults],
 )
-def test_a_planted_fault_is_told(check: str, fault: type[Policy], drives: Drives) -> None:
-    """The check that a fault was planted for fails, and says why."""
+def test_a_planted_fault_fails_its_check(check: str, fault: type[Policy], drives: Drives) -> None:
+    """The check fails with a reason."""
     driver = PolicyCaller(fault())
     outcome, words = checked_policy(driver, driver.manifest, drives, only=(check,)).outcomes[check]
     assert outcome == "failed", words
@@ -62,30 +65,30 @@ def test_a_planted_fault_is_told(check: str, fault: type[Policy], drives: Drives
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("check", list(planted.DOUBTS))
-def test_what_may_be_right_is_doubted_only(check: str, drives: Drives) -> None:
-    """A policy that may be right is doubted, with the reason why it may be, and has not failed."""
-    found = outcomes_of(planted.DOUBTS[check](), drives)
+@pytest.mark.parametrize("check", list(faulty_policies.DOUBTS))
+def test_a_questionable_policy_gets_a_warning(check: str, drives: Drives) -> None:
+    """A policy that may be right gets a warning with the reason, and no failure."""
+    found = outcomes_of(faulty_policies.DOUBTS[check](), drives)
     assert found.outcomes[check].outcome == "warning" and "right" in found.outcomes[check].words
     assert found.count("failed") == 0
 
 
 @pytest.mark.engine
-def test_a_policy_that_is_told_the_street_passes() -> None:
-    """It has failed in nothing, and what it is not asked says why."""
+def test_a_privileged_policy_passes() -> None:
+    """Nothing fails, and checks that do not apply say why."""
     found = outcomes_of(Route(), shown_drives(Route.manifest, 4, camera_of_choice("auto")))
     assert found.count("failed") == 0 and found.count("passed") >= 7
     assert "needs no picture" in found.outcomes["mirror"].words
 
 
 @pytest.mark.engine
-def test_the_command_says_what_it_found(cosim: Cosim, tmp_path: Path) -> None:
-    """A table, or JSON, a picture with the way in it, and exit code 1 where something has
-    failed."""
-    source = Path(planted.__file__).read_text()
-    (tmp_path / "planted.py").write_text(source)
+def test_the_command_prints_and_draws_its_findings(cosim: Cosim, tmp_path: Path) -> None:
+    """It prints a table or JSON, writes a picture with the waypoints, and exits with 1 after a
+    failure."""
+    source = Path(faulty_policies.__file__).read_text()
+    (tmp_path / "faulty_policies.py").write_text(source)
     words = ("--frames", "4", "-o", "check.png")
-    right = cosim("policy", "check", "planted:Right", *words, cwd=tmp_path)
+    right = cosim("policy", "check", "faulty_policies:Right", *words, cwd=tmp_path)
     assert (
         right.returncode == 0 and "0 failed" in right.stdout and "colour_order" in right.stdout
     ), right.stderr
@@ -94,19 +97,21 @@ def test_the_command_says_what_it_found(cosim: Cosim, tmp_path: Path) -> None:
     assert (
         np.abs(picture.astype(int) - (60, 70, 255)).max(axis=2) < 8
     ).sum() > 100  # the waypoint that is followed
-    wrong = cosim("policy", "check", "planted:BlueForRed", "--frames", "4", "--json", cwd=tmp_path)
-    told = json.loads(wrong.stdout)
-    assert wrong.returncode == 1 and told["checks"]["colour_order"]["outcome"] == "failed"
+    wrong = cosim(
+        "policy", "check", "faulty_policies:BlueForRed", "--frames", "4", "--json", cwd=tmp_path
+    )
+    report = json.loads(wrong.stdout)
+    assert wrong.returncode == 1 and report["checks"]["colour_order"]["outcome"] == "failed"
     assert (
-        told["goal"] == "route_point"
-        and told["answer_ms"] > 0.0
-        and len(told["checks"]) == len(POLICY_CHECKS)
+        report["goal"] == "route_point"
+        and report["answer_ms"] > 0.0
+        and len(report["checks"]) == len(POLICY_CHECKS)
     )
 
 
-def test_an_example_is_right_only_where_it_says_what_is_to_come_out(tmp_path: Path) -> None:
-    """The outputs that the graph has pass, others fail, and inputs alone, as some exporters write,
-    prove nothing."""
+def test_an_example_needs_expected_outputs(tmp_path: Path) -> None:
+    """The outputs of the graph pass, others fail, and inputs alone, as some exporters write, give a
+    warning."""
     driver = PolicyCaller(OnnxPolicy(bundle(tmp_path, tiny_graph())))
     inputs = {"obs": np.zeros((1, 6, 4, 8), np.float32), "goal": np.ones((1, 2), np.float32)}
     action = np.arange(1, 6)[None, :, None] / 5 * np.ones(2)
@@ -124,7 +129,7 @@ def test_an_example_is_right_only_where_it_says_what_is_to_come_out(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("nobody",), "unknown policy 'nobody'"),
         (("route", "-o", "check.jpg"), "use a name that ends in .png"),
@@ -133,8 +138,8 @@ def test_an_example_is_right_only_where_it_says_what_is_to_come_out(tmp_path: Pa
     ],
 )
 def test_wrong_use_is_refused_before_anything_is_drawn(
-    words: tuple[str, ...], said: str, cosim: Cosim
+    words: tuple[str, ...], message: str, cosim: Cosim
 ) -> None:
-    """A policy, a picture or a goal that there is not is one line and exit code 2."""
+    """An unknown policy, picture format, goal or check gives one line and exit code 2."""
     done = cosim("policy", "check", *words)
-    assert done.returncode == 2 and said in done.stderr and "drawing" not in done.stderr
+    assert done.returncode == 2 and message in done.stderr and "drawing" not in done.stderr

@@ -1,9 +1,6 @@
-"""Many short episodes, each as the first of a process and then all in one process, in another
-order.
-
-`python -m tests.support.in_turn` prints the ids of those that came out differently, how many were
-compared, and how many of these were unlike each other. With --sample it takes SAMPLE alone.
-"""
+"""Many short episodes, each as the first of a process and then all in one process in another order.
+`python -m tests.support.episode_order` prints the ids of those that differ, the number of compared ones,
+and the number of different results. With --sample it takes SAMPLE alone."""
 
 from __future__ import annotations
 
@@ -43,12 +40,10 @@ _DRIVES = Command(1.0, 0.2)
 
 
 def drawn() -> Iterator[tuple[Scenario, Manifest]]:
-    """Scenarios that are unlike their neighbours in all that is kept from episode to episode, and
-    who drives.
-
-    They come in sixes of one crowd and in pairs of one seed, which sets SUMO's clock to the same
-    time: what an episode leaves behind would be found by the next one.
-    """
+    """Yield scenarios that differ from their neighbours in all state that a process keeps between
+    episodes, with their manifests. They come in sixes of one crowd and in pairs of one seed, which
+    sets SUMO's clock to the same time, so that leftovers of an episode would affect the next
+    one."""
     for k in range(COUNT):
         where = msgspec.structs.replace(_CITIES[k % 2], roughness=0.5 if k % 6 == 1 else 0.0)
         rng = np.random.default_rng(k // 4)
@@ -78,7 +73,7 @@ def drawn() -> Iterator[tuple[Scenario, Manifest]]:
 
 
 def hash_of(scenario: Scenario, manifest: Manifest) -> str:
-    """All that was simulated, and what was seen at its beginning and its end."""
+    """Return a hash of the simulated states, and of the pictures."""
     state = StateHash()
     seen = hashlib.sha256()
     with Episode(scenario, manifest, watches=[lambda step, _: state.add(step)]) as episode:
@@ -91,8 +86,8 @@ def hash_of(scenario: Scenario, manifest: Manifest) -> str:
 
 
 def _as_the_first(work: Callable[[], str]) -> str:
-    """What is answered by a process in which no engine has run. This one's engines have been
-    imported, not started."""
+    """Return the result of a process in which no engine has run; the engines of this process are
+    imported and not started."""
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
@@ -102,9 +97,9 @@ def _as_the_first(work: Callable[[], str]) -> str:
             os._exit(0)
     os.close(writing)
     with os.fdopen(reading) as answer:
-        said = answer.read()
+        result = answer.read()
     os.waitpid(child, 0)
-    return said
+    return result
 
 
 if __name__ == "__main__":

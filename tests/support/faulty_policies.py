@@ -1,4 +1,4 @@
-"""A policy that sees and is right, and for each check of `cosim policy check` one that is not."""
+"""A correct policy with a camera, and for each check of `cosim policy check` a faulty one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WEIGHTS = (0.1, 0.1, 0.2, 0.6)
 
 
 class Right:
-    """Turns half to where the street is open, half to its goal, and brakes for who wears yellow."""
+    """Turns halfway to the open street and halfway to its goal, and brakes for people in yellow."""
 
     manifest = Manifest(
         "right",
@@ -106,7 +106,7 @@ class NeverForgets(Right):
         self.past = []
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Keeps the pictures of the episode before."""
+        """Keeps the pictures of the previous episode."""
 
 
 class GoesOnAfterReset(Right):
@@ -215,7 +215,7 @@ class YToTheRight(Right):
 
 
 class DrivesOtherwiseThanPlanned(Right):
-    """Its waypoints are right, and its command, which is what is driven, turns the other way."""
+    """Its waypoints are right, and its command, which is driven, turns the other way."""
 
     def act(self, seen: Observation) -> WaypointCommand:
         way = super().act(seen)
@@ -257,6 +257,6 @@ FAULTS = {
     "goal_mirrored": (YToTheRight, DrivesOtherwiseThanPlanned),
     "goal_ignored": (GoalIgnored,),
 }
-"""By the check that is to fail."""
+"""Faulty policies by the check that must fail."""
 DOUBTS = {"put_back": GoesOnAfterReset, "person": SeesNobody, "people_ignored": TracksIgnored}
-"""What may be right."""
+"""Questionable policies by the check that must warn."""

@@ -1,5 +1,4 @@
-"""What a policy is given in an episode, by the engines: goals that are pictures, further cameras,
-and no secret."""
+"""Observations of a policy in real episodes: picture goals, further cameras, and no secrets."""
 
 from __future__ import annotations
 
@@ -45,30 +44,30 @@ SEED = EpisodeOptions(seed=11)
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    """A second of a long way in a small city."""
+    """Return a second of a long way in a small city."""
     return msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
 
 
 class Ahead:
-    """Drives straight on, and keeps what it is given."""
+    """Drives straight ahead, and stores its observations."""
 
     def __init__(self, manifest: Manifest) -> None:
         self.manifest = manifest
         self.seen: list[Observation] = []
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Keeps no state."""
 
     def act(self, observation: Observation) -> Command:
         self.seen.append(observation)
         return Command(1.0, 0.0)
 
 
-def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(
+def test_an_observation_holds_no_secret_and_a_goal_picture_has_no_people(
     scenario: Scenario,
 ) -> None:
-    """An unprivileged observation with everything that can be requested reaches nothing that only
-    the simulator knows; its goal picture shows the place without people."""
+    """An unprivileged observation with everything that can be requested reaches no value of the
+    simulator alone, and its goal picture shows the place without people."""
     policy = Ahead(ALL)
     driver = PolicyCaller(policy)
     with Episode(scenario, ALL, SEED) as episode, episode.eyes(SPEC) as camera:
@@ -83,10 +82,10 @@ def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(
         z_m, _, _ = episode._open.engines.world.surface.lean(place, seen.robot.drive.span_m)  # type: ignore[attr-defined]
         robot = RobotState(place, z_m=z_m)
         ahead = place.xy + 3.0 * np.array([np.cos(place.heading_rad), np.sin(place.heading_rad)])
-        somebody = People.of(("a",), [ahead], [0.0], [0.0], ("stand",))
+        person = People.of(("a",), [ahead], [0.0], [0.0], ("stand",))
         empty, met = (
             camera.render(robot, Street(0, people)).rgb
-            for people in (People.of((), [], [], [], ()), somebody)
+            for people in (People.of((), [], [], [], ()), person)
         )
     assert isinstance(first.goal, ImageGoal) and np.array_equal(first.goal.rgb, empty)
     assert (first.goal.rgb != met).any(axis=-1).mean() > 0.02
@@ -99,9 +98,8 @@ def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(
 def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(
     scenario: Scenario,
 ) -> None:
-    """The same seed gives the same points, another others; the option goes before the manifest, and
-    stands in the record; hashes, and the robot's pictures where its goal is one, too, are those of
-    an episode without goals."""
+    """The same seed gives the same goals, and another seed others. The option overrides the
+    manifest and is recorded; state hashes and pictures equal those of an episode without goals."""
     records = []
     pictures = []
     points = []
@@ -130,8 +128,8 @@ def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(
     assert points[0] == points[4] == [] and points[1] == points[2] and points[1][0] != points[3][0]
 
 
-def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
-    """They stand in its rows and in run.json; who resumes it with others is refused, with both
+def test_a_run_cannot_be_resumed_with_other_goals(scenario: Scenario, tmp_path: Path) -> None:
+    """Rows and run.json have the goal protocol, and resuming with another one is refused with both
     names."""
     suite = Suite(name="one", version="1", scenarios=(scenario,))
     policy = Ahead(Manifest("ahead", camera=None, odometry="gps"))
@@ -159,8 +157,8 @@ def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
 
 
 def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
-    """By depth and matrix every pixel of the ground before the robot comes to lie on it, on level
-    ground; and a point of the ground that is seen there is drawn there."""
+    """Every ground pixel before the robot maps to level ground by depth and matrix, and a point of
+    the ground is drawn where the calibration projects it."""
     with Episode(scenario, ALL, SEED) as episode:
         seen = episode.reset()
         z_m = episode.moment.robot.z_m
@@ -179,7 +177,9 @@ def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
     assert len(rows) > 50 and abs(z_m) < 1.0
     assert np.abs(np.median(points[2])) < 0.03 and np.percentile(np.abs(points[2]), 90) < 0.06
     cos, sin = np.cos(robot.pose.heading_rad), np.sin(robot.pose.heading_rad)
-    there = points[:2].T @ [[cos, sin], [-sin, cos]] + robot.pose.xy
-    drawn = way_in_picture(shot, SPEC.lens, np.column_stack([there, surface.heights(there)])).points
+    ground_points = points[:2].T @ [[cos, sin], [-sin, cos]] + robot.pose.xy
+    drawn = way_in_picture(
+        shot, SPEC.lens, np.column_stack([ground_points, surface.heights(ground_points)])
+    ).points
     off_px = np.hypot(*(drawn - np.column_stack([columns, rows]) - 0.5).T)
     assert np.median(off_px) < 0.3 and np.percentile(off_px, 90) < 1.0

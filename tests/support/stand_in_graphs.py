@@ -1,4 +1,4 @@
-"""Small graphs with the inputs and outputs of a bundle's manifest: their answers follow street and
+"""Small graphs with the inputs and outputs of a bundle's manifest, whose answers follow street and
 goal a little."""
 
 from __future__ import annotations
@@ -29,9 +29,8 @@ SPEED_MPS = 1.0
 
 
 def likeness(bundle: BundleManifest, shapes: Shapes) -> bytes:
-    """A graph with these shapes of inputs and outputs. It turns by the sum of what each input tells
-    of left and right, and drives at 1 m/s. Shapes of outputs that no answer is made of are those of
-    zeros."""
+    """Return a graph with these shapes of inputs and outputs. It turns by the sum of what each
+    input indicates for left and right, and drives at 1 m/s. Unused outputs are zeros."""
     nodes: list[NodeProto] = []
     weights: dict[str, np.ndarray[Any, Any]] = {"zero": np.zeros((1,), np.float32)}
     terms = ["zero"]
@@ -80,7 +79,7 @@ def likeness(bundle: BundleManifest, shapes: Shapes) -> bytes:
 
 
 def _weights(one: Any, shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
-    """What each number of an input counts for turning left."""
+    """Return the weight of each number of an input for turning left."""
     if isinstance(one, NoiseInput | MaskInput):
         return np.full(shape, 1e-3)
     if isinstance(one, StateInput | ConstantInput) or not isinstance(
@@ -101,20 +100,20 @@ def _weights(one: Any, shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
     )
     gain *= 4.0 if isinstance(one, RoutePatchInput) else 2.0
     across = np.linspace(-0.5, 0.5, sides[1])
-    whole = np.einsum("t,c,x->tcx", newer / newer.sum(), tint / tint.sum(), across / sides[1])
-    whole = np.repeat(whole[:, :, None], sides[0], axis=2) / sides[0] * gain
+    weights = np.einsum("t,c,x->tcx", newer / newer.sum(), tint / tint.sum(), across / sides[1])
+    weights = np.repeat(weights[:, :, None], sides[0], axis=2) / sides[0] * gain
     order = {"N": 1, "T": one.frames, "C": channels, "H": sides[0], "W": sides[1]}
     letters = "".join(axes_of(one.layout))
     missing = [letter for letter in "TCHW" if letter not in letters]
     laid = np.einsum(
-        f"TCHW->{''.join(letter for letter in letters if letter != 'N')}{''.join(missing)}", whole
+        f"TCHW->{''.join(letter for letter in letters if letter != 'N')}{''.join(missing)}", weights
     )
     assert all(order[letter] == 1 for letter in missing)
     return laid.reshape(shape)
 
 
 def _point_in(one: Any) -> tuple[list[int], GoalPointInput] | None:
-    """Where the newest point of an input lies in it, counted through it."""
+    """Return the index of the newest point of an input, counted through it."""
     if isinstance(one, GoalPointInput):
         start = (one.frames - 1) * len(one.values)
         return list(range(start, start + len(one.values))), one
@@ -135,7 +134,7 @@ def _bearing(
     nodes: list[NodeProto],
     weights: Any,
 ) -> str:
-    """The sine of where a point lies, to the left."""
+    """Return the sine of the direction of a point, to the left."""
     at, point = place
     weights[f"{name}.all"] = np.array([1, -1])
     nodes.append(helper.make_node("Reshape", [source, f"{name}.all"], [f"{name}.values"]))
@@ -174,8 +173,8 @@ def _bearing(
 
 
 def _answer(bundle: BundleManifest, name: str, shape: tuple[int, ...]) -> tuple[Any, Any]:
-    """(1, numbers) twice: an output straight on, and what is added to it for a turn of 1 rad to the
-    left."""
+    """Return (1, numbers) twice: an output straight ahead, and its change for a turn of 1 rad to
+    the left."""
     output = bundle.output
     assert isinstance(output, WaypointsOutput)
     count = math.prod(shape)

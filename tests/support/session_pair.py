@@ -1,4 +1,4 @@
-"""Two ends of a session on this machine."""
+"""Two sessions on this machine that are connected to each other."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from cosim.spec.connection import Connection
 
 
 def listening_at(endpoint: str) -> Session:
-    """One that listens."""
+    """Return a session that listens."""
     return open_session(Connection(role="coordinator", listen=endpoint))
 
 
 def connected_to(endpoint: str) -> Session:
-    """One that connects. Raises EngineError when nobody listens there."""
+    """Return a session that connects. Raises EngineError when no session listens there."""
     return open_session(Connection(role="worker", connect=endpoint))
