@@ -114,7 +114,7 @@ def test_people_avoid_obstacles_without_walking_into_the_robot(aside_m: float) -
 @pytest.mark.parametrize("robot_y_m", [0.3, 0.45, 0.6])
 @pytest.mark.parametrize("aside_m", [-0.4, 0.0, 0.2])
 def test_people_pass_a_robot_beside_an_obstacle(robot_y_m: float, aside_m: float) -> None:
-    """Nobody gets stuck between an obstacle at the edge and a standing robot beside it."""
+    """No person gets stuck between an obstacle at the edge and a robot that stands next to it."""
     half_m = 0.35, 0.275
     standing = StandingObstacles([StandingBody(0.0, -0.7, 0.0, 1.0, 0.6, 0.0, -1.0)])
     poses = PoseFilter(DT_S, standing)

@@ -92,7 +92,7 @@ def test_the_crowd_walks_round_obstacles(kind: str) -> None:
 
 
 def test_an_obstacle_at_the_edge_is_passed_on_the_other_side() -> None:
-    """Beside a wall people pass a row of bins on the open side and stay on the sidewalk."""
+    """Along a wall, people pass a row of bins on the open side and stay on the sidewalk."""
     row = [obstacle_at("bin", 0.75 * k, 1.15, 1.57) for k in range(3)]
     obstacle_list = standing(*row)
     (body,) = obstacle_list.bodies

@@ -85,7 +85,7 @@ def test_a_person_alone_walks_exactly_as_wanted() -> None:
 
 
 def test_a_person_who_wants_to_stand_stays() -> None:
-    """A person who wants to stand stays in place whoever approaches."""
+    """A person who wants to stand stays in place when others approach."""
     assert steered((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), [Neighbour(0.4, 0.0, -1.0, 0.0)]) == (
         0.0,
         0.0,

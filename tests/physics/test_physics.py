@@ -145,7 +145,7 @@ def test_a_walking_person_is_met_within_the_tick(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_people_out_of_reach_change_nothing() -> None:
-    """With people and a vehicle some two metres beside its path the robot moves to the bit as in an
+    """With people and a vehicle some two metres from its path the robot moves to the bit as in an
     empty street."""
     crowd = People.of(
         ("c1", "c2"), [[-18.0, 7.2], [-16.0, 2.8]], [0.0, 1.0], [0.0, 0.0], ("stand", "stand")

@@ -47,7 +47,7 @@ def place(request: pytest.FixtureRequest) -> StreetMap:
 def climbs(
     place: StreetMap, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[str, Polyline]]:
-    """Yield lines from the middle of a crossing over its ramp onto a sidewalk beside its corner."""
+    """Yield lines from the middle of a crossing over its ramp onto a sidewalk next to its corner."""
     crossings = [strip for strip in place.strips.values() if strip.kind == "crossing"]
     order = rng.permutation(len(crossings)).tolist()
     found = 0

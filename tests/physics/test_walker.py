@@ -89,7 +89,7 @@ SLOPE = Course([(-48.0, 0.0), (0.0, 4.0), (48.0, 0.0)])
 def test_the_walker_holds_its_place_on_uneven_ground(
     course: Course, heading_deg: float, seconds: float
 ) -> None:
-    """Beside an edge of 3 cm and across a slope of 1:12 it drifts less than 5 cm and 3 degrees in a
+    """Next to an edge of 3 cm and across a slope of 1:12 it drifts less than 5 cm and 3 degrees in a
     minute. The walks before end in different phases."""
     with walking(WALKER, course, Pose(-40.0, 0.0, math.radians(heading_deg))) as walk:
         walk.drive(Command(0.5, 0.0), seconds)

@@ -158,7 +158,7 @@ def test_a_file_of_weights_cannot_run_code() -> None:
 
 
 def test_boxes_are_decoded_from_the_networks_answer() -> None:
-    """A planted answer in the grid of 16 pixels, and its duplicate beside it, become one box in
+    """A planted answer in the grid of 16 pixels, and its duplicate next to it, become one box in
     picture pixels."""
     answer = np.zeros((3549, 85), np.float32)
     row = 52 * 52 + 10 * 26 + 5  # of the second grid, the row 10 and the column 5

@@ -20,7 +20,7 @@ from cosim.policies.privileged.route_planner import DistanceField, RoutePlanner
 from cosim.spec.robot import COURIER
 
 GAP_M = COURIER.width_m + 0.5
-"""Width in metres that remains free beside every obstacle."""
+"""Width in metres that remains free next to every obstacle."""
 
 
 @dataclass(frozen=True)

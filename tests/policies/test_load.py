@@ -196,7 +196,7 @@ def test_an_edited_policy_has_another_hash(workspace: Path) -> None:
 
 
 def write_policies(workspace: Path) -> None:
-    """Write a policy in this folder, one beside its import in another, and one in a package that
+    """Write a policy in this folder, one next to its import in another, and one in a package that
     imports its own modules."""
     (workspace / "mine.py").write_text(GOOD.format(fields=""))
     (workspace / "deeper").mkdir()

@@ -119,31 +119,21 @@ class CountsFromZero(Right):
         return 1.2 * min(seen.time_s / 60.0, 1.0) + 0.5
 
 
+def _planner(name: str, rule: WaypointRule) -> Manifest:
+    """Return the manifest of a policy with a camera that answers with waypoints by a rule."""
+    return Manifest(name, camera=CameraSpec(96, 64, 60.0), goal="route_point", waypoints=rule)
+
+
 class InDecimetres(Right):
-    manifest = Manifest(
-        "decimetres",
-        camera=CameraSpec(96, 64, 60.0),
-        goal="route_point",
-        waypoints=WaypointRule(2, 2.5, 0.75),
-    )
+    manifest = _planner("decimetres", WaypointRule(2, 2.5, 0.75))
 
 
 class InTenthsOfTheTime(Right):
-    manifest = Manifest(
-        "tenths",
-        camera=CameraSpec(96, 64, 60.0),
-        goal="route_point",
-        waypoints=WaypointRule(2, 0.25, 0.075),
-    )
+    manifest = _planner("tenths", WaypointRule(2, 0.25, 0.075))
 
 
 class TenTimesTooShort(Right):
-    manifest = Manifest(
-        "short",
-        camera=CameraSpec(96, 64, 60.0),
-        goal="route_point",
-        waypoints=WaypointRule(2, 0.02, 0.75),
-    )
+    manifest = _planner("short", WaypointRule(2, 0.02, 0.75))
 
 
 class Backwards(Right):

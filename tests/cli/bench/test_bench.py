@@ -25,7 +25,7 @@ Path(path).write_text(json.dumps([figure]))
 
 
 def checkout(folder: Path, value: float) -> Path:
-    """A folder whose measurements all give one value, each noted in a file beside the folder."""
+    """A folder whose measurements all give one value, each noted in a file next to the folder."""
     bench = folder / "scenarios" / "tools" / "bench"
     bench.mkdir(parents=True)
     for package in (bench, bench.parent, bench.parents[1]):

@@ -211,7 +211,7 @@ def test_the_hash_of_a_bundle_covers_all_that_decides_its_answers(tmp_path: Path
 def test_weights_are_found_in_a_separate_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Weights that are not beside the manifest come from $COSIM_WEIGHTS and are checked against
+    """Weights that are not next to the manifest come from $COSIM_WEIGHTS and are checked against
     their hash."""
     files = {"tiny.onnx": {"bytes": len(tiny_graph()), "blake2b": file_facts(tiny_graph()).blake2b}}
     place = bundle(tmp_path / "net", tiny_graph(), model="tiny.onnx", files=files)

@@ -232,7 +232,7 @@ def test_a_mask_marks_whether_another_input_has_its_goal() -> None:
 
 
 def test_a_route_patch_has_the_declared_numbers() -> None:
-    """Cells on the route and beside it have the declared values, frame by frame."""
+    """Cells on the route and next to it have the declared values, frame by frame."""
     patch = np.zeros((80, 80), np.uint8)
     patch[:40, 40] = 255
     fields = {"what": "route_patch", "frames": 2, "on": 2, "off": -1, "layout": "NTHW"}
