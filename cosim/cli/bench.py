@@ -281,14 +281,10 @@ def bench(
             rich_help_panel=_SEVERAL,
         ),
     ] = 1,
-    groups: Annotated[
-        float, typer.Option(help=f"{help_of('groups')}", rich_help_panel=_CROWD)
-    ] = 0.0,
-    elderly: Annotated[
-        float, typer.Option(help=f"{help_of('elderly')}", rich_help_panel=_CROWD)
-    ] = 0.0,
+    groups: Annotated[float, typer.Option(help=help_of("groups"), rich_help_panel=_CROWD)] = 0.0,
+    elderly: Annotated[float, typer.Option(help=help_of("elderly"), rich_help_panel=_CROWD)] = 0.0,
     children: Annotated[
-        float, typer.Option(help=f"{help_of('children')}", rich_help_panel=_CROWD)
+        float, typer.Option(help=help_of("children"), rich_help_panel=_CROWD)
     ] = 0.0,
     suite: Annotated[
         str, typer.Option(help="Suite, or its .json.", rich_help_panel=_EXPLOIT)

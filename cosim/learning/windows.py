@@ -202,16 +202,18 @@ class WindowExamples:
         )
         return batch if changes is None else _changed(batch, changes, np.nonzero(valid)[0])
 
-    def rewarded_starts(self) -> NDArray[np.int64]:
-        """Return the rows at which windows with rewards begin, one after another."""
-        rows = np.flatnonzero(np.isfinite(self.returns))
+    def _starts(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return those of the rows at which windows begin, one after another."""
         found: NDArray[np.int64] = rows[(rows - self._first[rows]) % STEPS == 0]
         return found
 
+    def rewarded_starts(self) -> NDArray[np.int64]:
+        """Return the rows at which windows with rewards begin, one after another."""
+        return self._starts(np.flatnonzero(np.isfinite(self.returns)))
+
     def held_out_starts(self, most: int) -> NDArray[np.int64]:
         """Return the rows at which held-out windows begin: one after another, at most `most`."""
-        rows = self.held_out
-        starts = rows[(rows - self._first[rows]) % STEPS == 0]
+        starts = self._starts(self.held_out)
         found: NDArray[np.int64] = starts[:: max(1, -(-len(starts) // most))]
         return found
 

@@ -75,14 +75,11 @@ class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
                 f"a data set has {valid} pictures a second, not {self.rate_hz:g}: choose one "
                 f"of these rates"
             )
-        if not 0.0 <= self.noise <= _MAX_NOISE:
-            raise SpecError(
-                f"noise must be in [0, {_MAX_NOISE:g}], a share of the time, not {self.noise:g}"
-            )
-        if not 0.0 <= self.explore <= _MAX_NOISE:
-            raise SpecError(
-                f"explore must be in [0, {_MAX_NOISE:g}], a share of the time, not {self.explore:g}"
-            )
+        for name, share in (("noise", self.noise), ("explore", self.explore)):
+            if not 0.0 <= share <= _MAX_NOISE:
+                raise SpecError(
+                    f"{name} must be in [0, {_MAX_NOISE:g}], a share of the time, not {share:g}"
+                )
         if self.explore and not (self.learner and self.unsolved and not self.noise):
             raise SpecError(
                 "explore changes the commands of a learner, also in episodes that it fails: give "

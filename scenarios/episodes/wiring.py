@@ -110,7 +110,7 @@ def staged(
     if faults := list(event_faults(scenario, kinds)):
         raise SpecError(f"scenario '{scenario.id}': {join_faults(faults)}")
     _, street_map = place(scenario.place)
-    walkable = street_map.walkable_near(_around(scenario))
+    walkable = street_map.walkable_near(route_corridor(scenario))
     with ExitStack() as stack:
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
@@ -146,7 +146,7 @@ def staged(
         injected, directed = _with_people(
             director, scenario, options, street_map, street, clock, lambda: crowd.street.people
         )
-        privileged = _privileged_source(scenario, robot, street, street_map, walkable)
+        privileged = privileged_source(scenario, robot, street, street_map, walkable)
         yield StagedScenario(
             engines=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
@@ -163,13 +163,13 @@ def staged(
         )
 
 
-def _around(scenario: Scenario) -> Polygon:
+def route_corridor(scenario: Scenario) -> Polygon:
     """Return the ground within CORRIDOR_M of the route."""
     around: Polygon = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
     return around
 
 
-def _privileged_source(
+def privileged_source(
     scenario: Scenario,
     robot: Robot,
     street: PlaceSurface,
@@ -183,7 +183,7 @@ def _privileged_source(
 
     @cache
     def free() -> Polygon | MultiPolygon:
-        return _free_ground(walkable, scenario, street.standing(_around(scenario)), robot)
+        return _free_ground(walkable, scenario, street.standing(route_corridor(scenario)), robot)
 
     @cache
     def waits_m() -> tuple[float, ...]:

@@ -84,7 +84,7 @@ class Target(Frame):
         if self._parts:
             if self._bytes is None:
                 self._bytes = self._context.buffer(reserve=data.nbytes)
-            write_picture(self._context, self._colour, self._bytes, 0)
+            self.copy(self._bytes, 0)
             self._bytes.read_into(data)
         else:
             self.frame.read_into(data, components=4, dtype="f1")

@@ -63,7 +63,6 @@ class Comparison(NamedTuple):
     nearest: one of each loose ring
     following_m: (K,) distances to the nearest person ahead, below FOLLOWING_M, on FOLLOWED
     person_first_s, vehicle_first_s: post-encroachment times
-    people, vehicles: numbers at the crossing
     """
 
     by_density: tuple[list[tuple[MeanSd, float]], list[tuple[MeanSd, float]]]
@@ -72,8 +71,6 @@ class Comparison(NamedTuple):
     following_m: Floats
     person_first_s: Floats
     vehicle_first_s: Floats
-    people: int
-    vehicles: int
 
 
 def watch_people(jobs: int, progress: Progress) -> Comparison:
@@ -96,7 +93,7 @@ def watch_people(jobs: int, progress: Progress) -> Comparison:
         for k, one in enumerate(tasks := [*walking, *near, *free]):
             progress(f"simulating people: street {k + 1} of {len(tasks)}")
             found.append(one.get())
-        person_first_s, vehicle_first_s, people, vehicles = crossing.get()
+        person_first_s, vehicle_first_s = crossing.get()
         behind_m = following.get()
     one_way = found[: len(DENSITIES)]
     both_ways = found[len(DENSITIES) : len(dense)]
@@ -108,8 +105,6 @@ def watch_people(jobs: int, progress: Progress) -> Comparison:
         behind_m,
         person_first_s,
         vehicle_first_s,
-        people,
-        vehicles,
     )
 
 
@@ -151,6 +146,5 @@ def _free_mps(flow: Flow, seconds: float, seed: int) -> Floats:
     return free_speeds(walk_round(flow, seconds, seed)[1], _FREE_M, _FREE_S)
 
 
-def _crossing(seconds: float, seed: int) -> tuple[Floats, Floats, int, int]:
-    people, vehicles = walk_across(seconds, seed)
-    return *encroachments_s(people, vehicles, PERSON_RADIUS_M), len(people), len(vehicles)
+def _crossing(seconds: float, seed: int) -> tuple[Floats, Floats]:
+    return encroachments_s(*walk_across(seconds, seed), PERSON_RADIUS_M)

@@ -305,16 +305,16 @@ def _draw_crossing(street: OpenCrosswalk, seconds: float, seed: int) -> Entrance
     kinds = list(VEHICLE_TYPES)
     shares = [share for _, _, share in VEHICLE_TYPES.values()]
 
-    def moments_s(mean_s: float) -> list[float]:
+    def moments_s() -> list[float]:
         """Draw arrival times, rounded up to the half second at which arrivals are inserted."""
-        gaps_s = rng.exponential(mean_s, round(seconds / mean_s))
+        gaps_s = rng.exponential(_EVERY_S, round(seconds / _EVERY_S))
         return [
             round(begin_s + _ENTER_S * math.ceil(at_s / _ENTER_S), 2)
             for at_s in np.cumsum(gaps_s).tolist()
         ]
 
     for roads, walk in zip(street.lanes, street.over, strict=True):
-        for k, at_s in enumerate(moments_s(_EVERY_S)):
+        for k, at_s in enumerate(moments_s()):
             entry = VehicleEntry(
                 f"v{roads[0]}{k}", str(rng.choice(kinds, p=shares)), roads, _WALK_UP_M
             )
@@ -323,7 +323,7 @@ def _draw_crossing(street: OpenCrosswalk, seconds: float, seed: int) -> Entrance
         ahead = (end - start) / np.linalg.norm(end - start)
         at_m = float(np.linalg.norm(end - start)) - _WALK_UP_M
         angle_deg = heading_to_sumo(math.atan2(ahead[1], ahead[0]))
-        for at_s in moments_s(_EVERY_S):
+        for at_s in moments_s():
             group = draws.coming
             draws.entered()
             name = f"c{len(entrances.ages)}"

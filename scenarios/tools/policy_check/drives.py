@@ -10,14 +10,12 @@ import math
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from types import MappingProxyType
 from typing import Final, Literal
 
 import msgspec
 import numpy as np
-import shapely
-from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose, wrap_angle
@@ -39,12 +37,7 @@ from physics.people.body import COATS
 from physics.people.wardrobe import Season, season_of
 from physics.sensors.caster import RayCaster
 from physics.street.surface import PlaceSurface
-from scenarios.episodes.wiring import (
-    CORRIDOR_M,
-    draw_empty_street,
-    privileged_state,
-    without_obstacles,
-)
+from scenarios.episodes.wiring import draw_empty_street, privileged_source, route_corridor
 from scenarios.places.nets import place, surface_of_place
 from scenarios.suites.catalog import load_suite
 
@@ -165,13 +158,7 @@ def _observer(
     """
     robot = robot_called(scenario.robot)
     street_map = place(scenario.place)[1]
-    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
-
-    @cache
-    def free() -> Polygon | MultiPolygon:
-        ground = without_obstacles(street_map.walkable_near(around), surface.standing(around))
-        return shapely.buffer(ground, -robot.width_m / 2)
-
+    walkable = street_map.walkable_near(route_corridor(scenario))
     world = stack.enter_context(BulletWorld(surface, robot=robot))
     cameras = {
         name: stack.enter_context(
@@ -197,7 +184,7 @@ def _observer(
         scenario,
         exact,
         0,
-        lambda now: privileged_state(scenario, free(), (), now),
+        privileged_source(scenario, robot, surface, street_map, walkable),
         cameras,
         look,
         rays,
