@@ -16,7 +16,14 @@ from cosim.core.state import LABELS, RobotState, Street
 from cosim.place.scan import HeightGrid, Scan, ScanArea, ScanFacts, ScanMesh, ScanSun, Splats
 from cosim.spec.camera import CameraSpec
 from cosim.spec.run_config import Appearance
-from scenarios.tools.bench.cameras import SIZE, BusyStreet, busy_street_at, camera_city, median_s
+from scenarios.tools.bench.cameras import (
+    SIZE,
+    BusyStreet,
+    busy_street_at,
+    camera_city,
+    median_s,
+    one_ahead,
+)
 
 STEP_M: Final = 0.3
 """Distance of the robot from frame to frame, metres: more than the lattice of eyes."""
@@ -78,13 +85,10 @@ def scanned_together(
     with Atlas(CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
         keys = [eyes.join(world) for _ in range(environments)]
 
-        def draw(street: Street) -> None:
-            tick = street.tick
-            eyes.begin([(key, robots[tick + k], busy.streets[tick]) for k, key in enumerate(keys)])
-            if tick:
-                eyes.end()
+        def begin(street: Street) -> None:
+            eyes.begin([(key, robots[street.tick + k], street) for k, key in enumerate(keys)])
 
-        return median_s(draw, busy.streets[:frames]) / environments
+        return median_s(one_ahead(begin, eyes.end), busy.streets[:frames]) / environments
 
 
 def _driving(persons: int, frames: int) -> tuple[BusyStreet, list[RobotState]]:
