@@ -24,7 +24,7 @@ from physics.cameras.gl.air import AirDrawing, LinearTarget
 from physics.cameras.gl.backdrop import Backdrop, SkySlot
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.driver import flush
-from physics.cameras.gl.gl_state import blending, polygon_offset
+from physics.cameras.gl.gl_state import blending, masked, polygon_offset
 from physics.cameras.gl.instances import Forms
 from physics.cameras.gl.lamps import casting_people
 from physics.cameras.gl.layers import LayerTarget, LayerTargets
@@ -370,7 +370,7 @@ class BatchDrawing:
         gl.depth_func = "<"
         self._draw_pass(part, stage, "colour")
         # Paint and the shade at feet change colours only; labels and depth stay those of the ground.
-        with polygon_offset(gl, -1.0, -8.0), target.only("colours"):
+        with polygon_offset(gl, -1.0, -8.0), masked(target.frame, only="colours"):
             self.street.draw_paint(part, style)
             with blending(gl):
                 gl.blend_func = moderngl.DST_COLOR, moderngl.SRC_COLOR
@@ -379,9 +379,9 @@ class BatchDrawing:
         gl.depth_func = "<="
         self._draw_sky(part, stage)
         # Glass shows what is behind it; its labels and depth are its own.
-        with blending(gl), target.only("colours"):
+        with blending(gl), masked(target.frame, only="colours"):
             self.street.draw_panes(part, False, style)
-        with target.only("labels"):
+        with masked(target.frame, only="labels"):
             self.street.draw_panes(part, True, style)
 
     def _draw_layers(self, part: PictureRange, picture: PictureOrder, layers: Layers) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 import moderngl
 
@@ -30,12 +31,21 @@ def blending(context: moderngl.Context) -> Iterator[None]:
 
 
 @contextmanager
-def depth_only(frame: moderngl.Framebuffer) -> Iterator[None]:
-    """Limit later draws into a framebuffer to depths."""
-    frame.color_mask = False, False, False, False
+def masked(
+    frame: moderngl.Framebuffer, only: Literal["colours", "labels", "depth"]
+) -> Iterator[None]:
+    """Limit later draws into a framebuffer to colours, to labels and depth, or to depth.
+
+    Labels are the fourth channel. Masks of one framebuffer change without a flush, which a second
+    framebuffer would need.
+    """
+    colours = only == "colours"
+    before = frame.color_mask, frame.depth_mask
+    frame.color_mask = colours, colours, colours, only == "labels"
+    frame.depth_mask = not colours
     frame.use()
     try:
         yield
     finally:
-        frame.color_mask = True, True, True, True
+        frame.color_mask, frame.depth_mask = before
         frame.use()

@@ -15,7 +15,7 @@ import numpy as np
 from cosim.core.geometry import Floats
 from physics.cameras.gl import corners, walls
 from physics.cameras.gl.context import is_card
-from physics.cameras.gl.gl_state import depth_only
+from physics.cameras.gl.gl_state import masked
 from physics.cameras.gl.instances import MATERIALS, POOLED, Forms, Material, ThingArrays
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.pool import Draws, MeshPool, PictureRange, Pool
@@ -200,7 +200,7 @@ class StreetDrawing:
         if is_card(gl) or not self._draws.count(step, part.first, part.end):
             self._draw_tiles("walls", "colour", style, part)
             return
-        with depth_only(gl.fbo):
+        with masked(gl.fbo, only="depth"):
             self._draws.draw(self._tile_array("walls", style)[1], step, part.first, part.end)
         gl.depth_func = "<="
         try:

@@ -6,10 +6,6 @@ readback.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Literal
-
 import cv2
 import moderngl
 import numpy as np
@@ -33,23 +29,6 @@ class Frame:
     def use(self) -> None:
         """Make it the target of later draws."""
         self.frame.use()
-
-    @contextmanager
-    def only(self, part: Literal["colours", "labels"]) -> Iterator[None]:
-        """Limit draws within a `with` block to colours, or to labels and depth.
-
-        Masks of one framebuffer change without a flush, which a second framebuffer would need.
-        """
-        colours = part == "colours"
-        self.frame.color_mask = (colours, colours, colours, not colours)
-        self.frame.depth_mask = not colours
-        self.frame.use()
-        try:
-            yield
-        finally:
-            self.frame.color_mask = (True, True, True, True)
-            self.frame.depth_mask = True
-            self.frame.use()
 
 
 class Target(Frame):
