@@ -76,6 +76,11 @@ def write_protect(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
+def write_protected_float32(array: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Return an array as write-protected contiguous float32: in place if it is one already."""
+    return write_protect(np.ascontiguousarray(array, dtype=np.float32))
+
+
 @dataclass(frozen=True, slots=True)
 class LegState:
     """Attitude and joints of a robot with legs.

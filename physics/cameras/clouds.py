@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from cosim.core.geometry import Floats
-from cosim.core.state import write_protect
+from cosim.core.state import write_protected_float32
 from physics.textures.noise import Field, Noise, smooth_step
 
 _SIZE: Final = 512
@@ -75,7 +75,7 @@ def _layer(seed: int) -> Field:
         8,
     )
     order = np.argsort(np.argsort(field, axis=None)).reshape(field.shape)
-    return write_protect(np.asarray(order / order.size, dtype=np.float32))
+    return write_protected_float32(order / order.size)
 
 
 def _dense(layer: Field, ways: Floats, cover: float, moved: Floats) -> Field:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
-from cosim.core.state import Frame, RobotState, write_protect
+from cosim.core.state import Frame, RobotState, write_protected_float32
 from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.robot import Mount
 from physics.textures.layers import LINEAR_OF_SRGB_BYTE, linear_to_srgb
@@ -217,13 +217,13 @@ def _rays(spec: CameraSpec) -> tuple[Map, Map]:
             )
         scale = np.where(bent > 1e-9, r / np.maximum(bent, 1e-9), 1.0)
         x, y = x * scale, y * scale
-    return _read_only(x), _read_only(y)
+    return write_protected_float32(x), write_protected_float32(y)
 
 
 @lru_cache(maxsize=2)
 def _noise(seed: int, size: int) -> Map:
     """Return normal noise of a scenario; each picture takes `size` values at its own offset."""
-    return _read_only(
+    return write_protected_float32(
         np.random.default_rng([seed, 0x1E45]).standard_normal(size + _OFFSETS, dtype=np.float32)
     )
 
@@ -234,7 +234,7 @@ def _falloff(spec: CameraSpec) -> Map:
     of 1.
     """
     x, y = _rays(spec)
-    return _read_only(1.0 - spec.lens.vignette * (1.0 - (1.0 + x**2 + y**2) ** -2.0))
+    return write_protected_float32(1.0 - spec.lens.vignette * (1.0 - (1.0 + x**2 + y**2) ** -2.0))
 
 
 @lru_cache(maxsize=8)
@@ -262,15 +262,10 @@ def _flows(spec: CameraSpec) -> tuple[Map, Map]:
     flows = []
     for speed, turn in ((ahead, np.zeros(3)), (swing, up)):
         moved = -speed * near[..., None] - np.cross(turn, rays)
-        flows.append(_read_only(moved[..., :2] - rays[..., :2] * moved[..., 2:]))
+        flows.append(write_protected_float32(moved[..., :2] - rays[..., :2] * moved[..., 2:]))
     return flows[0], flows[1]
 
 
 def _flow(spec: CameraSpec, robot: RobotState) -> Map:
     ahead, turn = _flows(spec)
     return ahead * np.float32(robot.v_mps) + turn * np.float32(robot.w_radps)
-
-
-def _read_only(field: NDArray[np.floating[Any]]) -> Map:
-    """Return an array as write-protected contiguous float32."""
-    return write_protect(np.ascontiguousarray(field, dtype=np.float32))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.state import write_protect
+from cosim.core.state import write_protected_float32
 
 Field = NDArray[np.floating[Any]]
 """(S, S) values."""
@@ -159,7 +159,7 @@ def _clouds(size: int, cells: int) -> Field:
     # Warping hides the grid of the random values.
     bend = [np.float32(0.10 * size / cells) * _resized(_grid(rng, cells), size) for _ in range(2)]
     total = warp(total, bend[0], bend[1])
-    return _read_only((total - total.mean()) / total.std())
+    return write_protected_float32((total - total.mean()) / total.std())
 
 
 def _grid(rng: np.random.Generator, cells: int) -> Field:
@@ -177,7 +177,7 @@ def _grain(size: int, soft_px: float) -> Field:
         )
         # Averaging lowers the contrast; the square root restores half of the loss.
         field *= np.float32(np.sqrt(1.0 / max(float(field.std()), 1e-6)))
-    return _read_only(
+    return write_protected_float32(
         field / max(1.0, float(field.std())) if soft_px == 0.0 else field / field.std()
     )
 
@@ -189,8 +189,3 @@ def _resized(grid: Field, size: int) -> Field:
     fy, fx = size // rows, size // columns
     drawn = cv2.resize(wide, ((columns + 6) * fx, (rows + 6) * fy), interpolation=cv2.INTER_CUBIC)
     return np.asarray(drawn[3 * fy : 3 * fy + size, 3 * fx : 3 * fx + size])
-
-
-def _read_only(field: NDArray[np.floating]) -> Field:
-    """Return an array as write-protected contiguous float32."""
-    return write_protect(np.ascontiguousarray(field, dtype=np.float32))
