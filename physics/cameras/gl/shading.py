@@ -118,17 +118,16 @@ _MEMBERS: Final = (
 )
 _DECLARED: Final = "".join(f"    {kind} {name};\n" for kind, name in _MEMBERS)
 
-_BLOCK: Final = f"""#version 430
+_VERSION: Final = "#version 430\n"
+_LAYER_EXTENSION: Final = "#extension GL_ARB_shader_viewport_layer_array : require\n"
+"""For vertex shaders, which select the layer; other shaders have no such extension."""
+_BLOCK: Final = f"""
 layout(std140, binding = 0) uniform Scene {{
 {_DECLARED}}};
 """
-
-_BLOCKS: Final = f"""#version 430
-EXTENSION
+_BLOCKS: Final = f"""
 layout(std140, binding = 0) uniform Scenes {{ vec4 rows[{_BLOCK_ROWS * PICTURES_MAX}]; }};
 """
-_LAYER_EXTENSION: Final = "#extension GL_ARB_shader_viewport_layer_array : require"
-"""For vertex shaders, which select the layer; other shaders have no such extension."""
 
 
 def _of_picture() -> str:
@@ -322,7 +321,7 @@ float snow_on(vec3 at, float raised, float label) {
 )
 """Code of the variants with `Variant.WEATHER`."""
 
-_NOTHING = "#version 430\nvoid main() {}\n"
+_NOTHING: Final = "void main() {}\n"
 
 
 @lru_cache(maxsize=128)
@@ -338,24 +337,15 @@ def programs(
     Equal programs are shared during the context's lifetime, so set their uniforms before each draw.
     """
     variant = Variant(shadows)
-    layers = Variant.LAYERS in variant
-    head = (_BLOCKS.replace("EXTENSION", "") if layers else _BLOCK) + variant.defines
-    head += _LAYERS_FRAGMENT if layers else ""
-    weather = BLOCK if variant & Variant.WEATHER else ""
     return Programs(
         context.program(
             vertex_shader=_before_vertex(variant) + vertex,
-            fragment_shader=head
-            + weather
-            + _DECODED
-            + _SHADOW
-            + _FRAGMENT.replace("WEATHER_CODE", _WEATHER)
-            + fragment,
+            fragment_shader=_before_fragment(variant) + fragment,
         ),
         context.program(
             # These programs draw into the shadow maps, so they must not read them.
             vertex_shader=_before_vertex(variant & ~Variant.SHADOWS) + vertex,
-            fragment_shader=f"#version 430\n{cut_out}" if cut_out else _NOTHING,
+            fragment_shader=_VERSION + (cut_out or _NOTHING),
         ),
     )
 
@@ -363,9 +353,19 @@ def programs(
 def _before_vertex(variant: Variant) -> str:
     """Return the GLSL before a drawable's vertex shader."""
     if Variant.LAYERS in variant:
-        head = _BLOCKS.replace("EXTENSION", _LAYER_EXTENSION)
-        return head + variant.defines + _SCENE_MAP + _DECODED + _SHADOW + _LAYERS_VERTEX
-    return _BLOCK + variant.defines + _DECODED + _SHADOW + _VERTEX
+        head = _VERSION + _LAYER_EXTENSION + _BLOCKS + variant.defines + _SCENE_MAP
+        return head + _DECODED + _SHADOW + _LAYERS_VERTEX
+    return _VERSION + _BLOCK + variant.defines + _DECODED + _SHADOW + _VERTEX
+
+
+def _before_fragment(variant: Variant) -> str:
+    """Return the GLSL before a drawable's fragment shader."""
+    if Variant.LAYERS in variant:
+        head = _VERSION + _BLOCKS + variant.defines + _LAYERS_FRAGMENT
+    else:
+        head = _VERSION + _BLOCK + variant.defines
+    weather = BLOCK if variant & Variant.WEATHER else ""
+    return head + weather + _DECODED + _SHADOW + _FRAGMENT.replace("WEATHER_CODE", _WEATHER)
 
 
 def anchor_of(eye_m: Floats) -> Floats:
