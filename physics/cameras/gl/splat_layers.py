@@ -34,8 +34,6 @@ from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
 _SIZES_MAX: Final = 4
 _ALWAYS: Final = "1"
 """Depth function of moderngl that passes every pixel."""
-_FEET_UNIT: Final = 19
-"""Texture unit of the light that is left at feet."""
 _CLOUDS_MAX: Final = 2
 """Unused clouds that stay on the renderer."""
 _CONTACT: Final = 0.5
@@ -54,7 +52,7 @@ layout(binding = {glsl.MESH_DEPTH_UNIT}) uniform sampler2D mesh_depth;
 layout(binding = {glsl.COLOUR_UNIT}) uniform sampler2D splats;
 layout(binding = {glsl.MEDIAN_UNIT}) uniform sampler2D median;
 layout(binding = {glsl.LIMITS_UNIT}) uniform sampler2D limits;
-layout(binding = {_FEET_UNIT}) uniform sampler2D at_feet;
+layout(binding = {glsl.FEET_UNIT}) uniform sampler2D at_feet;
 uniform int first_row;
 in vec2 spot;
 {glsl.METRES}
@@ -120,7 +118,7 @@ class Layers:
             (self._depths[0], glsl.OBJECTS_DEPTH_UNIT),
             (self._mesh, glsl.MESH_UNIT),
             (self._depths[1], glsl.MESH_DEPTH_UNIT),
-            (self._feet, _FEET_UNIT),
+            (self._feet, glsl.FEET_UNIT),
         ):
             texture.use(unit)
 

@@ -52,7 +52,9 @@ MESH_DEPTH_UNIT: Final = 12
 COLOUR_UNIT: Final = 13
 MEDIAN_UNIT: Final = 14
 LIMITS_UNIT: Final = 15
-"""Texture units of a picture's layers."""
+FEET_UNIT: Final = 19
+"""Texture units of a picture's layers, the last of the light left at feet; 16 to 18 are those of
+`physics.cameras.gl.weather_shaders`."""
 
 METRES: Final = f"""
 float metres(float depth) {{
