@@ -270,6 +270,10 @@ class Log:
         """Whether the robot has legs."""
         return self.legs.shape[1:] > (0,)
 
+    def tick_at(self, seconds: float) -> int:
+        """Return the tick nearest to a time of the episode."""
+        return round(seconds / self.tick_s)
+
     def robot(self, tick: int) -> RobotState:
         """Return the robot's pose at the end of a tick, with attitude and joints if it has legs.
 

@@ -302,7 +302,7 @@ def _passing(outcome: TriggeredEvent, log: Log) -> Passing | None:
     """Return the motion in an event's window; None without one."""
     if outcome.triggered_at_s is None or outcome.passed_at_s is None:
         return None
-    first, end = (round(at / log.tick_s) for at in (outcome.triggered_at_s, outcome.passed_at_s))
+    first, end = log.tick_at(outcome.triggered_at_s), log.tick_at(outcome.passed_at_s)
     return passing_of(log.route_s_m, log.speed[:, 0], log.tick_s, first, end)
 
 

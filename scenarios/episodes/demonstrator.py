@@ -253,7 +253,7 @@ class _Rows:
         extras = {name: np.stack(rows) for name, rows in self._extras.items()}
         if "scene" in extras:
             triggered = {
-                one.id: round(one.triggered_at_s / log.tick_s)
+                one.id: log.tick_at(one.triggered_at_s)
                 for one in record.events
                 if one.triggered_at_s is not None
             }

@@ -132,7 +132,7 @@ def test_a_decoy_is_solved_only_by_going_on() -> None:
     assert (record.status, record.ended, passed.rule_met) == ("done", "goal", True), record
     assert record.measures["success"] == 1.0 and record.scenario.decoy_of == "gesturing-064"
     assert passed.passed_at_s is not None and passed.passing_mps == pytest.approx(1.2, abs=0.1)
-    end = round(passed.passed_at_s / log.tick_s) - 1
+    end = log.tick_at(passed.passed_at_s) - 1
     assert log.route_s_m[end] == pytest.approx(event.route_s_m + 1.0, abs=0.1)
     assert not [*contradictions(record, scenario, log)]
 

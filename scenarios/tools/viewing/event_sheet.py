@@ -78,7 +78,7 @@ def rows_of(
         if at_s is None:
             continue
         tracks = log.event_tracks[log.event_tracks[:, 1] == number]
-        first = round(at_s / log.tick_s)
+        first = log.tick_at(at_s)
         before = max(first - 1, 0)
         trigger_m = event.route_s_m - float(log.route_s_m[before] if first else 0.0)
         stated_m = event.trigger_m
