@@ -13,7 +13,7 @@ from cosim.spec.manifest import Manifest
 class Stop:
     """Never moves."""
 
-    manifest = Manifest("stop")
+    manifest = Manifest("stop", camera=None)
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Do nothing: the policy has no state."""
@@ -25,7 +25,7 @@ class Stop:
 class Straight:
     """Drives straight ahead at four fifths of the robot's cruising speed."""
 
-    manifest = Manifest("straight")
+    manifest = Manifest("straight", camera=None)
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Do nothing: the policy has no state."""

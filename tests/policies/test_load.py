@@ -326,6 +326,12 @@ def test_a_missing_module_is_reported_with_the_search_path(
     )
 
 
+@pytest.mark.parametrize("name", ["stop", "straight"])
+def test_the_simplest_baselines_are_blind(name: str) -> None:
+    """`stop` and `straight` have no sensor, so their runs draw no pictures."""
+    assert load_policy(name).manifest.track == "blind"
+
+
 def test_shipped_policies_of_different_files_have_different_hashes() -> None:
     """Two shipped policies have the same hash only if their classes are in the same file."""
     loaded = [load_policy(name) for name in POLICIES]

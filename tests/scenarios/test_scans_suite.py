@@ -10,7 +10,6 @@ import msgspec
 import pytest
 
 from cosim.core.errors import MapError, UsageError
-from cosim.policies.load import load_policy
 from cosim.spec.scenario import CityMap
 from scenarios.episodes.run_episode import run_episode
 from scenarios.places.nets import place
@@ -26,6 +25,7 @@ from scenarios.places.scan_places import (
 from scenarios.suites.catalog import SUITES, load_suite
 from scenarios.suites.proofs import read_proofs
 from scenarios.suites.recipes import LONG_WAY, RECIPES, SCANS_ROUTE_M
+from scenarios.tools.bench.environment import StraightWithPictures
 from scenarios.tools.build.claims import CLAIMS, Read
 from scenarios.tools.build.place_claims import faults_in_places
 from sumo_nets.maps.map_store import map_hash, maps_folder
@@ -114,10 +114,11 @@ def test_a_preset_gives_the_map_of_the_suite(name: str, empty_cache: None) -> No
 
 @pytest.mark.engine
 def test_a_generated_scan_is_made_and_driven_on() -> None:
-    """On the first scenario `straight` drives to an end, and the oracle repeats its proof."""
+    """On the first scenario a policy with pictures drives to an end, and the oracle repeats its
+    proof."""
     scenario = load_suite("scans").scenarios[0]
     assert isinstance(scenario.place, CityMap)
     assert isinstance(SCAN_PLACES[scenario.place.map], GeneratedScan)
     proofs = read_proofs(SUITES["scans"])
     assert list(faults_in_places([scenario], [scenario.id], proofs)) == []
-    assert run_episode(scenario, load_policy("straight")).record.status == "done"
+    assert run_episode(scenario, StraightWithPictures()).record.status == "done"

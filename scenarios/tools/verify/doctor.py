@@ -15,8 +15,8 @@ from cosim.core.cache import cache_folder
 from cosim.core.errors import EngineError, MachineError
 from cosim.core.versions import versions
 from cosim.place.walk_graph import WalkGraph
-from cosim.policies.baselines import Straight
 from cosim.spec.events import EventQuery
+from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
@@ -28,6 +28,8 @@ from scenarios.runs.isolated_policy import sandbox_lacks
 from scenarios.suites.long_horizon import build_long_horizon
 
 _SMALL = City(seed=1, size_m=500.0)
+_SEEING = Manifest("doctor")
+"""Manifest of a policy with the default camera."""
 OWN = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
@@ -94,7 +96,7 @@ def cameras() -> str:
 def frame() -> str:
     """Run one frame and one step of a small city, with crowd and physics."""
     scenario = small_scenario()
-    with Episode(scenario, Straight.manifest) as episode:
+    with Episode(scenario, _SEEING) as episode:
         picture = episode.reset().rgb
         if picture is None or len(np.unique(picture.reshape(-1, 3), axis=0)) < 5:
             raise EngineError("the camera's picture is blank")
