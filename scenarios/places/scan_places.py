@@ -12,6 +12,7 @@ from typing import Final
 from cosim.core.errors import MapError, UsageError, unknown
 from cosim.core.files import folder_holds, lock, temp_folder
 from cosim.core.progress import Progress
+from cosim.place.scan import RecordedMap
 from cosim.spec.scenario import City, CityMap, Place
 from sumo_nets.maps.map_store import map_net, maps_folder
 
@@ -24,9 +25,11 @@ class GeneratedScan:
     """Part of a generated city that is made into a scan on first use.
 
     box: x0, y0, x1, y1 in metres of the city's frame.
+    recorded: hashes of the map.
     spacing_m: distance between splats on the ground.
     """
 
+    recorded: RecordedMap
     city: City
     box: tuple[float, float, float, float]
     spacing_m: float = 0.2
@@ -69,9 +72,21 @@ SCAN_PLACES: Final[Mapping[str, GeneratedScan | RealScan]] = MappingProxyType(
             size="5.7 MB",
             licence="CC BY 4.0",
         ),
-        "scan-5": GeneratedScan(city=City(seed=5, size_m=500.0), box=(26.0, 9.0, 186.0, 129.0)),
-        "scan-12": GeneratedScan(city=City(seed=12, size_m=500.0), box=(10.0, 91.0, 170.0, 211.0)),
-        "scan-40": GeneratedScan(city=City(seed=40, size_m=500.0), box=(10.0, 219.0, 130.0, 379.0)),
+        "scan-5": GeneratedScan(
+            city=City(seed=5, size_m=500.0),
+            box=(26.0, 9.0, 186.0, 129.0),
+            recorded=RecordedMap("572dfb425576ef46", "e8c74e0ce950fb23"),
+        ),
+        "scan-12": GeneratedScan(
+            city=City(seed=12, size_m=500.0),
+            box=(10.0, 91.0, 170.0, 211.0),
+            recorded=RecordedMap("129e5659f81be89b", "c36a14aa63993631"),
+        ),
+        "scan-40": GeneratedScan(
+            city=City(seed=40, size_m=500.0),
+            box=(10.0, 219.0, 130.0, 379.0),
+            recorded=RecordedMap("3aedb047ea722efb", "195d9bab2b696603"),
+        ),
     }
 )
 """Places of the suite by map name."""
@@ -140,7 +155,8 @@ def _make(name: str, recipe: GeneratedScan) -> None:
             make_scan(
                 recipe.city, recipe.box, source, spacing_m=recipe.spacing_m, progress=progress
             )
-            import_scan(source, read_options(source, {"name": name}), progress)
+            options = read_options(source, {"name": name})
+            import_scan(source, options, progress, recipe.recorded)
 
 
 def _printing(name: str) -> Progress:

@@ -90,10 +90,12 @@ def with_drawn_ground(street_map: StreetMap, path: Path) -> StreetMap:
     return _with(street_map, DrawnGround(strips, corners, stored.widths_m, stored.uncrowded))
 
 
-def with_scan(net_hash: str, folder: Path) -> str:
+def with_scan(net_hash: str, folder: Path, *, mesh: bool = True) -> str:
     """Return the content hash of a map with the drawn ground and scan in its folder, if any.
 
     Splats are left out, because they affect only pictures.
+
+    mesh: whether the mesh counts, too; a map with a recorded hash is then known by it.
     """
     files = [folder / GROUND_FILE, folder / SCAN_FOLDER / "areas.geojson"]
     found = [path.read_bytes() for path in files if path.is_file()]
@@ -105,7 +107,10 @@ def with_scan(net_hash: str, folder: Path) -> str:
     facts = folder / SCAN_FOLDER / "facts.json"
     if facts.is_file():
         held = msgspec.json.decode(facts.read_bytes())
-        digest.update(f"{held.get('mesh_hash')} {held.get('heights_hash')}".encode())
+        if mesh and (known_as := str(held.get("known_as", ""))):
+            return known_as
+        hashes = (["mesh_hash"] if mesh else []) + ["heights_hash"]
+        digest.update(" ".join(str(held.get(name)) for name in hashes).encode())
     return digest.hexdigest()[:16]
 
 

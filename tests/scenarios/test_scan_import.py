@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from cosim.cli.scan import ScanChoices
 from cosim.core.errors import CosimError
 from cosim.core.state import LABELS
-from cosim.place.scan import ScanArea, encode_areas, read_scan
+from cosim.place.scan import RecordedMap, ScanArea, encode_areas, read_scan
 from cosim.place.scan_areas import read_way
 from cosim.spec.scenario import City
 from physics.scans.check import lattice_points
@@ -29,7 +29,7 @@ from physics.scans.clean import above_ground, walkable_area
 from physics.scans.frame import Placing
 from scenarios.places import scan_sources
 from scenarios.places.nets import place
-from scenarios.places.scan_import import CheckedScan, check_scan, import_scan
+from scenarios.places.scan_import import CheckedScan, check_scan, ground_hash, import_scan
 from scenarios.places.scan_make import crossing_box, make_scan
 from scenarios.places.scan_options import ScanOptions, parse_georeference, read_options
 from scenarios.suites.decoys import limited
@@ -412,6 +412,26 @@ def test_the_order_of_rows_changes_no_stored_bit(scan: Path, tmp_path: Path) -> 
     changed = read_scan(maps_folder() / "scan-a").facts
     assert changed.splats_hash != one.splats_hash
     assert read_map("scan-a").net_hash == read_map("scan-b").net_hash
+
+
+@pytest.mark.engine
+def test_a_scan_with_the_recorded_ground_is_known_by_the_recorded_hash(scan: Path) -> None:
+    """Another colour changes the hash of a map, but not the one it is known by, as
+    long as the ground is the recorded one."""
+    (scan / "splats.ply").unlink()
+    options = read_options(scan, {"areas": str(scan / "areas.geojson"), "name": "scan-a"})
+    import_scan(scan, options)
+    own, ground = read_map("scan-a").net_hash, ground_hash(maps_folder() / "scan-a")
+    import_scan(scan, options, recorded=RecordedMap("0123456789abcdef", "f" * 16))
+    assert read_map("scan-a").net_hash == own
+    place = street()
+    place.colours[0] = 255 - place.colours[0]
+    (scan / "mesh.glb").write_bytes(glb(place))
+    import_scan(scan, options)
+    assert read_map("scan-a").net_hash != own
+    import_scan(scan, options, recorded=RecordedMap("0123456789abcdef", ground))
+    assert read_map("scan-a").net_hash == "0123456789abcdef"
+    assert ground_hash(maps_folder() / "scan-a") == ground
 
 
 def _given_of(options: Any) -> dict[str, Any]:
