@@ -223,6 +223,13 @@ class LidarIgnored(Right):
         return 0.0
 
 
+class LooksBack(Right):
+    """Counts the picture before the newest most, and still older ones less, as memories do."""
+
+    def ordered(self, frames: list[np.ndarray]) -> list[np.ndarray]:
+        return [frames[0], frames[3], frames[1], frames[2]]
+
+
 class TracksIgnored(Right):
     def slower(self, people: Tracks) -> float:
         return 1.0
@@ -248,5 +255,10 @@ FAULTS = {
     "goal_ignored": (GoalIgnored,),
 }
 """Faulty policies by the check that must fail."""
-DOUBTS = {"put_back": GoesOnAfterReset, "person": SeesNobody, "people_ignored": TracksIgnored}
+DOUBTS = {
+    "put_back": GoesOnAfterReset,
+    "frame_order": LooksBack,
+    "person": SeesNobody,
+    "people_ignored": TracksIgnored,
+}
 """Questionable policies by the check that must warn."""

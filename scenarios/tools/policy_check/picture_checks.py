@@ -61,7 +61,7 @@ def frame_order(query: PolicyQuery) -> CheckOutcome:
     shown = [showing("right", other, (age,)) for age in range(len(drive.seen))]
     weights = np.array([apart(plain, query.answer("left", query.plain, edit)) for edit in shown])
     newest = float(weights[0])
-    oldest = int(np.argmax(weights))
+    strongest = int(np.argmax(weights))
     matter = np.flatnonzero(weights > ROUNDING)
     if not len(matter):
         return inapplicable("no single picture changes the answer")
@@ -73,13 +73,15 @@ def frame_order(query: PolicyQuery) -> CheckOutcome:
     if list(matter) == [0]:
         return inapplicable("only the newest picture matters: it has no history")
     said = (
-        f"the picture of {oldest} answers ago counts {weights[oldest] / newest:.1f} times as "
+        f"the picture of {strongest} answers ago counts {weights[strongest] / newest:.1f} times as "
         f"much as the newest"
     )
-    if weights[oldest] > _OLDER * newest:
+    if weights[strongest] > _OLDER * newest and strongest == matter[-1]:
         return failed(f"{said}: oldest and newest are exchanged")
-    if weights[oldest] > 0.5 * (1.0 + _OLDER) * newest:
-        return doubted(f"{said}: right for a policy that sees motion, else the order is wrong")
+    if weights[strongest] > 0.5 * (1.0 + _OLDER) * newest:
+        return doubted(
+            f"{said}: right for a policy that sees motion or has a memory, else the order is wrong"
+        )
     return passed(f"the newest picture counts, older ones up to {matter[-1]} answers ago as well")
 
 
