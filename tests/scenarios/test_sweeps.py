@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
 
 from cosim.core.errors import MachineError
 from cosim.report.curves import draw_curves, top_of
@@ -120,6 +122,19 @@ def test_no_text_of_a_sweeps_picture_is_cut_off(
         )
         == []
     )
+
+
+def test_metrics_without_a_value_have_no_panel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On suites without people no empty panel shows distances to people."""
+    titles: list[str] = []
+    monkeypatch.setattr(Axes, "set_title", lambda self, title, **_: titles.append(title))
+    rows = [
+        {"weather": name, "metric": metric, "mean": mean, "low": mean, "high": mean, "n": 9}
+        for name in ("clear", "snow")
+        for metric, mean in (("success", 0.5), ("pedestrian_distance_min_m", math.nan))
+    ]
+    draw_curves(pd.DataFrame(rows), ["weather"], ["success", "pedestrian_distance_min_m"], "unit")
+    assert titles == ["success (SR)"]
 
 
 @pytest.fixture(scope="module")

@@ -204,7 +204,7 @@ def test_an_invalid_command_crashes_with_a_description(
     printed once."""
     type_name = TWIST if words == "finite" else TWIST_STAMPED
     with (
-        open_driver(endpoint, start_s=1.5) as driver,
+        open_driver(endpoint, start_s=4.0) as driver,  # a busy machine answers after seconds
         Peer(
             endpoint,
             lambda peer, seen: [peer.node.publish(CMD_VEL, sends(seen)) for _ in range(3)] and None,
