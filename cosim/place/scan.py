@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -104,6 +104,20 @@ class ScanSun(msgspec.Struct, frozen=True, kw_only=True):
     elevation_deg: float
 
 
+class RecordedMap(msgspec.Struct, frozen=True):
+    """Hashes of a generated scan as it was recorded.
+
+    Processors round differently, and a few of a million triangles of its mesh depend on the last
+    bit. So a map with the recorded ground has the recorded hash.
+
+    map_hash: to which frozen suites refer.
+    ground_hash: of net, drawn ground, areas and heights, which are equal on every processor.
+    """
+
+    map_hash: str
+    ground_hash: str
+
+
 class ScanFacts(msgspec.Struct, frozen=True, kw_only=True):
     """Origin and properties of a scan.
 
@@ -117,7 +131,7 @@ class ScanFacts(msgspec.Struct, frozen=True, kw_only=True):
     versions: of the importer and of libraries that affect the result.
     mesh_hash, splats_hash, heights_hash, areas_hash: content hashes; splats_hash is "" without
         splats.
-    known_as: recorded hash of the map, see `RecordedMap`; "" for other maps.
+    recorded: hashes of a generated scan of a suite.
     """
 
     name: str
@@ -136,21 +150,7 @@ class ScanFacts(msgspec.Struct, frozen=True, kw_only=True):
     splats_hash: str = ""
     heights_hash: str = ""
     areas_hash: str = ""
-    known_as: str = ""
-
-
-class RecordedMap(NamedTuple):
-    """Hashes of a generated scan as it was recorded.
-
-    Processors round differently, and a few of a million triangles of its mesh depend on the last
-    bit. So a map with the same ground is known by the recorded hash.
-
-    map_hash: to which frozen suites refer.
-    ground_hash: of net, drawn ground, areas and heights, which are equal on every processor.
-    """
-
-    map_hash: str
-    ground_hash: str
+    recorded: RecordedMap | None = None
 
 
 class ScanArea(msgspec.Struct, frozen=True):
@@ -245,14 +245,8 @@ def write_scan(scan: Scan, map_folder: Path) -> ScanFacts:
         ).hexdigest()[:16],
         areas_hash=hashlib.sha256(areas).hexdigest()[:16],
     )
-    write_facts(facts, map_folder)
+    (folder / _FACTS).write_bytes(msgspec.json.format(msgspec.json.encode(facts), indent=2))
     return facts
-
-
-def write_facts(facts: ScanFacts, map_folder: Path) -> None:
-    """Write the facts of a scan into the folder of its map. Raises OSError."""
-    words = msgspec.json.format(msgspec.json.encode(facts), indent=2)
-    (map_folder / SCAN_FOLDER / _FACTS).write_bytes(words)
 
 
 def parse_areas(data: bytes) -> tuple[ScanArea, ...]:

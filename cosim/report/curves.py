@@ -68,7 +68,9 @@ def draw_curves(
     title: str,
     joined: bool = True,
 ) -> bytes:
-    """Draw the means with their intervals as PNG, a panel for each metric that has any.
+    """Draw the means with their intervals as PNG.
+
+    Metrics without any mean have no panel, unless no metric has one.
 
     summary: rows of fields, metric, mean, low, high, n
     joined: whether lines join the means
@@ -83,7 +85,7 @@ def draw_curves(
             "no picture of the sweep: matplotlib is missing: `pip install matplotlib`, then "
             "the same with --resume"
         ) from error
-    known = set(summary["metric"][summary["mean"].notna()])
+    known = set(summary.loc[summary["mean"].notna(), "metric"])
     metrics = [metric for metric in metrics if metric in known] or metrics
     first, *others = fields
     x, ticks = _x_positions(summary[first])

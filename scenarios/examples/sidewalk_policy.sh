@@ -55,12 +55,12 @@ packed() { # names...: packs their collections, when all are done
   done
 }
 round() { # name, number, words of the driver...: collects in parallel, then packs
-  local k=$1 number=$2 first=$((900 + 100 * $2)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0 some; shift 2
-  some=$(awk "BEGIN { print int(3 * $JOBS * $COLLECT) + 3 }")  # more than fit in COLLECT minutes, to be drawn in seconds
+  local k=$1 number=$2 first=$((900 + 100 * $2)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0 limit; shift 2
+  limit=$(awk "BEGIN { print int(3 * $JOBS * $COLLECT) + 3 }")  # an upper limit: drawing more would take long
   local common=(--city-size 1000 --seed "$number" --astray 0.3 --unsolved "$@")
   local all=(--cities $first:$((first + CITIES)) "${common[@]}")
-  gather "$k-unit" 0.08 0 "$some" unit "${all[@]}" &
-  gather "$k-long" 0.22 $((GPUS - 1)) "$((some / 3))" long-horizon "${all[@]}" &
+  gather "$k-unit" 0.08 0 "$limit" unit "${all[@]}" &
+  gather "$k-long" 0.22 $((GPUS - 1)) "$((limit / 3))" long-horizon "${all[@]}" &
   while [ $gpu -lt "$GPUS" ]; do
     names+=("$k-reactive-$gpu")
     gather "$k-reactive-$gpu" "0.56 / $GPUS" $gpu "$MOST" reactive --decoys \
@@ -69,7 +69,7 @@ round() { # name, number, words of the driver...: collects in parallel, then pac
   done
   for robot in $ROBOTS; do
     names+=("$k-$robot")
-    gather "$k-$robot" 0.07 $((${#names[@]} % GPUS)) "$some" reactive --decoys --robot "$robot" "${all[@]}" &
+    gather "$k-$robot" 0.07 $((${#names[@]} % GPUS)) "$limit" reactive --decoys --robot "$robot" "${all[@]}" &
   done
   wait
   packed "${names[@]}"

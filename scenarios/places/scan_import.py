@@ -26,7 +26,6 @@ from cosim.place.scan import (
     ScanArea,
     ScanFacts,
     Splats,
-    write_facts,
     write_scan,
 )
 from physics.scans.check import (
@@ -45,10 +44,8 @@ from physics.scans.mesh_distance import MeshDistance
 from scenarios.places.chosen_areas import find_areas
 from scenarios.places.scan_options import ScanOptions
 from scenarios.places.scan_sources import LoadedScan, level_hint, load_mesh, load_splats, splat_hint
-from sumo_nets.maps.ground_file import with_scan
 from sumo_nets.maps.import_rules import IMPORTER_VERSION
 from sumo_nets.maps.map_store import About, licence_texts, map_name, store_map
-from sumo_nets.net.raw_file import net_content_hash
 
 SCAN_IMPORTER: Final = 1
 """Version of the import of scans. It rises when the same files give another result."""
@@ -75,7 +72,7 @@ def import_scan(
 ) -> tuple[About, CheckedScan]:
     """Import the scan in a folder, and store it as a map.
 
-    recorded: hashes of a generated scan, by which it is known if its ground is the recorded one.
+    recorded: hashes of a generated scan of a suite.
 
     Raises MapError with the first refusal, UsageError for a wrong name. Then nothing is stored.
     """
@@ -94,19 +91,12 @@ def import_scan(
         built.extend(note(words) for words in net.findings)
         progress("writing the scan")
         found = tuple(str(one) for one in (*checked.findings, *built))
-        facts = msgspec.structs.replace(scan.facts, name=name, findings=found)
-        facts = write_scan(dataclasses.replace(scan, facts=facts), ready)
-        if recorded is not None and ground_hash(ready) == recorded.ground_hash:
-            write_facts(msgspec.structs.replace(facts, known_as=recorded.map_hash), ready)
+        facts = msgspec.structs.replace(scan.facts, name=name, findings=found, recorded=recorded)
+        write_scan(dataclasses.replace(scan, facts=facts), ready)
         return _about(name, folder, facts, found, options)
 
     about = store_map(name, fill)
     return about, CheckedScan(scan, (*checked.findings, *built))
-
-
-def ground_hash(map_folder: Path) -> str:
-    """Return the hash of a map's net, drawn ground, areas and heights."""
-    return with_scan(net_content_hash(map_folder / "net.xml"), map_folder, mesh=False)
 
 
 def check_scan(folder: Path, options: ScanOptions, progress: Progress = ignore) -> CheckedScan:

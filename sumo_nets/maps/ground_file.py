@@ -90,13 +90,31 @@ def with_drawn_ground(street_map: StreetMap, path: Path) -> StreetMap:
     return _with(street_map, DrawnGround(strips, corners, stored.widths_m, stored.uncrowded))
 
 
-def with_scan(net_hash: str, folder: Path, *, mesh: bool = True) -> str:
+def with_scan(net_hash: str, folder: Path) -> str:
     """Return the content hash of a map with the drawn ground and scan in its folder, if any.
 
-    Splats are left out, because they affect only pictures.
-
-    mesh: whether the mesh counts, too; a map with a recorded hash is then known by it.
+    Splats are left out, because they affect only pictures. A generated scan of a suite has its
+    recorded hash if its ground is the recorded one.
     """
+    facts = folder / SCAN_FOLDER / "facts.json"
+    if not facts.is_file():
+        return _with_files(net_hash, folder, "")
+    held = msgspec.json.decode(facts.read_bytes())
+    recorded = held.get("recorded")
+    if recorded and ground_hash(net_hash, folder) == recorded["ground_hash"]:
+        return str(recorded["map_hash"])
+    return _with_files(net_hash, folder, f"{held.get('mesh_hash')} {held.get('heights_hash')}")
+
+
+def ground_hash(net_hash: str, folder: Path) -> str:
+    """Return the hash of what a scan's map has in common on every processor: all but its mesh."""
+    held = msgspec.json.decode((folder / SCAN_FOLDER / "facts.json").read_bytes())
+    return _with_files(net_hash, folder, str(held.get("heights_hash")))
+
+
+def _with_files(net_hash: str, folder: Path, more: str) -> str:
+    """Return the hash of a net, of the drawn ground and areas in its folder, if any, and of
+    more."""
     files = [folder / GROUND_FILE, folder / SCAN_FOLDER / "areas.geojson"]
     found = [path.read_bytes() for path in files if path.is_file()]
     if not found:
@@ -104,13 +122,7 @@ def with_scan(net_hash: str, folder: Path, *, mesh: bool = True) -> str:
     digest = hashlib.sha256(net_hash.encode())
     for data in found:
         digest.update(hashlib.sha256(data).digest())
-    facts = folder / SCAN_FOLDER / "facts.json"
-    if facts.is_file():
-        held = msgspec.json.decode(facts.read_bytes())
-        if mesh and (known_as := str(held.get("known_as", ""))):
-            return known_as
-        hashes = (["mesh_hash"] if mesh else []) + ["heights_hash"]
-        digest.update(" ".join(str(held.get(name)) for name in hashes).encode())
+    digest.update(more.encode())
     return digest.hexdigest()[:16]
 
 

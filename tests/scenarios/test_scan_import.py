@@ -29,14 +29,16 @@ from physics.scans.clean import above_ground, walkable_area
 from physics.scans.frame import Placing
 from scenarios.places import scan_sources
 from scenarios.places.nets import place
-from scenarios.places.scan_import import CheckedScan, check_scan, ground_hash, import_scan
+from scenarios.places.scan_import import CheckedScan, check_scan, import_scan
 from scenarios.places.scan_make import crossing_box, make_scan
 from scenarios.places.scan_options import ScanOptions, parse_georeference, read_options
 from scenarios.suites.decoys import limited
 from scenarios.suites.proofs import Proof
 from scenarios.suites.sample import suite_on_map
 from scenarios.tools.build.proving import proved
-from sumo_nets.maps.map_store import maps_folder, read_map
+from sumo_nets.maps.ground_file import ground_hash
+from sumo_nets.maps.map_store import map_hash, maps_folder, read_map
+from sumo_nets.net.raw_file import net_content_hash
 from tests.conftest import Cosim
 from tests.support.documents import blocks, text_of
 from tests.support.moved_scenarios import moved_scenario
@@ -415,13 +417,16 @@ def test_the_order_of_rows_changes_no_stored_bit(scan: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.engine
-def test_a_scan_with_the_recorded_ground_is_known_by_the_recorded_hash(scan: Path) -> None:
-    """Another colour changes the hash of a map, but not the one it is known by, as
-    long as the ground is the recorded one."""
+def test_a_scan_with_the_recorded_ground_has_the_recorded_hash(scan: Path) -> None:
+    """Another colour of its mesh does not matter, and another ground or a changed net does."""
     (scan / "splats.ply").unlink()
     options = read_options(scan, {"areas": str(scan / "areas.geojson"), "name": "scan-a"})
     import_scan(scan, options)
-    own, ground = read_map("scan-a").net_hash, ground_hash(maps_folder() / "scan-a")
+    folder = maps_folder() / "scan-a"
+    own, ground = (
+        read_map("scan-a").net_hash,
+        ground_hash(net_content_hash(folder / "net.xml"), folder),
+    )
     import_scan(scan, options, recorded=RecordedMap("0123456789abcdef", "f" * 16))
     assert read_map("scan-a").net_hash == own
     place = street()
@@ -430,8 +435,10 @@ def test_a_scan_with_the_recorded_ground_is_known_by_the_recorded_hash(scan: Pat
     import_scan(scan, options)
     assert read_map("scan-a").net_hash != own
     import_scan(scan, options, recorded=RecordedMap("0123456789abcdef", ground))
-    assert read_map("scan-a").net_hash == "0123456789abcdef"
-    assert ground_hash(maps_folder() / "scan-a") == ground
+    assert read_map("scan-a").net_hash == map_hash(folder / "net.xml") == "0123456789abcdef"
+    net = (folder / "net.xml").read_text()
+    (folder / "net.xml").write_text(net.replace('speed="', 'speed="1', 1))
+    assert map_hash(folder / "net.xml") not in (own, "0123456789abcdef")
 
 
 def _given_of(options: Any) -> dict[str, Any]:

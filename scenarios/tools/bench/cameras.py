@@ -153,7 +153,6 @@ def together(environments: int, frames: int, size_m: float) -> float:
     spec = CameraSpec(*SIZE, fov_deg=60.0)
     with Atlas(spec) as eyes:
         keys = [eyes.join(world) for _ in range(environments)]
-
         draw = one_ahead(
             lambda street: eyes.begin([(key, busy.robot, street) for key in keys]), eyes.end
         )
