@@ -2,7 +2,7 @@
 
 Windows that contain a moment in which the expert stops or starts are oversampled. A window is
 augmented as a whole: half are mirrored, brightness and tint vary, pictures are shifted, and speeds
-are hidden.
+and motion between two pictures are hidden.
 
 The held-out episodes depend on the names of their scenarios alone. An event and its decoy are on
 the same side, and a later round of DAgger never trains on what an earlier one held out.
@@ -51,8 +51,15 @@ STEPS: Final = 40
 """Steps of a window; 8 s at 5 Hz."""
 DECOY: Final = "-decoy"
 """End of the id of a decoy."""
+WAITS_MPS: Final = 0.02
+"""Command in m/s below which the expert waits. Turns almost on the spot are faster."""
 _HIDDEN_SPEEDS: Final = 0.6
 """Share of windows whose speeds are hidden, see `examples`."""
+_FROZEN: Final = 0.4
+"""Share of windows whose pictures are each shown twice, as at the start of an episode.
+
+Two equal pictures tell a network that the robot is at rest, and at rest an expert mostly waits.
+"""
 _FROM_START: Final = 0.15
 """Share of windows that begin with an episode."""
 _ROOM: Final = 0.75
@@ -162,7 +169,9 @@ class WindowExamples:
         visible = draws.random(size) >= _HIDDEN_SPEEDS
         off_px = draws.integers(0, 2 * SHIFT_PX + 1, (2, size, 1))
         mirrored = draws.random(size) < 0.5
-        return self.windows(start, STEPS, _Changes(np.exp(light), visible, off_px, mirrored))
+        frozen = draws.random(size) < _FROZEN
+        changes = _Changes(np.exp(light), visible, off_px, mirrored, frozen)
+        return self.windows(start, STEPS, changes)
 
     def windows(
         self, start: NDArray[np.int64], steps: int, changes: _Changes | None = None
@@ -181,20 +190,24 @@ class WindowExamples:
         before = np.maximum(start - 1, self._first[start])[:, None]
         shown = torch.from_numpy(np.concatenate([before, rows], 1)).to(self._frames.device)
         frames = _pictures_of(self._frames[shown].to(self._device), changes)
+        earlier, newest = frames[:, :-1], frames[:, 1:]
+        if changes is not None:
+            frozen = torch.from_numpy(changes.frozen).to(self._device)
+            earlier = torch.where(_shaped(frozen, earlier), newest, earlier)
         at = torch.from_numpy(rows).to(self._device)
         here = torch.from_numpy(rows[valid]).to(self._device)
         command = self._rows["command"][here]
         driven = self._rows["driven"][here]
         nothing = torch.zeros((len(here), 0), device=self._device)
         batch = Windows(
-            pictures=torch.cat([frames[:, :-1], frames[:, 1:]], 4).permute(0, 1, 4, 2, 3),
+            pictures=torch.cat([earlier, newest], 4).permute(0, 1, 4, 2, 3),
             goal=scaled_goal(self._rows["goal"][at]),
             speeds=scaled_speeds(self._rows["state"][at]),
             valid=torch.from_numpy(valid).to(self._device),
             places=torch.from_numpy(np.flatnonzero(valid)).to(self._device),
             speed=command[:, 0] / CRUISE_MPS,
             turn=command[:, 1].clamp(-TURN_UNIT_RADPS, TURN_UNIT_RADPS),
-            stop=(command[:, 0] < STOPS_MPS).float(),
+            stop=(command[:, 0] < WAITS_MPS).float(),
             way=self._rows["waypoints"][here][:, :WAYPOINTS],
             driven=(torch.arange(WAYPOINTS, device=self._device) < driven[:, None]).float(),
             weight=self.weight[here],
@@ -235,12 +248,14 @@ class _Changes:
     visible: (B,) whether speeds are shown
     off_px: (2, B, 1) shift of the pictures down and right, from 0 to 2 SHIFT_PX
     mirrored: (B,) whether left and right are exchanged
+    frozen: (B,) whether the picture before each one is replaced by it
     """
 
     light: NDArray[np.float64]
     visible: NDArray[np.bool_]
     off_px: NDArray[np.int64]
     mirrored: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
 
 
 def _pictures_of(frames: Tensor, changes: _Changes | None) -> Tensor:

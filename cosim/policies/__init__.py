@@ -9,6 +9,7 @@ from cosim.episode.interfaces import Policy
 from cosim.policies.baselines import Stop, Straight
 from cosim.policies.nav.policy import Nav
 from cosim.policies.privileged.orca import Orca
+from cosim.policies.privileged.orca_hasty import HastyOrca
 from cosim.policies.privileged.route import Route
 from cosim.policies.privileged.social_force import SocialForce
 
@@ -19,6 +20,7 @@ POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
         "nav": Nav,
         "route": Route,
         "orca": Orca,
+        "orca-hasty": HastyOrca,
         "social_force": SocialForce,
     }
 )

@@ -39,7 +39,7 @@ from cosim.learning.memory_network import (  # noqa: E402
     forward_steps,
     new_memory_parameters,
 )
-from cosim.learning.network import HEIGHT_PX, WAYPOINTS, WIDTH_PX, plan  # noqa: E402
+from cosim.learning.network import CRUISE_MPS, HEIGHT_PX, WAYPOINTS, WIDTH_PX, plan  # noqa: E402
 from cosim.learning.settings import Training  # noqa: E402
 from cosim.learning.sidewalk import FREE_UNIT_M, HAND, SIDEWALK, near_loss  # noqa: E402
 from cosim.learning.training import _batches, train  # noqa: E402
@@ -184,6 +184,27 @@ def test_windows_stay_in_their_episode(data: Path) -> None:
     first, second = batch.pictures[0, 0, :3], batch.pictures[0, 0, 3:]
     assert torch.equal(first, second)
     assert torch.equal(batch.pictures[1, 0, :3], batch.pictures[0, 2, 3:])
+
+
+def test_a_share_of_the_windows_shows_each_picture_twice(data: Path) -> None:
+    """In these, all pairs of pictures are equal; in the others only the first one may be."""
+    batch = WindowExamples([data], BRISK, CPU).drawn(0, 0, 40)
+    earlier, newest = batch.pictures[:, 1:, :3], batch.pictures[:, 1:, 3:]
+    equal = (earlier == newest).flatten(2).all(2)
+    valid = batch.valid[:, 1:]
+    frozen = torch.stack([row[there].all() for row, there in zip(equal, valid, strict=True)])
+    moving = torch.stack([row[there].any() for row, there in zip(equal, valid, strict=True)])
+    assert torch.equal(frozen, moving) and 8 <= int(frozen.sum()) <= 24
+
+
+def test_an_expert_that_turns_almost_on_the_spot_does_not_wait(tmp_path: Path) -> None:
+    """Commands of 0 m/s are stops, and 0.05 m/s is a speed to be learned."""
+    packed = street()
+    packed.command[:, 0] = np.where(np.arange(len(packed)) % 2, 0.05, 0.0)
+    packed.save(tmp_path / "d.npz")
+    batch = WindowExamples([tmp_path / "d.npz"], BRISK, CPU).windows(np.array([0]), 6)
+    assert batch.stop.tolist() == [1.0, 0.0] * 3
+    assert batch.speed[1::2].tolist() == pytest.approx([0.05 / CRUISE_MPS] * 3)
 
 
 def test_the_mirror_exchanges_left_and_right_in_labels_too(data: Path) -> None:

@@ -25,6 +25,7 @@ from cosim.policies.privileged.orca import (
     gesture_limit,
     vehicle_violation,
 )
+from cosim.policies.privileged.orca_hasty import HastyOrca
 from cosim.policies.privileged.people_prediction import Yielding, gaps_to_people
 from cosim.policies.privileged.rollout import STEP_S, Plans, SampledPath, roll_out
 from cosim.policies.privileged.route import crossing_limit
@@ -227,6 +228,23 @@ def test_the_oracle_waits_for_oncoming_people_until_they_are_past() -> None:
     assert not patient.waits(stays, 5.2)
     for x_m, heading in ((8.0, math.pi - 0.3), (8.0, 0.0), (9.0, math.pi)):
         assert not Yielding().waits(knowledge(people((x_m, 0.0, heading, 1.4, "walk"))), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "doing", "v_mps", "differ"),
+    [(7.0, "stand", 0.0, True), (7.0, "stand", 1.2, False), (6.8, "stop", 0.0, False)],
+)
+def test_only_at_rest_the_hasty_oracle_moves_where_the_oracle_waits_out_of_caution(
+    x_m: float, doing: Doing, v_mps: float, differ: bool
+) -> None:
+    """Two people 1.2 m apart stand 2 m ahead: the oracle waits, the hasty one goes round them. A
+    raised hand stops both."""
+    ahead = people((x_m, 0.6, math.pi, 0.0, doing), (x_m, -0.6, math.pi, 0.0, "stand"))
+    known = knowledge(ahead, v_mps=v_mps)
+    seen = Observation(0, 0.0, None, v_mps, 0.0, COURIER, known)
+    calm, hasty = (PolicyCaller(one()).act(seen) for one in (Orca, HastyOrca))
+    assert calm.v_mps == 0.0
+    assert (hasty.v_mps > 0.1 and hasty.w_radps != 0.0) if differ else hasty == calm
 
 
 def test_near_people_count_at_their_current_place_too() -> None:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -103,6 +103,8 @@ _PAST_END_M: Final = 0.05
 """Metres before the end of the path at which the robot has missed the goal and replans."""
 _PATIENCE_S: Final = 3.0
 """Seconds without progress after which the robot is stuck."""
+_AT_REST_MPS: Final = 0.3
+"""Speed in m/s below which the robot is at rest."""
 _LED_ANEW_S: Final = 1.6
 """Seconds without progress after which the path is planned again around standing people."""
 STUCK_M: Final = 0.5
@@ -163,6 +165,8 @@ class Orca:
     """Oracle that predicts, yields, avoids groups and obeys gestures; privileged."""
 
     manifest = Manifest("orca", version="5", rate_hz=5.0, camera=None, privileged=True)
+    patient: ClassVar[bool] = True
+    """Whether it waits out of caution, up to `_PATIENCE_S`, where a tighter plan would move."""
 
     def __init__(self) -> None:
         self.reset("", 0)
@@ -211,13 +215,17 @@ class Orca:
         gaps = gaps_to_people(known, robot, ahead, people, ends)
         weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
         out, deeper = outside_area(known, here, ahead, axis_points(robot))
-        cost = (
-            weights.edge * out
-            + _SOLID_COST * deeper
-            + _NEARNESS_COST * vehicle_violation(known, disks, ahead)
-        )
-        score = self._scores(known, here, plans, ahead, gaps, wished, aim_m, weights) - cost
-        best = int(np.argmax(score))
+        near_cars = vehicle_violation(known, disks, ahead)
+
+        def best_plan(weights: Weights) -> int:
+            cost = weights.edge * out + _SOLID_COST * deeper + _NEARNESS_COST * near_cars
+            score = self._scores(known, here, plans, ahead, gaps, wished, aim_m, weights) - cost
+            return int(np.argmax(score))
+
+        best = best_plan(weights)
+        may_drive = limit_mps >= 0.1 and abs(state.v_mps) < _AT_REST_MPS
+        if not self.patient and may_drive and plans.speed_mps[best] == 0.0:
+            best = best_plan(STUCK)
         if plans.speed_mps[best] > 0.0:
             self._lane_m = float(plans.lane_m[best]) if plans.delay_s[best] == 0.0 else self._lane_m
         v_mps, w_radps = ahead.command[:, best]
