@@ -34,7 +34,7 @@ from cosim.learning.packed_checks import check_pictures, check_rows, common_meta
 HELD_OUT: Final = 0.1
 """Share of episodes that are held out."""
 STOPS_MPS: Final = 0.3
-"""Speed below which a command is a stop and a robot is at rest."""
+"""Speed below which a robot is at rest, and a command a stop of the network `small`."""
 DARK: Final = 0.6
 BRIGHT: Final = 1.5
 """Least and largest factor of the brightness of augmented pictures."""

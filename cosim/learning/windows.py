@@ -51,7 +51,7 @@ STEPS: Final = 40
 """Steps of a window; 8 s at 5 Hz."""
 DECOY: Final = "-decoy"
 """End of the id of a decoy."""
-WAITS_MPS: Final = 0.02
+WAITS_MPS: Final = 0.005
 """Command in m/s below which the expert waits. Turns almost on the spot are faster."""
 _HIDDEN_SPEEDS: Final = 0.6
 """Share of windows whose speeds are hidden, see `examples`."""
@@ -59,6 +59,7 @@ _FROZEN: Final = 0.4
 """Share of windows whose pictures are each shown twice, as at the start of an episode.
 
 Two equal pictures tell a network that the robot is at rest, and at rest an expert mostly waits.
+In these windows it must decide by what it sees.
 """
 _FROM_START: Final = 0.15
 """Share of windows that begin with an episode."""
@@ -145,7 +146,7 @@ class WindowExamples:
         arrays = ("state", "goal", "command", "waypoints", "driven", *labels)
         self._rows = {name: joined(name) for name in arrays}
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
-        changes = self.learned[((command < STOPS_MPS) != (state < STOPS_MPS))[self.learned]]
+        changes = self.learned[((command < WAITS_MPS) != (state < STOPS_MPS))[self.learned]]
         self._changes = changes if len(changes) else self.learned
         rewards = [_rewards(one) for one in packed]
         self.returns = discounted_returns(

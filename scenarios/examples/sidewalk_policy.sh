@@ -16,7 +16,7 @@
 # The table of a suite is WORK/SUITE.md, its picture WORK/SUITE.png: all policies, compared with the first one.
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
 # MOST: most episodes of a collection (100000); small ones are drawn faster, which matters on few cores.
-# EXPERT: whose commands are stored (orca-hasty, which at rest does not wait out of caution).
+# EXPERT: whose commands are stored (orca-hasty, which at rest does not wait out of caution). EXPERT=orca continues older folders.
 # ROBOTS: further robots that collect, besides the courier ("scout dog"). WEATHERS: names from which each episode's is drawn.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)

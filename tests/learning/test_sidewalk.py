@@ -198,13 +198,13 @@ def test_a_share_of_the_windows_shows_each_picture_twice(data: Path) -> None:
 
 
 def test_an_expert_that_turns_almost_on_the_spot_does_not_wait(tmp_path: Path) -> None:
-    """Commands of 0 m/s are stops, and 0.05 m/s is a speed to be learned."""
+    """Commands of 0 m/s are stops, and 0.01 m/s, the slowest turn, is a speed to be learned."""
     packed = street()
-    packed.command[:, 0] = np.where(np.arange(len(packed)) % 2, 0.05, 0.0)
+    packed.command[:, 0] = np.where(np.arange(len(packed)) % 2, 0.01, 0.0)
     packed.save(tmp_path / "d.npz")
     batch = WindowExamples([tmp_path / "d.npz"], BRISK, CPU).windows(np.array([0]), 6)
     assert batch.stop.tolist() == [1.0, 0.0] * 3
-    assert batch.speed[1::2].tolist() == pytest.approx([0.05 / CRUISE_MPS] * 3)
+    assert batch.speed[1::2].tolist() == pytest.approx([0.01 / CRUISE_MPS] * 3)
 
 
 def test_the_mirror_exchanges_left_and_right_in_labels_too(data: Path) -> None:

@@ -1,1 +1,2 @@
-"""Policies that know the simulator's state: `orca` (the oracle), `route`, `social_force`."""
+"""Policies that know the simulator's state: `orca` (the oracle), `orca-hasty`, `route`,
+`social_force`."""

@@ -186,7 +186,7 @@ class Orca:
     def act(self, observation: Observation) -> Command:
         known = observation.privileged
         if known is None:
-            raise ValueError("policy orca needs privileged state")
+            raise ValueError(f"policy {self.manifest.name} needs privileged state")
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
         robot = observation.robot

@@ -11,7 +11,7 @@ from cosim.spec.manifest import Manifest
 
 
 class HastyOrca(Orca):
-    """Oracle that at rest takes a tighter plan instead of waiting out of caution; privileged."""
+    """Oracle that at rest moves if a tighter plan can, instead of waiting; privileged."""
 
     manifest = Manifest("orca-hasty", version="1", rate_hz=5.0, camera=None, privileged=True)
     patient = False
