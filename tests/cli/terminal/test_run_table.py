@@ -190,13 +190,18 @@ def test_a_table_omits_cameras_and_waypoints_that_a_policy_lacks(
 
 
 def test_the_list_marks_privileged_policies() -> None:
-    """`orca` is the oracle; it and two other baselines are privileged, those that see are not."""
+    """`orca` is the oracle; it and three other baselines are privileged, those that see are not."""
     out, output = terminal()
     print_names(out)
     named = [
         line.split("  ")[1] for line in output.getvalue().splitlines() if line.startswith("policy ")
     ]
-    privileged = ["route (privileged)", "orca (oracle, privileged)", "social_force (privileged)"]
+    privileged = [
+        "route (privileged)",
+        "orca (oracle, privileged)",
+        "orca-hasty (privileged)",
+        "social_force (privileged)",
+    ]
     assert [name for name in named if "privileged" in name] == privileged
     assert {"stop", "straight", "nav", "small"} <= {*named}
 
