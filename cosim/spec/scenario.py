@@ -421,6 +421,11 @@ class Suite(Ranged, frozen=True, kw_only=True):
         """SHA-256 of the suite's canonical JSON, 16 hex digits."""
         return content_hash(self)
 
+    @property
+    def ends_on_failure(self) -> bool:
+        """Whether all scenarios end on a failure, so that rates of failures mean nothing."""
+        return all(one.ends_on_failure for one in self.scenarios)
+
 
 def split_called(name: str | None) -> Split | None:
     """Return the split with a name. Raises UsageError with the valid names."""
