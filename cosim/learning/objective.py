@@ -98,15 +98,19 @@ class PlanErrors:
         """Return the mean loss and errors.
 
         These are mean errors of speed and turn if both move, the mean error of the last waypoint,
-        and recall and precision of stops.
+        and recall and precision of stops. A mean over no rows is NaN.
         """
         sums = self._sums
-        moving, ends = max(sums["moving"], 1.0), max(sums["ends"], 1.0)
         return {
-            "held_out_loss": sums["loss"] / max(self._rows, 1),
-            "speed_error_mps": sums["speed"] / moving,
-            "turn_error_radps": sums["turn"] / moving,
-            "way_error_m": sums["way"] / ends,
-            "stops_found": sums["stops_found"] / max(sums["stops"], 1.0),
-            "stops_right": sums["stops_found"] / max(sums["stops_predicted"], 1.0),
+            "held_out_loss": mean(sums["loss"], self._rows),
+            "speed_error_mps": mean(sums["speed"], sums["moving"]),
+            "turn_error_radps": mean(sums["turn"], sums["moving"]),
+            "way_error_m": mean(sums["way"], sums["ends"]),
+            "stops_found": mean(sums["stops_found"], sums["stops"]),
+            "stops_right": mean(sums["stops_found"], sums["stops_predicted"]),
         }
+
+
+def mean(total: float, count: float) -> float:
+    """Return the mean, NaN of nothing."""
+    return total / count if count else math.nan

@@ -26,7 +26,7 @@ from cosim.learning.memory_network import (
     new_memory_parameters,
 )
 from cosim.learning.network import NetworkOutput, Parameters, plan
-from cosim.learning.objective import PLAN_WEIGHTS, PlanErrors, plan_losses
+from cosim.learning.objective import PLAN_WEIGHTS, PlanErrors, mean, plan_losses
 from cosim.learning.settings import Training
 from cosim.learning.values import weights_of
 from cosim.learning.windows import STEPS, WindowExamples, Windows
@@ -152,7 +152,7 @@ class _LabelErrors:
         self._sums[name] = total + float(values.sum()), count + len(values)
 
     def means(self) -> dict[str, float]:
-        return {name: total / max(count, 1) for name, (total, count) in self._sums.items()}
+        return {name: mean(*sums) for name, sums in self._sums.items()}
 
 
 _CLASSES: Final = ("signals_right", "events_right")

@@ -171,6 +171,22 @@ def test_a_stopped_and_resumed_training_has_the_same_bits(data: Path, tmp_path: 
     assert policy.manifest.name == "sidewalk" and not policy.manifest.privileged
 
 
+def test_a_mean_over_no_held_out_row_is_no_number(tmp_path: Path) -> None:
+    """Without a signal in the held-out episodes, their share of right signals is NaN in the curve,
+    and is not printed."""
+    packed = street()
+    path = tmp_path / "nothing.npz"
+    replace(packed, scene=np.zeros_like(packed.scene)).save(path)
+    said: list[str] = []
+    train([path], tmp_path / "net", BRISK, False, lambda words, _=None: said.append(words))
+    names, *_, row = (tmp_path / "net/curve.csv").read_text().splitlines()
+    curve = dict(zip(names.split(","), row.split(","), strict=True))
+    assert curve["signals_right"] == curve["events_right"] == "nan"
+    assert float(curve["held_out_loss"]) > 0.0
+    assert any("held out loss" in one for one in said)
+    assert not any("right nan" in one or "signals right" in one for one in said)
+
+
 def test_windows_stay_in_their_episode(data: Path) -> None:
     """A window longer than its episode ends with it, and its first picture is repeated."""
     packed = street()
