@@ -17,6 +17,7 @@
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
 # MOST: most episodes of a collection (100000); small ones are drawn faster, which matters on few cores.
 # EXPERT: whose commands are stored (orca-hasty, which at rest does not wait out of caution). EXPERT=orca continues older folders.
+# FOV: degrees of the camera from its lower to its upper edge (75; older folders have 60). A learner sees the same camera.
 # ROBOTS: further robots that collect, besides the courier ("scout dog"). WEATHERS: names from which each episode's is drawn.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
@@ -25,7 +26,7 @@ W=${1:?a folder to work in}
 VALUES=${VALUES-1} MORE=${MORE:-2000} EVENT=${EVENT:-gesturing} RUN=${RUN:-}
 ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-7} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
 SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
-MOST=${MOST:-100000} EXPERT=${EXPERT:-orca-hasty} ROBOTS=${ROBOTS-"scout dog"} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
+MOST=${MOST:-100000} EXPERT=${EXPERT:-orca-hasty} ROBOTS=${ROBOTS-"scout dog"} FOV=${FOV:-75} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
 mkdir -p "$W/demos" "$W/nets" "$W/runs"
 
 awk "BEGIN { exit !($COLLECT < ${MINUTES:-9}) }" || { echo "COLLECT=$COLLECT must be less than MINUTES=${MINUTES:-9}"; exit 2; }
@@ -44,7 +45,7 @@ gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes
       rm -f "$USED"; echo "no episode in COLLECT minutes: continuing"; exit 1
     fi
     echo $(($(cat "$USED" 2> /dev/null || echo 0) + SECONDS)) > "$USED"; [ $LAST = 1 ]' - \
-    $COSIM collect "$@" --policy "$EXPERT" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --fov 60 --labels --format raw \
+    $COSIM collect "$@" --policy "$EXPERT" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --fov "$FOV" --labels --format raw \
     --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
 )
 packed() { # names...: packs their collections, when all are done
