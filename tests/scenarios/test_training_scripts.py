@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 from pathlib import Path
 
@@ -10,10 +11,12 @@ import pytest
 
 from cosim.core.errors import UsageError
 from scenarios.examples.black_pictures import Blinded
+from tests.conftest import wait_until
 
 SCRIPT = Path(__file__).parents[2] / "scenarios/examples/sidewalk_policy.sh"
 COMMAND = """#!/usr/bin/env bash
 echo "$(basename "$0") $*" >> "$CALLS"
+[ -z "${NAP:-}" ] || { echo $$ >> "$CALLS.pids"; exec sleep "$NAP"; }
 while [ $# -gt 0 ]; do
   case $1 in
     collect) command=$1 ;;
@@ -33,21 +36,18 @@ esac
 """
 
 
-def run_script(
-    folder: Path, code: int = 4, **settings: str
-) -> tuple[subprocess.CompletedProcess[str], list[str]]:
-    """Run the script with these settings and this exit code of `cosim collect`; return the process
-    and its commands."""
+def begin_script(folder: Path, code: int = 4, **settings: str) -> subprocess.Popen[str]:
+    """Start the script with these settings and this exit code of `cosim collect`."""
     for name in ("cosim", "python"):
         (folder / name).write_text(COMMAND)
         (folder / name).chmod(0o755)
     calls = folder / "calls.txt"
     calls.write_text("")
-    done = subprocess.run(
+    return subprocess.Popen(
         ["bash", str(SCRIPT), str(folder / "work")],
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        check=False,
         env=os.environ
         | {"COSIM": str(folder / "cosim"), "PYTHON": str(folder / "python"), "CALLS": str(calls)}
         | {
@@ -63,7 +63,37 @@ def run_script(
         }
         | settings,
     )
-    return done, calls.read_text().splitlines()
+
+
+def run_script(
+    folder: Path, code: int = 4, **settings: str
+) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+    """Run the script; return the process and its commands."""
+    with begin_script(folder, code, **settings) as process:
+        out, errors = process.communicate()
+    done = subprocess.CompletedProcess(process.args, process.returncode, out, errors)
+    return done, (folder / "calls.txt").read_text().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGKILL, -9)]
+)
+def test_a_killed_script_leaves_no_second_training_in_its_folder(
+    tmp_path: Path, sent: signal.Signals, code: int
+) -> None:
+    """Ctrl-C and SIGTERM end its collections. After SIGKILL the next call is refused, until they
+    have ended."""
+    pids = tmp_path / "calls.txt.pids"
+    with begin_script(tmp_path, NAP="600") as process:
+        wait_until(lambda: pids.exists() and len(pids.read_text().splitlines()) == 3)
+        process.send_signal(sent)
+        assert process.wait() == code
+        if sent == signal.SIGKILL:
+            done, calls = run_script(tmp_path)
+            assert done.returncode == 1 and "is in use" in done.stdout and not calls
+            for pid in pids.read_text().splitlines():
+                os.kill(int(pid), signal.SIGTERM)
+    wait_until(lambda: run_script(tmp_path)[0].stdout.endswith("all done\n"))
 
 
 def test_a_collection_that_crashed_is_not_done(tmp_path: Path) -> None:
