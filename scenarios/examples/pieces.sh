@@ -10,6 +10,7 @@ mkdir -p "$W"
 # Steps inherit the lock: one that outlives a killed script holds it, too.
 exec 9> "$W/lock"
 flock -n 9 || { echo "$W is in use: another call works there, or a step of a killed one. Try again when it has ended, after ${MINUTES:-9} minutes at most"; exit 1; }
+trap 'end_steps; exit 129' HUP
 trap 'end_steps; exit 130' INT
 trap 'end_steps; exit 143' TERM
 

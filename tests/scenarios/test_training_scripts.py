@@ -36,6 +36,12 @@ esac
 """
 
 
+def _heed_signals() -> None:
+    """Reset signals that the tests' own parent ignores, as `nohup` does."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 def begin_script(folder: Path, code: int = 4, **settings: str) -> subprocess.Popen[str]:
     """Start the script with these settings and this exit code of `cosim collect`."""
     for name in ("cosim", "python"):
@@ -48,6 +54,7 @@ def begin_script(folder: Path, code: int = 4, **settings: str) -> subprocess.Pop
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=_heed_signals,
         env=os.environ
         | {"COSIM": str(folder / "cosim"), "PYTHON": str(folder / "python"), "CALLS": str(calls)}
         | {
@@ -76,13 +83,14 @@ def run_script(
 
 
 @pytest.mark.parametrize(
-    ("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGKILL, -9)]
+    ("sent", "code"),
+    [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129), (signal.SIGKILL, -9)],
 )
 def test_a_killed_script_leaves_no_second_training_in_its_folder(
     tmp_path: Path, sent: signal.Signals, code: int
 ) -> None:
-    """Ctrl-C and SIGTERM end its collections. After SIGKILL the next call is refused, until they
-    have ended."""
+    """Ctrl-C, SIGTERM and a closed terminal end its collections. After SIGKILL the next call is
+    refused, until they have ended."""
     pids = tmp_path / "calls.txt.pids"
     with begin_script(tmp_path, NAP="600") as process:
         wait_until(lambda: pids.exists() and len(pids.read_text().splitlines()) == 3)
