@@ -8,7 +8,7 @@
 # for COLLECT minutes (7, less than MINUTES) in all, with JOBS processes (16), in CITIES new cities (48), a multiple of GPUS.
 # COSIM, PYTHON: see small_policy.sh.
 # ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
-# SEEDS: trained on all rounds at the end ("0 1 2"; "" for none). GPUS: number of GPUs (1); each trains one network at a time.
+# SEEDS: trained on all rounds at the end ("0 1 2"; "" for none). GPUS: number of GPUs (1); each trains PER_GPU networks at a time (1).
 # VALUES: temperature of the fine-tuning on rewards (1; "" for none). The first seed's policy explores, and is trained on what it drove,
 # weighted by values, for MORE steps (2000). WORK/kept.txt has the better one of both on val.
 # ABLATIONS=1: trains seed 0 again with each change of docs/learning.md. QUESTIONS=1: fine-tunes on one EVENT (gesturing) alone, and
@@ -25,7 +25,7 @@ W=${1:?a folder to work in}
 . "$here/scenarios/examples/pieces.sh"
 VALUES=${VALUES-1} MORE=${MORE:-2000} EVENT=${EVENT:-gesturing} RUN=${RUN:-}
 ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-7} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
-SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
+SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} PER_GPU=${PER_GPU:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
 MOST=${MOST:-100000} EXPERT=${EXPERT:-orca-hasty} ROBOTS=${ROBOTS-"scout dog"} FOV=${FOV:-75} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
 mkdir -p "$W/demos" "$W/nets" "$W/runs"
 
@@ -87,11 +87,11 @@ sidewalk() { # name, last round, words...
   local name=$1 last=$2; shift 2
   network "$name" $(parts "$last") --steps "$STEPS" --rate 5e-4 "$@"
 }
-together() { # what, names...: trains in parallel, one network on each GPU
+together() { # what, names...: trains in parallel, PER_GPU networks on each GPU
   local what=$1 number=0 name; shift
   for name in "$@"; do
     CUDA_VISIBLE_DEVICES=$((number % GPUS)) "$what" "$name" &
-    number=$((number + 1)); [ $((number % GPUS)) = 0 ] && wait
+    number=$((number + 1)); [ $((number % (GPUS * PER_GPU))) = 0 ] && wait
   done
   wait
   for name in "$@"; do [ -e "$W/log/train-$name.done" ] || exit 1; done
@@ -160,7 +160,7 @@ if [ -n "$first" ] && [ "${QUESTIONS:-0}" = 1 ]; then
   names+=(event)
 fi
 if [ "${ABLATIONS:-0}" = 1 ]; then
-  changes=(share-0.01 share-0.1 no-memory no-auxiliary no-decoys no-weather)
+  changes=(share-0.01 share-0.1 share-0.3 share-0.5 no-memory no-auxiliary no-decoys no-weather)
   [ -n "$FROM" ] && changes+=(whole)  # without FROM it is sidewalk-0
   together ablation "${changes[@]}"
   names+=("${changes[@]}")

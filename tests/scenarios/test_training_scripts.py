@@ -151,6 +151,14 @@ def test_the_script_ends_with_a_table(
     assert sum("compare" in call for call in calls) == table
 
 
+def test_networks_share_gpus(tmp_path: Path) -> None:
+    """With two networks on each of two GPUs, five seeds are trained, each once."""
+    done, calls = run_script(tmp_path, SEEDS="0 1 2 3 4", GPUS="2", PER_GPU="2", CITIES="4")
+    assert done.returncode == 0 and done.stdout.endswith("all done\n"), done
+    trained = sorted(call.split("--name ")[1].split()[0] for call in calls if "--name" in call)
+    assert trained == [f"sidewalk-{seed}" for seed in range(5)]
+
+
 HEAD = "by,metric,value_before,value_after,verdict\n"
 
 
