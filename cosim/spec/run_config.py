@@ -368,7 +368,7 @@ class RunConfig:
     director_wait: Annotated[
         float,
         Option(
-            "Timeout of the director in seconds; then the episode has crashed.",
+            "Timeout of the director in seconds; then the episode is invalid.",
             least=0.1,
             most=LONGEST_WAIT_S,
             panel=_NETWORK,
