@@ -144,9 +144,7 @@ class DemoConfig:
         bool,
         Option("Store people, free ground, signals and events ahead, for auxiliary heads."),
     ] = False
-    decoys: Annotated[bool, Option("With --cities, drive the decoy of each event after it.")] = (
-        False
-    )
+    decoys: Annotated[bool, Option("With --cities, draw the decoy of each event, too.")] = False
     astray: Annotated[
         float,
         Option(

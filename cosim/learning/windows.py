@@ -332,13 +332,14 @@ def split_episodes(
     """Return which episodes are held out, and which are trained on.
 
     The settings of an ablation leave out training episodes alone. A smaller share is a part of a
-    larger one. Of few episodes the last scenario is held out.
+    larger one. An event, its decoy and all pieces of an episode are on one side, and used or left
+    out together. Of few episodes the last scenario is held out.
     """
     base = [zlib.crc32(name.removesuffix(DECOY).encode()) for name in names]
     held_out = np.array([np.random.default_rng([one, 0x4E1D]).random() < HELD_OUT for one in base])
     if held_out.all() or not held_out.any():
         held_out = np.array([one == base[-1] for one in base])
-    drawn = np.random.default_rng(0x5A4E).random(len(names))
+    drawn = np.array([np.random.default_rng([one, 0x5A4E]).random() for one in base])
     used = ~held_out & (drawn < training.share)
     if not training.decoys:
         used &= np.array([not name.endswith(DECOY) for name in names])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Final, NamedTuple
 
@@ -132,10 +133,17 @@ def summary_by_weather(result: RunComparison) -> pd.DataFrame:
     """Return a row for each weather, policy and metric of all runs: `summary_of` with these.
 
     Columns: weather, policy, metric, and those of `summary_of`; weathers in the order of
-    `WEATHERS`.
+    `WEATHERS`. Where a policy has several runs in one weather, the runs' names stand for it.
     """
     runs = (result.before, *result.others)
     names = [str(run.table["policy"].iloc[0]) for run in runs]
+    pairs = Counter(
+        (weather, name)
+        for run, name in zip(runs, names, strict=True)
+        for weather in run.table["weather"].unique()
+    )
+    if any(count > 1 for count in pairs.values()):
+        names = [run.label for run in runs]
     parts = []
     for weather in WEATHERS:
         for run, policy in zip(runs, names, strict=True):
@@ -184,15 +192,16 @@ def _mean_in_words(mean: float, low: float, high: float) -> str:
 
 
 def flips_in_words(result: RunComparison, other: ComparedRun) -> tuple[str, ...]:
-    """Return which scenarios only one of two runs solved, by name."""
+    """Return which scenarios only one of two runs solved, by name, and then which decoys."""
     flipped = result.flipped[result.flipped["after"] == other.label]
     lines = []
-    for flip, what in (
-        ("won", f"solved by {other.label} alone"),
-        ("lost", f"solved by {result.before.label} alone"),
-    ):
-        names = flipped.loc[flipped["flip"] == flip, "scenario"].tolist()
-        lines.append(f"{what}, {len(names)}: {', '.join(names) or 'none'}")
+    for decoys, of in ((False, ""), (True, "decoys ")):
+        for flip, run in (("won", other), ("lost", result.before)):
+            chosen = (flipped["flip"] == flip) & (flipped["decoy"] == decoys)
+            names = flipped.loc[chosen, "scenario"].tolist()
+            if names or not decoys:
+                alone = f"{of}solved by {run.label} alone"
+                lines.append(f"{alone}, {len(names)}: {', '.join(names) or 'none'}")
     return tuple(lines)
 
 

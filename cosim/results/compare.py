@@ -19,6 +19,7 @@ from cosim.results.discerned import (
     DISCERNED,
     episode_pairs,
     has_decoys,
+    is_decoy,
     with_discerned,
     without_decoys,
 )
@@ -173,6 +174,7 @@ FLIPPED: Final = (
     "scenario",
     "split",
     "structure",
+    "decoy",
     "flip",
     "ended_before",
     "ended_after",
@@ -349,7 +351,9 @@ def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
 
     The flip is "won" if the second run solved it, else "lost".
     """
-    table_before, table_after = (run.table.set_index("scenario") for run in (before, after))
+    table_before, table_after = (
+        run.table.assign(decoy=is_decoy(run.table)).set_index("scenario") for run in (before, after)
+    )
     rows = []
     for name in table_before.index.intersection(table_after.index):
         row_before, row_after = table_before.loc[name], table_after.loc[name]
@@ -370,6 +374,7 @@ def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
                     name,
                     row_before["split"],
                     row_before["structure"],
+                    bool(row_before["decoy"]),
                     flip,
                     *ends,
                 )
@@ -448,6 +453,12 @@ def _notes(runs: Sequence[VerifiedRun], compared: Sequence[ComparedRun]) -> Iter
             yield (
                 f"{first_label} sees by {first_camera}; {other.label} by {camera}: "
                 "a difference may be the camera's"
+            )
+        drawn, drawn_first = run.spec.setup.renderer, first.renderer
+        if camera and first_camera and drawn != drawn_first:
+            yield (
+                f"{first_label}'s pictures are drawn by {drawn_first}, {other.label}'s by {drawn}: "
+                "a small difference may be the renderer's"
             )
         if words := _looks_apart(runs[0], run):
             yield (

@@ -13,7 +13,8 @@
 # weighted by values, for MORE steps (2000). WORK/kept.txt has the better one of both on val.
 # ABLATIONS=1: trains seed 0 again with each change of docs/learning.md. QUESTIONS=1: fine-tunes on one EVENT (gesturing) alone, and
 # scores the first seed's policy with random goals in place of route goals. SPLIT, SUITES: what is scored (val; all three). RUN: more words for cosim run.
-# The table of a suite is WORK/SUITE.md, its picture WORK/SUITE.png: all policies, compared with the first one.
+# Tables are WORK/NAME.md, their pictures WORK/NAME.png; each compares with its first row. SUITE has all policies, SUITE-ablations the changes
+# against seed 0 from new parameters, reactive-black the policy that is kept with and without pictures.
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
 # MOST: most episodes of a collection (100000); small ones are drawn faster, which matters on few cores.
 # EXPERT: whose commands are stored (orca-hasty, which at rest does not wait out of caution). EXPERT=orca continues older folders.
@@ -110,6 +111,11 @@ compared() { # name, words...: compares runs, and shows the end of the output if
   local name=$1; shift
   $COSIM compare "$@" > "$W/log/compare-$name.txt" 2>&1 || { tail -n 3 "$W/log/compare-$name.txt"; exit 1; }
 }
+table() { # name, runs...: compares the others with the first one
+  local name=$1; shift
+  compared "$name" "$@" -o "$W/$name.md" -o "$W/$name.png" --by policy
+  echo "$name:"; cat "$W/$name.md"
+}
 values() { # learner: fine-tunes it on rewards; writes the better one of both on val to WORK/kept.txt
   local where=val-reactive name; [ "$SPLIT" = val ] && where=reactive
   round values $((FIRST + ROUNDS)) --learner "onnx:$W/nets/$1" --explore 0.3
@@ -146,7 +152,7 @@ for k in $(seq "$FIRST" $((FIRST + ROUNDS - 1))); do
     learner=$W/nets/round$k
   fi
 done
-names=()
+names=() changes=() control=
 for number in $SEEDS; do names+=("sidewalk-$number"); done
 together seed "${names[@]}"
 first=${names[0]:-} kept=${names[0]:-}
@@ -161,7 +167,8 @@ if [ -n "$first" ] && [ "${QUESTIONS:-0}" = 1 ]; then
 fi
 if [ "${ABLATIONS:-0}" = 1 ]; then
   changes=(share-0.01 share-0.1 share-0.3 share-0.5 no-memory no-auxiliary no-decoys no-weather)
-  [ -n "$FROM" ] && changes+=(whole)  # without FROM it is sidewalk-0
+  control=sidewalk-0  # seed 0, trained from new parameters on everything
+  if [ -n "$FROM" ] || [[ " $SEEDS " != *" 0 "* ]]; then changes+=(whole) control=whole; fi
   together ablation "${changes[@]}"
   names+=("${changes[@]}")
 fi
@@ -177,9 +184,13 @@ if [ -n "$first" ] && [[ " $SUITES " = *" reactive "* ]]; then
 fi
 for suite in $SUITES; do
   runs=()
-  for name in "${names[@]}" black random-goals; do [ -e "$W/runs/$suite-$name/run.json" ] && runs+=("$W/runs/$suite-$name"); done
-  [ ${#runs[@]} -gt 1 ] || continue
-  compared "$suite" "${runs[@]}" -o "$W/$suite.md" -o "$W/$suite.png" --by policy
-  echo "$suite:"; cat "$W/$suite.md"
+  for name in "${names[@]}" random-goals; do [ -e "$W/runs/$suite-$name/run.json" ] && runs+=("$W/runs/$suite-$name"); done
+  [ ${#runs[@]} -gt 1 ] && table "$suite" "${runs[@]}"
+  if [ -n "$control" ]; then
+    runs=("$W/runs/$suite-$control")
+    for name in "${changes[@]}"; do [ "$name" = "$control" ] || runs+=("$W/runs/$suite-$name"); done
+    table "$suite-ablations" "${runs[@]}"
+  fi
 done
+[ -e "$W/runs/reactive-black/run.json" ] && table reactive-black "$W/runs/reactive-$kept" "$W/runs/reactive-black"
 echo "all done"

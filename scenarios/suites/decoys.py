@@ -24,6 +24,8 @@ DECOY_FACTOR: Final = 1.3
 LIMIT_MORE_S: Final = 3.0
 GO_ON_SHARE: Final = 0.6
 """Least mean speed past the person of a decoy, as a share of the expert's."""
+DRAWN_GO_ON_MPS: Final = 0.8
+"""Least mean speed past the person of a drawn scenario, near the middle of those of `reactive`."""
 _TICKS_PER_S: Final = 20
 _GO_ON_DIGITS: Final = 4
 
@@ -93,6 +95,16 @@ def least_pace_mps(scenario: Scenario, expert_mps: float | None) -> float:
     if expert_mps is None or not any(event.decoy for event in scenario.events):
         return 0.0
     return round(GO_ON_SHARE * expert_mps, _GO_ON_DIGITS)
+
+
+def paced(scenario: Scenario) -> Scenario:
+    """Return a drawn scenario with the rules of its kind, though no proof says how fast to go on.
+
+    Events in which the robot must give way, and decoys in which nothing happens, get
+    `DRAWN_GO_ON_MPS`. Others are returned as they are.
+    """
+    judged = must_give_way(scenario) or any(event.decoy for event in scenario.events)
+    return msgspec.structs.replace(scenario, go_on_mps=DRAWN_GO_ON_MPS) if judged else scenario
 
 
 def limited(scenario: Scenario, expert_s: float, expert_mps: float | None) -> Scenario:

@@ -17,7 +17,7 @@ from cosim.spec.scenario import City, Scenario
 from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
 from scenarios.ipc.parallel_map import parallel_map
-from scenarios.suites.decoys import DECOY, decoy_of
+from scenarios.suites.decoys import DECOY, decoy_of, paced
 from scenarios.suites.recipes import LONG_WAY, Slot, candidate, repeated
 from scenarios.suites.unit import STRUCTURES
 from sumo_nets.city.store import SEEDS
@@ -84,7 +84,7 @@ class NewScenarios(msgspec.Struct, frozen=True, kw_only=True):
         again, city = divmod(turn, len(self.seeds))
         called, seed = self.structures[structure], self.seeds[city]
         if called.endswith(DECOY):
-            return decoy_of(self._one(number - 1))
+            return paced(decoy_of(self._one(number - 1)))
         length_m = np.random.default_rng([number, 0x1E46]).uniform(*_ROUTE_M)
         slot = Slot(
             name=f"{called}-{seed}-{again:03d}",
@@ -96,7 +96,7 @@ class NewScenarios(msgspec.Struct, frozen=True, kw_only=True):
             length_m=round(length_m, 1) if called == LONG_WAY else 0.0,
         )
         if called != STATIC:
-            return candidate(slot, again)
+            return paced(candidate(slot, again))
         return repeated(slot, candidate(replace(slot, structure=next(iter(EVENT_KINDS))), again))
 
 

@@ -245,8 +245,8 @@ def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
 
 
 def test_ablations_remove_only_training_episodes() -> None:
-    """Held-out episodes follow from names, with decoys on the side of their events; a smaller share
-    is a subset of a larger one."""
+    """Held-out episodes and shares follow from names, with decoys on the side of their events and
+    in any order of files; a smaller share is a subset of a larger one."""
     names = [f"{kind}-{k}{end}" for kind in "ab" for k in range(200) for end in ("", "-decoy")]
     weathers = ["clear", "clear", "rain", "rain"] * 200
 
@@ -258,6 +258,10 @@ def test_ablations_remove_only_training_episodes() -> None:
     assert (used == ~held_out).all()
     tenth, half = split(share=0.1)[1], split(share=0.5)[1]
     assert 0.05 < tenth.mean() < 0.15 and (half | ~tenth).all()
+    assert (half[::2] == half[1::2]).all()
+    names.reverse()
+    assert (split(share=0.5)[1] == half[::-1]).all()
+    names.reverse()
     assert not split(decoys=False)[1][1::2].any()
     assert not split(weather=False)[1][np.array(weathers) == "rain"].any()
     for changes in ({"share": 0.1}, {"decoys": False}, {"weather": False}):

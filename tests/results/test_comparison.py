@@ -17,7 +17,14 @@ import pytest
 from rich.console import Console
 
 from cosim.cli.run_table import print_table
-from cosim.report.compared import as_latex, as_markdown, flips_in_words, tables_of_comparison
+from cosim.report.compared import (
+    as_latex,
+    as_markdown,
+    flips_in_words,
+    summary_by_weather,
+    table_by_weather,
+    tables_of_comparison,
+)
 from cosim.results.compare import (
     RunComparison,
     compare_runs,
@@ -213,6 +220,32 @@ def test_runs_in_other_weathers_get_a_table_and_a_plot_but_no_verdict(
     table = table_of(read_verified_run(rain).records.values())
     print_table(Console(file=printed, width=200), table, 20, rain)
     assert printed.getvalue().count("weather rain") == 1
+
+
+def test_runs_of_one_policy_in_one_weather_keep_their_names(tmp_path: Path) -> None:
+    """Two runs in clear weather and a third in rain give three rows by weather."""
+    ways = scenarios_of(20)
+    runs = [
+        run_of(tmp_path / "first", [GOALS] * 20, "p", ways),
+        run_of(tmp_path / "second", [HIT] * 20, "p", ways),
+        run_of(tmp_path / "rain", [HIT] * 20, "p", ways, weather="rain"),
+    ]
+    rows = table_by_weather(summary_by_weather(compare_runs(runs))).rows
+    assert [row[:3] for row in rows] == [
+        ("clear", "first", "1.00 (0.84 to 1.00)"),
+        ("clear", "second", "0.00 (0.00 to 0.16)"),
+        ("rain", "rain", "0.00 (0.00 to 0.16)"),
+    ]
+
+
+def test_another_renderer_of_the_pictures_is_noted(runs: Path, tmp_path: Path) -> None:
+    """Two runs with a camera, drawn by a processor and by a GPU, have a note; blind ones none."""
+    seeing = rewritten(runs / "b", tmp_path / "seeing", camera={"width": 64, "height": 48})
+    drawn = rewritten(seeing, tmp_path / "drawn")
+    path = drawn / "run.json"
+    path.write_text(re.sub(r'"renderer": ?"[^"]*"', '"renderer":"gl: a GPU"', path.read_text()))
+    assert compare_runs([runs / "a", runs / "b"]).notes == ()
+    assert any("by gl: a GPU: a small" in note for note in compare_runs([seeing, drawn]).notes)
 
 
 @pytest.mark.parametrize("track", ["lidar", "people"])

@@ -4,6 +4,7 @@ files."""
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from cosim.core.errors import RunError, SpecError
 from cosim.core.progress import ignore
-from cosim.report.compared import as_latex, as_markdown
+from cosim.report.compared import as_latex, as_markdown, flips_in_words
 from cosim.report.page.page import Maps, colours_of, render_page
 from cosim.report.page.plots import plots_of
 from cosim.report.page.runs import read_runs
@@ -141,6 +142,17 @@ def test_a_comparison_pairs_the_pairs(runs: Path, tmp_path: Path) -> None:
     for text in (as_markdown(comparison), as_latex(comparison)):
         assert "discerned" in text and "D share of events solved with their decoys" in text
         assert any("lateral" in line and " D " in line for line in text.splitlines())
+
+
+def test_decoys_solved_by_one_run_alone_are_listed_apart(runs: Path) -> None:
+    """Scenarios won minus lost are the change of SR; decoys have lines of their own."""
+    comparison = compare_runs([runs / "a", runs / "b"])
+    success = comparison.differences.set_index(["metric", "group"]).loc[("success", "reactive")]
+    lines = flips_in_words(comparison, comparison.others[0])
+    won, lost, *decoys = (int(re.findall(r"alone, (\d+):", line)[0]) for line in lines)
+    assert won - lost == round(success["n"] * success["difference"]) and "decoy" not in lines[0]
+    assert sum(decoys) == comparison.flipped["decoy"].sum() > 0
+    assert all(line.startswith("decoys solved by") and "-decoy" in line for line in lines[2:])
 
 
 def test_a_report_has_d_in_tables_and_a_plot(runs: Path) -> None:

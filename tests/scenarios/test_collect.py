@@ -35,6 +35,7 @@ from scenarios.episodes.demonstrator import Demonstrator
 from scenarios.episodes.reward import tick_rewards
 from scenarios.episodes.run_episode import run_episode
 from scenarios.places.nets import place
+from scenarios.suites.decoys import DRAWN_GO_ON_MPS
 from scenarios.suites.unit import build_unit
 from scenarios.tools.dataset.read import read_data_set
 from tests.conftest import WIDE, Cosim
@@ -289,6 +290,23 @@ def test_fresh_scenarios_do_not_depend_on_how_they_are_divided() -> None:
     }
     assert len({one.light for one in drawn}) == len(drawn) >= 3
     assert [*fresh.drawn(0, 2), *fresh.drawn(2, 3)] == drawn
+
+
+def test_drawn_events_have_the_rules_of_the_suite() -> None:
+    """Decoys in which nothing happens, and events that need the robot to give way, require a pace;
+    others require none. Without it, a learner is rewarded for stopping."""
+    from scenarios.suites.new_scenarios import new_scenarios
+
+    drawn = new_scenarios("reactive", (1000,), ("overtaking", "lateral", "queueing"), 500.0, True)
+    paces = {
+        one.structure + "-decoy" * bool(one.decoy_of): one.go_on_mps for one in drawn.drawn(0, 6)
+    }
+    assert {name for name, pace in paces.items() if pace == DRAWN_GO_ON_MPS} == {
+        "overtaking",
+        "overtaking-decoy",
+        "lateral-decoy",
+    }
+    assert paces["lateral"] == paces["queueing"] == paces["queueing-decoy"] == 0.0
 
 
 class SeeingExpert:

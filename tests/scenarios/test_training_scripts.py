@@ -130,25 +130,45 @@ def test_a_collection_without_episodes_is_not_done(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "table", "names"),
+    ("settings", "tables", "names"),
     [
-        ({"SUITES": "reactive"}, True, ["sidewalk-0"]),
-        ({"SEEDS": ""}, False, []),
-        ({"SEEDS": "0 1"}, True, ["sidewalk-0", "sidewalk-1"]),
-        ({"SEEDS": "1", "ABLATIONS": "1"}, True, ["sidewalk-1", "sidewalk-share-0.01"]),
+        ({"SUITES": "reactive"}, 1, ["sidewalk-0"]),
+        ({"SEEDS": ""}, 0, []),
+        ({"SEEDS": "0 1"}, 1, ["sidewalk-0", "sidewalk-1"]),
+        ({"SEEDS": "1", "ABLATIONS": "1"}, 2, ["sidewalk-1", "sidewalk-share-0.01"]),
     ],
     ids=["black", "no seed", "seeds", "ablations"],
 )
 def test_the_script_ends_with_a_table(
-    tmp_path: Path, settings: dict[str, str], table: bool, names: list[str]
+    tmp_path: Path, settings: dict[str, str], tables: int, names: list[str]
 ) -> None:
     """Each policy has its own name, and all are compared; without a seed none is."""
     done, calls = run_script(tmp_path, **settings)
     assert done.returncode == 0 and done.stdout.endswith("all done\n"), done
-    assert ("a table" in done.stdout) == table
+    assert done.stdout.count("a table") == tables
     trained = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
     assert trained[: len(names)] == names and len(trained) == len(set(trained))
-    assert sum("compare" in call for call in calls) == table
+    assert sum("compare" in call for call in calls) == tables
+
+
+@pytest.mark.parametrize(
+    ("settings", "control"),
+    [({}, "sidewalk-0"), ({"SEEDS": "1"}, "whole"), ({"FIRST": "1", "FROM": "old"}, "whole")],
+    ids=["seed 0", "another seed", "from a bundle"],
+)
+def test_ablations_are_compared_with_seed_0_from_new_parameters(
+    tmp_path: Path, settings: dict[str, str], control: str
+) -> None:
+    """The control is trained without FROM on all data, and is the first of their table alone."""
+    done, calls = run_script(tmp_path, ABLATIONS="1", **settings)
+    assert done.returncode == 0, done
+    (call,) = [call for call in calls if "unit-ablations.md" in call]
+    first, *others = call.split(" -o ")[0].split()[2:]
+    assert first == str(tmp_path / f"work/runs/unit-{control}")
+    assert len(others) == 8 and not any("sidewalk" in name or name == first for name in others)
+    named = f"--name sidewalk-{control.removeprefix('sidewalk-')} "
+    (trained,) = [call for call in calls if named in call]
+    assert "--from" not in trained and "--seed 0" in trained
 
 
 def test_networks_share_gpus(tmp_path: Path) -> None:
