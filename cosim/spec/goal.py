@@ -567,7 +567,7 @@ _ROWS: Final = (
     ),
     GoalKind(
         "route_point",
-        "the next point of the reference route, 5 to 20 m along it",
+        "the next point of the reference route, 5 to 20 m along it; in the last 20 m its end",
         PointGoal,
         _route_points,
         has_data_set_column=True,
