@@ -336,11 +336,14 @@ def split_episodes(
     out together. Of few episodes the last scenario is held out.
     """
     base = [zlib.crc32(name.removesuffix(DECOY).encode()) for name in names]
-    held_out = np.array([np.random.default_rng([one, 0x4E1D]).random() < HELD_OUT for one in base])
+
+    def drawn(purpose: int) -> NDArray[np.float64]:
+        return np.array([np.random.default_rng([one, purpose]).random() for one in base])
+
+    held_out = drawn(0x4E1D) < HELD_OUT
     if held_out.all() or not held_out.any():
         held_out = np.array([one == base[-1] for one in base])
-    drawn = np.array([np.random.default_rng([one, 0x5A4E]).random() for one in base])
-    used = ~held_out & (drawn < training.share)
+    used = ~held_out & (drawn(0x5A4E) < training.share)
     if not training.decoys:
         used &= np.array([not name.endswith(DECOY) for name in names])
     if not training.weather:
