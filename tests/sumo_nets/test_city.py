@@ -323,7 +323,7 @@ def test_concurrent_processes_build_one_city(
         subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True) for _ in range(3)
     )
     ends_s = time.monotonic() + PATIENCE_S
-    while not list(tmp_path.glob(f"{BUILDING_PREFIX}*/*")):
+    while not list(tmp_path.glob(f"{BUILDING_PREFIX}*/*.xml")):
         assert dies.poll() is None and time.monotonic() < ends_s
         time.sleep(0.01)
     dies.kill()
