@@ -182,21 +182,6 @@ def test_the_slots_spread_lengths_positions_and_sides_evenly(redraw: int) -> Non
             assert abs(apart).max() < 3.3 / math.sqrt(count)
 
 
-@pytest.mark.engine
-def test_a_pair_is_built_and_proved_together(tmp_path: Path) -> None:
-    """A request for an event also builds its decoy; both proofs hold, and the limits follow from
-    them."""
-    out = tmp_path / "reactive.json"
-    suite, proofs = build_suite("reactive", out, only=["obstructing-001"])
-    assert [one.id for one in suite.scenarios] == ["obstructing-001", "obstructing-001-decoy"]
-    read = Read(suite, proofs, out)
-    for claim in ("decoys", "limits", "proofs", "obstacles"):
-        assert list(CLAIMS[claim](read)) == []
-    assert all(one.time_limit_s < 60.0 for one in suite.scenarios)
-    driven = [suite.scenarios[1].id]
-    assert list(faults_in_places(suite.scenarios, driven, read_proofs(out))) == []
-
-
 def test_a_redraw_has_the_same_slots_with_other_draws(tmp_path: Path) -> None:
     """Names, places and splits are equal; seeds, lengths and sides are not. The shipped file is not
     replaced."""
@@ -222,24 +207,26 @@ def test_a_redraw_has_the_same_slots_with_other_draws(tmp_path: Path) -> None:
 
 
 @pytest.mark.engine
-def test_cheats_are_driven_on_a_redraw(
+def test_a_redrawn_pair_is_proved_and_cheats_are_driven_on_it(
     tmp_path: Path,
     cosim: Cosim,
     monkeypatch: pytest.MonkeyPatch,
     request: pytest.FixtureRequest,
 ) -> None:
-    """A pair of `overtaking` is drawn with other seeds and keeps its claims, and cheats are
-    evaluated on it: one by default, two with --whole. The decoy of an unsolved event is left
-    out."""
+    """A request for an event also builds its decoy, with other seeds than the shipped pair. Both
+    keep their claims, and their proofs hold in another process. Cheats are evaluated on the redraw:
+    one by default, two with --whole. The decoy of an unsolved event is left out."""
     out = tmp_path / "redraw.json"
     done = cosim("suite", "build", "reactive", str(out), "--redraw", "1", "--only", "*taking-7002")
     assert done.returncode == 0 and "version 2.0-redraw-1" in done.stdout, done.stderr
-    suite = read_suite(out)
+    suite, proofs = read_suite(out), read_proofs(out)
     shipped = {one.id: one for one in load_suite("reactive").scenarios}
     assert [one.id for one in suite.scenarios] == ["overtaking-7002", "overtaking-7002-decoy"]
     assert all(one.route != shipped[one.id].route for one in suite.scenarios)
+    assert all(one.time_limit_s < 60.0 for one in suite.scenarios)
     for claim in ("decoys", "exclusive", "limits", "proofs", "obstacles"):
-        assert list(CLAIMS[claim](Read(suite, read_proofs(out), out))) == []
+        assert list(CLAIMS[claim](Read(suite, proofs, out))) == []
+    assert list(faults_in_places(suite.scenarios, [suite.scenarios[1].id], proofs)) == []
     more = ("stop-every-2-m",) if request.config.getoption("--whole") else ()
     cheats = {name: CHEATS[name] for name in ("swerve-left", *more)}
     monkeypatch.setattr(measure, "CHEATS", cheats)
