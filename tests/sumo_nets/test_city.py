@@ -319,13 +319,16 @@ def test_concurrent_processes_build_one_city(
         "from sumo_nets.city.store import city_net, is_undamaged; from cosim.spec.scenario import City;"
         "print(is_undamaged(city_net(City(seed=9, size_m=200.0))))"
     )
-    dies, *others = (
-        subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True) for _ in range(3)
-    )
+
+    def building() -> subprocess.Popen[str]:
+        return subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True)
+
+    dies = building()
     ends_s = time.monotonic() + PATIENCE_S
     while not list(tmp_path.glob(f"{BUILDING_PREFIX}*/*.xml")):
         assert dies.poll() is None and time.monotonic() < ends_s
         time.sleep(0.01)
+    others = [building() for _ in range(2)]
     dies.kill()
     dies.communicate()
     assert [other.communicate(timeout=PATIENCE_S)[0] for other in others] == ["True\n"] * 2
