@@ -74,7 +74,7 @@ def role(
     days: _Days = 365,
     renew: Annotated[bool, typer.Option("--renew", help="Replace the one that is there.")] = False,
 ) -> None:
-    """Issue the certificate of a role. A role that listens (director, policy) needs --host."""
+    """Issue the certificate of a role. A director needs --host, a policy if its server listens."""
     from bridge.security.authority import issue
 
     if name not in get_args(Role):

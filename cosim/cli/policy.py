@@ -41,7 +41,8 @@ def policies() -> None:
     "check",
     cls=ConfiguredCommand,
     epilog="Examples:  \n`cosim policy check my.py:Mine -o check.png`  \n`cosim policy check "
-    "onnx:bundle --json`  \n`cosim policy check zenoh:vint --policy-at tcp/gpu:7449 --goal image`",
+    "onnx:bundle --json`  \n`cosim policy check zenoh:vint --policy-at tcp/127.0.0.1:7449 --goal "
+    "image`",
 )
 @configured
 def check_policy(

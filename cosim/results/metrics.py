@@ -15,6 +15,7 @@ import numpy as np
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
+from cosim.results.go_on import is_measured
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.referee import Ended, Failure
@@ -39,6 +40,7 @@ class EpisodeFacts:
     """Input of the metrics of one episode.
 
     route_length_m: geodesic walkable length of the reference route
+    rules_met: whether no event's rule is unmet; it also is where an event was not passed
     rules_broken: number of events whose rule was broken
     bypassed: whether the robot bypassed an event (`cosim.results.validity`)
     walked_into: contacts and falls at a person's fault
@@ -50,6 +52,7 @@ class EpisodeFacts:
     red_light_entries: int
     ended: Ended | None
     route_length_m: float
+    rules_met: bool = True
     rules_broken: int = 0
     bypassed: bool = False
     walked_into: tuple[Failure, ...] = ()
@@ -65,11 +68,27 @@ class EpisodeFacts:
             red_light_entries=len(record.red_light_entries),
             ended=record.ended,
             route_length_m=scenario.route_line.length_m,
-            rules_broken=sum(event.rule_met is False for event in record.events),
+            rules_met=all(event.rule_met is not False for event in record.events),
+            rules_broken=rules_broken(record, scenario),
             bypassed=why_bypassed(record, scenario) != "",
             walked_into=record.walked_into,
             period_ticks=clock.policy_ms // clock.tick_ms,
         )
+
+
+def rules_broken(record: Record, scenario: Scenario) -> int:
+    """Return the number of events that the robot passed against their rules.
+
+    A rule on the speed of passing is broken once the event was passed. Where the episode ends at a
+    stop before a person, driving past is the broken rule.
+    """
+    measured = {event.id for event in scenario.events if is_measured(event, scenario)}
+    unmet = sum(
+        event.rule_met is False and (event.id not in measured or event.passed_at_s is not None)
+        for event in record.events
+    )
+    drove_past = scenario.ends_at == "stop" and record.ended == "failure" and not record.failures
+    return unmet + drove_past
 
 
 class Metric(NamedTuple):
@@ -112,7 +131,8 @@ def success(episode: EpisodeFacts) -> float:
     bypassed event."""
     return float(
         episode.ended in ("goal", "stop")
-        and not (episode.failures or episode.rules_broken or episode.bypassed)
+        and episode.rules_met
+        and not (episode.failures or episode.bypassed)
     )
 
 

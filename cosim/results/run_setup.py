@@ -10,7 +10,7 @@ from cosim.core.versions import versions
 from cosim.spec.options import EpisodeOptions, PolicyProcess, absolute_gait
 from cosim.spec.run_config import Appearance
 
-METRIC_SCHEMA = 5
+METRIC_SCHEMA = 6
 """Version of the metric definitions; results of other schemas are not compared."""
 NO_RENDERER = "none"
 """Renderer name of an episode whose policy has no camera."""

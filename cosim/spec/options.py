@@ -91,7 +91,7 @@ class DirectorAddress(msgspec.Struct, frozen=True, kw_only=True):
 
     connection: connection to it.
     run: name of the run in keys.
-    wait_s: timeout of its replies; then the episode is recorded as crashed.
+    wait_s: timeout of its replies; then the episode is invalid.
     """
 
     connection: Connection

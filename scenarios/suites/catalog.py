@@ -64,7 +64,7 @@ def _own(path: Path) -> Suite:
     for goal in filter(None, dict.fromkeys(variant.own.goal_protocol for variant in own.variants)):
         raise UsageError(
             f"{path}: goal_protocol '{goal}' is of a run: use `cosim scenario run {path}`, "
-            f"or give --goal in its place"
+            f"or delete it and give --goal"
         )
     return suite_of_own(own)
 

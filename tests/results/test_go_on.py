@@ -13,6 +13,7 @@ from cosim.core.state import Command
 from cosim.report.page.reasons import mishaps_of, reason_of
 from cosim.results.go_on import OVERTAKEN_M, STOP_S, Passing, PassingWindow, passing_of, rule_met
 from cosim.results.log import Log
+from cosim.results.metrics import EpisodeFacts, success
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
 from cosim.spec.events import Event
@@ -104,10 +105,10 @@ def test_mean_speed_and_stops_are_those_of_the_window() -> None:
     assert Passing(1.0, 0.45).goes_on(1.0) and not Passing(0.99, 0.0).goes_on(1.0)
 
 
-def shipped() -> Scenario:
-    """A decoy of `reactive` with another gesture, without fences, and with more time for slow
-    robots."""
-    (one,) = (s for s in load_suite("reactive").scenarios if s.id == "gesturing-064-decoy")
+def shipped(name: str = "gesturing-064-decoy") -> Scenario:
+    """A scenario of `reactive`, by default a decoy with another gesture, without fences, and with
+    more time for slow robots."""
+    (one,) = (s for s in load_suite("reactive").scenarios if s.id == name)
     return msgspec.structs.replace(one, obstacles=(), time_limit_s=60.0)
 
 
@@ -176,8 +177,8 @@ def test_a_decoy_is_solved_only_by_going_on() -> None:
 
 @pytest.mark.engine
 def test_a_robot_that_never_passes_has_not_gone_on() -> None:
-    """A robot that stays before the person does not meet the rule; without the rule there is no
-    result."""
+    """A robot that stays before the person neither meets nor breaks the rule, and does not succeed;
+    without the rule there is no result."""
     scenario = msgspec.structs.replace(shipped(), time_limit_s=9.0)
     (event,) = scenario.events
     waits = lambda time_s, s_m: 0.0 if s_m > event.route_s_m - 3.0 else 1.5  # noqa: E731
@@ -185,6 +186,9 @@ def test_a_robot_that_never_passes_has_not_gone_on() -> None:
     (outcome,) = record.events
     assert (record.ended, outcome.passed_at_s, outcome.rule_met) == ("timeout", None, False)
     assert outcome.triggered_at_s is not None and not [*contradictions(record, scenario, log)]
+    assert (record.measures["broke_rule"], record.measures["success"]) == (0.0, 0.0)
+    reached = EpisodeFacts.of(msgspec.structs.replace(record, ended="goal"), scenario, log)
+    assert (success(reached), reached.rules_broken) == (0.0, 0)
     record, _ = drive(msgspec.structs.replace(scenario, go_on_mps=0.0), waits)
     assert record.events[0].rule_met is None
 
@@ -200,3 +204,11 @@ def test_a_decoy_that_the_robot_never_saw_is_not_solved() -> None:
     assert (record.status, record.ended) == ("done", "goal")
     assert record.measures["success"] == 0.0
     assert record.reason == "bypassed: nobody of event e0 (gesturing) was seen"
+
+
+@pytest.mark.engine
+def test_driving_past_a_person_who_holds_out_a_hand_breaks_the_rule() -> None:
+    """The episode ends beside the person, without a failure of the referee's."""
+    record, _ = drive(shipped("gesturing-064"), lambda time_s, s_m: 1.2)
+    assert (record.ended, record.failures) == ("failure", ())
+    assert (record.measures["broke_rule"], record.measures["success"]) == (1.0, 0.0)
