@@ -346,7 +346,8 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         of_d = _d_cells(part) if d_heads else ()
         shares = (success.in_words, success.interval_in_words(".."), *of_d)
         means = (estimate.in_words for estimate in rest)
-        rows.append((kind, *counts, *shares, *means, f"{(part['status'] == 'invalid').sum()}"))
+        invalid = f"{(without_decoys(part)['status'] == 'invalid').sum()}"
+        rows.append((kind, *counts, *shares, *means, invalid))
     tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
     unknown = "; - unknown, because an episode crashed" if crashed else ""
     out.print(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
@@ -12,7 +11,7 @@ import pandas as pd
 
 from cosim.results.compare import MIN_CHANGED, ComparedRun, RunComparison
 from cosim.results.discerned import DISCERNED, DISCERNED_IN_WORDS
-from cosim.results.intervals import BOOTSTRAP, MIN_N
+from cosim.results.intervals import BOOTSTRAP, MIN_N, Estimate
 from cosim.results.metrics import SUCCESS_IN_WORDS
 from cosim.results.table import summary_of
 from cosim.spec.weather import WEATHERS
@@ -170,25 +169,20 @@ def table_by_weather(summary: pd.DataFrame) -> TextTable:
     """Build the table of `summary_by_weather`: a row for each weather and policy."""
     rows = []
     for (weather, policy), of in summary.groupby(["weather", "policy"], sort=False):
-        found = {
-            str(name): (mean, low, high)
-            for name, mean, low, high in of[["metric", "mean", "low", "high"]].itertuples(
-                index=False
-            )
-        }
+        figures = of.set_index("metric")[[*Estimate._fields]]
+        found = {str(name): Estimate(*row) for name, *row in figures.itertuples()}
         cells = (
-            _mean_in_words(*found[name]) if name in found else "-" for name in _WEATHER_METRICS
+            _estimate_in_words(found[name]) if name in found else "-" for name in _WEATHER_METRICS
         )
         rows.append((str(weather), str(policy), *cells))
     heads = ("weather", "policy", *_WEATHER_METRICS.values())
     return TextTable("By weather: means, with 95 % intervals", heads, tuple(rows), 2)
 
 
-def _mean_in_words(mean: float, low: float, high: float) -> str:
-    """Return a mean with its interval; "-" without a value."""
-    if math.isnan(mean):
-        return "-"
-    return _plain(mean) if math.isnan(low) else f"{_plain(mean)} ({_plain(low)} to {_plain(high)})"
+def _estimate_in_words(found: Estimate) -> str:
+    """Return a mean with its interval, or counts below MIN_N; "-" without a value."""
+    interval = f" ({found.interval_in_words()})" if found.has_interval else ""
+    return f"{found.in_words}{interval}"
 
 
 def flips_in_words(result: RunComparison, other: ComparedRun) -> tuple[str, ...]:

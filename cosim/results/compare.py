@@ -283,7 +283,8 @@ def differences_of(
             unit, better = _unit_and_direction(name)
             verdict = paired.verdict(better if judged else None)
             key = (before.label, after.label, by, group, name, unit)
-            means = (paired.before, paired.after, *_counts(name, *pair), paired.difference)
+            counts = _counts(name, *pair) if paired.n else ("", "")
+            means = (paired.before, paired.after, *counts, paired.difference)
             interval = (paired.low, paired.high)
             rows.append((*key, paired.n, *means, *interval, paired.changed, verdict))
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
@@ -437,8 +438,7 @@ def _notes(runs: Sequence[VerifiedRun], compared: Sequence[ComparedRun]) -> Iter
             yield f"{other.label}: {words}"
         if words := injections_in_words(other.table):
             yield f"{other.label}: {words}"
-        crashed = sum(record.status == "crashed" for record in run.records.values())
-        if crashed:
+        if crashed := crashed_in(without_decoys(other.table)):
             yield (
                 f"{other.label}: {crashed} crashed, counted as failed, with SR, RC, SPL and V of "
                 f"0; groups with them have neither rates nor other means"

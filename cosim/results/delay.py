@@ -2,9 +2,10 @@
 
 Both streets start identically. A body is compared if it has the same id, entry tick and entry place
 in both. At the end of the common time, its delay is how much earlier it would have reached its
-current position without the robot. The delay is negative if it got ahead. Stepping aside and back
-counts as no progress. Positions within _SLACK_M are the same, so delays are slightly
-underestimated. Bodies that never move without the robot are skipped.
+current position without the robot, so a body that rests at the same place in both has none. The
+delay is negative if it got ahead. Stepping aside and back counts as no progress. Positions within
+_SLACK_M are the same, so delays are slightly underestimated. Bodies that never move without the
+robot are skipped.
 
 Small changes spread: far from the robot the streets differ by chance. The sum over bodies that came
 near the robot is therefore reported separately.

@@ -223,11 +223,15 @@ def injections_in_words(table: pd.DataFrame) -> str:
 
 def why_inconclusive(table: pd.DataFrame, scheduled: int) -> str:
     """Return why the means of a run are inconclusive, in words; "" if they are not."""
-    invalid = int((table["status"] == "invalid").sum())
-    if invalid > MAX_INVALID_SHARE * scheduled:
-        return (
-            f"{invalid} of {scheduled} scheduled episodes are invalid, more than "
-            f"{100 * MAX_INVALID_SHARE:.0f} %"
-        )
+    pairs = episode_pairs(table)
+    without = without_decoys(table)
+    scenarios = scheduled - (len(table) - len(without))
+    invalid = int((without["status"] == "invalid").sum())
+    for count, of, things in (
+        (invalid, scenarios, "scheduled episodes are invalid"),
+        (pairs.invalid, len(pairs.solved), "pairs with a decoy have an invalid episode"),
+    ):
+        if count > MAX_INVALID_SHARE * of:
+            return f"{count} of {of} {things}, more than {100 * MAX_INVALID_SHARE:.0f} %"
     missing = scheduled - len(table)
     return f"{missing} of {scheduled} scheduled episodes have not ended" if missing else ""

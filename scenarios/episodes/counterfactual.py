@@ -34,7 +34,7 @@ class DelayComparison(NamedTuple):
 
     @property
     def measures(self) -> dict[str, float | None]:
-        """Return the measures of a record: mean delays of those that came near the robot, None if
+        """Return the measures of a record: summed delays of those that came near the robot, None if
         none did."""
         measures: dict[str, float | None] = {}
         for kind, delay in (("people", self.people), ("vehicles", self.vehicles)):

@@ -389,6 +389,21 @@ def test_two_runs_of_one_policy_and_suite_have_the_names_of_their_folders(tmp_pa
     assert [run.label for run in read_runs([first, second])] == ["first", "second"]
 
 
+def test_a_folder_with_the_name_of_another_policy_has_its_own_row(tmp_path: Path) -> None:
+    """Two runs of one policy in folders, of which one has the name of the policy of a third run."""
+    runs = read_runs(
+        [
+            run_of(tmp_path / "other", ["goal"] * 2, "mine"),
+            run_of(tmp_path / "b", ["goal"] * 2, "mine"),
+            run_of(tmp_path / "c", [HIT] * 2, "other"),
+        ]
+    )
+    labels = [f"other ({tmp_path / 'other'})", "b", f"other ({tmp_path / 'c'})"]
+    assert [run.label for run in runs] == labels
+    (table,) = tables_of(runs)
+    assert len(table.rows) == 3
+
+
 def test_runs_of_one_suite_by_several_robots_share_a_table(tmp_path: Path) -> None:
     """Rows of a policy that drove several robots have the robot in their name."""
     runs = read_runs(

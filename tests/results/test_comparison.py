@@ -238,6 +238,15 @@ def test_runs_of_one_policy_in_one_weather_keep_their_names(tmp_path: Path) -> N
     ]
 
 
+def test_below_five_scenarios_a_weather_has_counts(tmp_path: Path) -> None:
+    """As in all tables, there is no decimal and no interval."""
+    ways = scenarios_of(3)
+    hows = {"clear": [GOALS, GOALS, HIT], "rain": [HIT] * 3}
+    runs = [run_of(tmp_path / name, how, "p", ways, weather=name) for name, how in hows.items()]
+    rows = table_by_weather(summary_by_weather(compare_runs(runs))).rows
+    assert [row[2] for row in rows] == ["2/3", "0/3"]
+
+
 def test_another_renderer_of_the_pictures_is_noted(runs: Path, tmp_path: Path) -> None:
     """Two runs with a camera, drawn by a processor and by a GPU, have a note; blind ones none."""
     seeing = rewritten(runs / "b", tmp_path / "seeing", camera={"width": 64, "height": 48})
@@ -371,6 +380,7 @@ def test_a_crashing_run_is_compared_at_its_worst_without_rates(runs: Path) -> No
     )
     assert (
         row(comparison, "failures_per_100m", after="c")["n"] == 0
+        and row(comparison, "failures_per_100m", after="c")["counts_before"] == ""
         and row(comparison, "failures_per_100m", "straight", "c")["n"] == 9
     )
     assert not len(comparison.flipped)

@@ -24,7 +24,7 @@ from cosim.results.discerned import episode_pairs
 from cosim.results.intervals import wilson
 from cosim.results.merge import merge_runs
 from cosim.results.run_folder import read_records
-from cosim.results.table import summary_of, table_of
+from cosim.results.table import summary_of, table_of, why_inconclusive
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario, Suite, read_suite, write_suite
 from scenarios.events import EVENT_KINDS
@@ -104,6 +104,14 @@ def test_without_the_other_member_there_is_no_pair(runs: Path) -> None:
     assert summary_of(nothing).loc["discerned", "n"] == 0
 
 
+def test_invalid_episodes_are_counted_apart_from_decoys(runs: Path) -> None:
+    """Decoys do not dilute the share of invalid scenarios, and each costs D a pair."""
+    assert why_inconclusive(table(runs / "a"), 21).startswith("1 of 11 scheduled episodes are inv")
+    valid = run_of(runs / "valid", [*[GOAL, GOAL] * 9, GOAL, "invalid", GOAL], "v", EVERY)
+    words = "1 of 10 pairs with a decoy have an invalid episode, more than 2 %"
+    assert why_inconclusive(table(valid), 21) == words
+
+
 def test_files_record_the_event_of_a_decoy(runs: Path) -> None:
     """record.json and results.csv have the column, so that no table needs the suite."""
     fields = json.loads((runs / "a/episodes/lateral-000-decoy/record.json").read_bytes())
@@ -121,7 +129,9 @@ def test_a_run_shows_d_beside_sr(runs: Path, cosim: Cosim) -> None:
     assert "decoys count in D alone, over 8 pairs; left out: 2 with an invalid member" in text
     assert "D share of events solved with their decoys" in text
     assert "of all rows 10 are decoys" in text
-    assert any(line.startswith("lateral 4 3/4 - 1/4 - 4") for line in lines), lines
+    by_kind = {line.split()[0]: line.split() for line in lines if line.startswith(KINDS)}
+    assert by_kind["lateral"][:7] == ["lateral", "4", "3/4", "-", "1/4", "-", "4"]
+    assert (by_kind["lateral"][-1], by_kind["frontal"][-1]) == ("1", "0")  # invalid, without decoys
     assert "decoy" not in cosim("show", str(runs / "events")).stdout.replace("of decoys: go", "")
     result = cosim("show", str(runs / "a"), "--episode", "lateral-000-decoy")
     assert result.stdout.startswith("lateral-000-decoy (decoy of lateral-000): done goal"), result
@@ -161,6 +171,8 @@ def test_a_report_has_d_in_tables_and_a_plot(runs: Path) -> None:
     reported = read_runs([runs / "a", runs / "b"])
     colours = colours_of(reported)
     summary = summary_table(reported, colours)
+    assert [row.crashed for row in summary.rows] == [0, 0]
+    assert "1 crashed (decoys)" in tables_of(reported)[0].rows[0].notes
     assert summary.heads[3:5] == ("SR", "D")
     assert [(row.cells[1].mean, row.cells[1].n) for row in summary.rows] == [(0.5, 8), (1.0, 10)]
     titles = [one.title for one in tables_of(reported)]

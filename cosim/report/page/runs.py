@@ -135,9 +135,14 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
         f"{policy}, {suite}" if suite not in PAPER_SUITES and len(suites[policy]) > 1 else policy
         for suite, policy in policies
     ]
+    labels = [
+        name if policy in alike else label
+        for name, policy, label in zip(names, policies, labels, strict=True)
+    ]
+    rows = [(whole.spec.suite, label) for whole, label in zip(found, labels, strict=True)]
     return [
-        ReportedRun(name if policy in alike else label, whole)
-        for whole, name, policy, label in zip(found, names, policies, labels, strict=True)
+        ReportedRun(row[1] if rows.count(row) == 1 else f"{row[1]} ({path})", whole)
+        for whole, path, row in zip(found, paths, rows, strict=True)
     ]
 
 

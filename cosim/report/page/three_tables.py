@@ -24,6 +24,7 @@ from cosim.results.discerned import (
     has_decoys,
     is_decoy,
     with_discerned,
+    without_decoys,
 )
 from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
 from cosim.results.run_setup import gait_in_words
@@ -163,7 +164,7 @@ def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> Re
                 track=track_of(run.table),
                 colour=colours[run.label],
                 scored=len(run.table) - invalid,
-                crashed=crashed_in(run.table),
+                crashed=crashed_in(without_decoys(run.table)),
                 invalid=invalid,
             )
         )
@@ -172,7 +173,9 @@ def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> Re
         f"SR success; {of_d}RC share of the route done; FC failures per 100 m travelled, pooled; "
         f"V mean speed. Small figures are 95 % intervals; below {MIN_N} episodes there are only "
         "counts. A crashed episode counts as failed, with SR, RC and V of 0; a run with one has "
-        "no rates." + " Decoys are scored, but count in D alone." * decoys
+        "no rates."
+        + " Decoys are scored, but count in D alone; their crashes are not listed here."
+        * decoys
     )
     heads = ("scored", "crashed", "invalid", *first.values())
     return ReportTable("All episodes of each run", note, heads, tuple(rows))
@@ -351,8 +354,9 @@ def _notes(table: pd.DataFrame) -> str:
     notes += [f"robot {name}" for name in sorted({*table["robot"]} - {COURIER.name})]
     gaits = table[["gait", "gait_hash"]].drop_duplicates().itertuples(index=False)
     notes += [gait_in_words(*gait) for gait in gaits if gait[0]]
-    if crashed := crashed_in(table):
-        notes.append(f"{crashed} crashed")
+    for of, part in (("", without_decoys(table)), (" (decoys)", table[is_decoy(table)])):
+        if crashed := crashed_in(part):
+            notes.append(f"{crashed} crashed{of}")
     notes += [f"weather {name}" for name in sorted({*table["weather"]} - {CLEAR})]
     notes += ["crowd added"] * bool(table["crowd_added"].any())
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
