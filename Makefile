@@ -3,8 +3,8 @@
 
 PYTHON ?= python3.11
 JOBS ?= 2
-# Tests often wait for other processes: four of pytest keep two cores busy.
-WORKERS ?= 4
+# Tests often wait for other processes: three of pytest keep two cores busy.
+WORKERS ?= 3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 

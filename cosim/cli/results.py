@@ -412,7 +412,7 @@ def print_episode(out: Console, record: Record) -> None:
             else f", passed at {event.passed_at_s:.2f} s: on average {event.passing_mps:.2f} m/s, "
             f"longest stop {event.stopped_s:.2f} s"
         )
-        broken = ", rule broken" if event.rule_met is False else ""
+        broken = ", rule not met" if event.rule_met is False else ""
         out.print(f"  event {event.id} {event.kind}: {at}{passing}{broken}")
     units = {name: metric.unit for name, metric in METRICS.items()}
     units |= {name: unit for name, unit in COUNTERFACTUAL.items() if name in record.measures}

@@ -268,12 +268,14 @@ def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
     assert f"CONFLICT: {first} by {one.name}" in run.log
 
 
-def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
-    """The job of a lost worker goes to another at once, and the first result of either counts."""
+def test_the_job_of_a_lost_worker_goes_to_the_next(tmp_path: Path) -> None:
+    """Once the loss is noticed, the job of a worker goes to the next one that asks, without waiting
+    for the end of its lease. The first result of either counts."""
     run = Run(tmp_path)
     with manual_workers(run, 3) as (lost, other, third):
         first = lost.job()
         lost.session.close()
+        wait_until(lambda: f"{lost.name}: lost" in run.log)
         assert other.job() == first
         lost.session = open_session(Connection(role="worker", connect=run.endpoint))
         with lost.session:

@@ -455,7 +455,7 @@ def test_a_generated_street_is_recovered_from_a_corrupted_export(
     clean = tmp_path / "clean"
     city = City(seed=7, size_m=300.0)
     x0, y0, x1, y1 = crossing_box(place(city)[1])
-    make_scan(city, (x0 + 15, y0 + 10, x1 - 15, y1 - 10), clean, spacing_m=0.5)
+    make_scan(city, (x0 + 20, y0 + 14, x1 - 20, y1 - 14), clean, spacing_m=0.5)
     wanted = import_scan(clean, read_options(clean, {"name": "scan-clean"}))[1].scan
     assert wanted is not None
     angle = np.radians(33)
