@@ -18,7 +18,6 @@ from cosim.results.discerned import (
     has_decoys,
     is_decoy,
     with_discerned,
-    without_decoys,
 )
 from cosim.results.intervals import MIN_N, Estimate
 from cosim.results.log import holds_waypoints
@@ -35,6 +34,7 @@ from cosim.results.table import (
     crashed_in,
     estimate_of,
     injections_in_words,
+    invalid_in,
     policy_in_words,
     why_inconclusive,
 )
@@ -161,7 +161,7 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     ]
     over = "over all but decoys" if has_decoys(table) else "over all episodes"
     tables.show(out, [*tables.names(over), *tables.figures(*_MEAN_HEADS)], rows)
-    crashed = crashed_in(without_decoys(table))
+    crashed = crashed_in(table)
     failed = f"; no rates: {crashed} crashed, which counts as SR, RC, SPL and V of 0"
     out.print(
         f"rates are pooled: all failures on all metres, of an episode at most "
@@ -333,7 +333,7 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     people = bool(table["pedestrian_distance_min_m"].notna().any())
     columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
     d_heads = ("D", "95 % of D", "pairs") if has_decoys(table) else ()
-    crashed = ["crash"] if crashed_in(without_decoys(table)) else []
+    crashed = ["crash"] if crashed_in(table) else []
     shown = ("n", *crashed, "SR", "95 % of SR", *d_heads)
     heads = (*shown, *(head for _, head in columns), "in-\nvalid")
     rows = []
@@ -342,12 +342,11 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         success, *rest = (
             estimate_of(part, name) for name in ("success", *(name for name, _ in columns))
         )
-        counts = f"{success.n}", *([f"{crashed_in(without_decoys(part))}"] if crashed else [])
+        counts = f"{success.n}", *([f"{crashed_in(part)}"] if crashed else [])
         of_d = _d_cells(part) if d_heads else ()
         shares = (success.in_words, success.interval_in_words(".."), *of_d)
         means = (estimate.in_words for estimate in rest)
-        invalid = f"{(without_decoys(part)['status'] == 'invalid').sum()}"
-        rows.append((kind, *counts, *shares, *means, invalid))
+        rows.append((kind, *counts, *shares, *means, f"{invalid_in(part)}"))
     tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
     unknown = "; - unknown, because an episode crashed" if crashed else ""
     out.print(
@@ -379,7 +378,7 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
             f"{one.in_words} {one.interval_in_words('..')}" if one.has_interval else one.in_words
             for one in means
         )
-        crashed = f"{crashed_in(without_decoys(part))}"
+        crashed = f"{crashed_in(part)}"
         rows.append((str(split), f"{means[0].n}", crashed, *cells))
     heads = ("n", "crashed", *(f"{head}, 95 %" for head in columns.values()))
     tables.show(out, [*tables.names("split"), *tables.figures(*heads)], rows)

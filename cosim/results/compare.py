@@ -438,7 +438,7 @@ def _notes(runs: Sequence[VerifiedRun], compared: Sequence[ComparedRun]) -> Iter
             yield f"{other.label}: {words}"
         if words := injections_in_words(other.table):
             yield f"{other.label}: {words}"
-        if crashed := crashed_in(without_decoys(other.table)):
+        if crashed := crashed_in(other.table):
             yield (
                 f"{other.label}: {crashed} crashed, counted as failed, with SR, RC, SPL and V of "
                 f"0; groups with them have neither rates nor other means"

@@ -40,7 +40,7 @@ class EpisodeFacts:
     """Input of the metrics of one episode.
 
     route_length_m: geodesic walkable length of the reference route
-    rules_met: whether no event's rule is unmet; it also is where an event was not passed
+    rules_met: False if the rule of an event is unmet, also because the event was not passed
     rules_broken: number of events whose rule was broken
     bypassed: whether the robot bypassed an event (`cosim.results.validity`)
     walked_into: contacts and falls at a person's fault

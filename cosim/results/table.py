@@ -15,6 +15,7 @@ from cosim.results.discerned import (
     DISCERNED,
     episode_pairs,
     has_decoys,
+    is_decoy,
     with_discerned,
     without_decoys,
 )
@@ -195,8 +196,17 @@ def estimate_of(table: pd.DataFrame, name: str) -> Estimate:
 
 
 def crashed_in(table: pd.DataFrame) -> int:
-    """Return the number of episodes whose policy crashed."""
-    return int((table["status"] == "crashed").sum())
+    """Return the number of scenarios whose policy crashed; decoys are not among them."""
+    return _count_of(table, "crashed")
+
+
+def invalid_in(table: pd.DataFrame) -> int:
+    """Return the number of invalid scenarios; decoys are not among them."""
+    return _count_of(table, "invalid")
+
+
+def _count_of(table: pd.DataFrame, status: str) -> int:
+    return int((without_decoys(table)["status"] == status).sum())
 
 
 def numeric_column(table: pd.DataFrame, name: str) -> Floats:
@@ -224,11 +234,9 @@ def injections_in_words(table: pd.DataFrame) -> str:
 def why_inconclusive(table: pd.DataFrame, scheduled: int) -> str:
     """Return why the means of a run are inconclusive, in words; "" if they are not."""
     pairs = episode_pairs(table)
-    without = without_decoys(table)
-    scenarios = scheduled - (len(table) - len(without))
-    invalid = int((without["status"] == "invalid").sum())
+    scenarios = scheduled - int(is_decoy(table).sum())
     for count, of, things in (
-        (invalid, scenarios, "scheduled episodes are invalid"),
+        (invalid_in(table), scenarios, "scheduled episodes are invalid"),
         (pairs.invalid, len(pairs.solved), "pairs with a decoy have an invalid episode"),
     ):
         if count > MAX_INVALID_SHARE * of:

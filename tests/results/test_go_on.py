@@ -208,7 +208,7 @@ def test_a_decoy_that_the_robot_never_saw_is_not_solved() -> None:
 
 @pytest.mark.engine
 def test_driving_past_a_person_who_holds_out_a_hand_breaks_the_rule() -> None:
-    """The episode ends beside the person, without a failure of the referee's."""
+    """The episode ends beside the person, and the referee counts no failure."""
     record, _ = drive(shipped("gesturing-064"), lambda time_s, s_m: 1.2)
     assert (record.ended, record.failures) == ("failure", ())
     assert (record.measures["broke_rule"], record.measures["success"]) == (1.0, 0.0)

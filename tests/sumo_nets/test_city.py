@@ -7,7 +7,6 @@ import math
 import os
 import subprocess
 import sys
-import time
 from collections import Counter, defaultdict
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.raw_file import net_content_hash
-from tests.conftest import PATIENCE_S
+from tests.conftest import PATIENCE_S, wait_until
 
 SAMPLE = [
     (1, 200.0, "mixed"),
@@ -324,10 +323,9 @@ def test_concurrent_processes_build_one_city(
         return subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True)
 
     dies = building()
-    ends_s = time.monotonic() + PATIENCE_S
-    while not list(tmp_path.glob(f"{BUILDING_PREFIX}*/*.xml")):
-        assert dies.poll() is None and time.monotonic() < ends_s
-        time.sleep(0.01)
+    begun = f"{BUILDING_PREFIX}*/*.xml"
+    wait_until(lambda: dies.poll() is not None or list(tmp_path.glob(begun)))
+    assert dies.poll() is None
     others = [building() for _ in range(2)]
     dies.kill()
     dies.communicate()

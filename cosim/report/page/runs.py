@@ -141,8 +141,8 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
     ]
     rows = [(whole.spec.suite, label) for whole, label in zip(found, labels, strict=True)]
     return [
-        ReportedRun(row[1] if rows.count(row) == 1 else f"{row[1]} ({path})", whole)
-        for whole, path, row in zip(found, paths, rows, strict=True)
+        ReportedRun(label if rows.count((suite, label)) == 1 else f"{label} ({path})", whole)
+        for whole, path, (suite, label) in zip(found, paths, rows, strict=True)
     ]
 
 

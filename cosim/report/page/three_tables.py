@@ -24,7 +24,6 @@ from cosim.results.discerned import (
     has_decoys,
     is_decoy,
     with_discerned,
-    without_decoys,
 )
 from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
 from cosim.results.run_setup import gait_in_words
@@ -164,7 +163,7 @@ def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> Re
                 track=track_of(run.table),
                 colour=colours[run.label],
                 scored=len(run.table) - invalid,
-                crashed=crashed_in(without_decoys(run.table)),
+                crashed=crashed_in(run.table),
                 invalid=invalid,
             )
         )
@@ -354,9 +353,10 @@ def _notes(table: pd.DataFrame) -> str:
     notes += [f"robot {name}" for name in sorted({*table["robot"]} - {COURIER.name})]
     gaits = table[["gait", "gait_hash"]].drop_duplicates().itertuples(index=False)
     notes += [gait_in_words(*gait) for gait in gaits if gait[0]]
-    for of, part in (("", without_decoys(table)), (" (decoys)", table[is_decoy(table)])):
-        if crashed := crashed_in(part):
-            notes.append(f"{crashed} crashed{of}")
+    crashed = crashed_in(table)
+    of_decoys = int((table["status"] == "crashed").sum()) - crashed
+    notes += [f"{crashed} crashed"] * bool(crashed)
+    notes += [f"{of_decoys} crashed (decoys)"] * bool(of_decoys)
     notes += [f"weather {name}" for name in sorted({*table["weather"]} - {CLEAR})]
     notes += ["crowd added"] * bool(table["crowd_added"].any())
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
