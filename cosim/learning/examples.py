@@ -22,12 +22,14 @@ from cosim.learning.network import (
     CRUISE_MPS,
     GOAL_MOST_M,
     GOAL_UNIT_M,
+    HEIGHT_PX,
     HISTORY,
     PICTURE_INTERVAL,
     SPEED_MEAN_MPS,
     SPEED_UNIT_MPS,
     TURN_UNIT_RADPS,
     WAYPOINTS,
+    WIDTH_PX,
 )
 from cosim.learning.packed_checks import check_pictures, check_rows, common_meta
 
@@ -261,7 +263,7 @@ def _checked(path: Path) -> Packed:
     """Load a file. Raises RunError if this network cannot learn from it."""
     packed = read_packed(path)
     check_rows(path, packed)
-    check_pictures(path, packed.frames)
+    check_pictures(path, packed.frames, (WIDTH_PX, HEIGHT_PX))
     if (fastest := float(np.abs(packed.command[:, 1]).max())) > TURN_UNIT_RADPS + _ROUNDING:
         raise RunError(
             f"{path}: the expert turns at {fastest:.2f} rad/s, and this network at "

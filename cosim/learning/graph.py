@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from cosim.core.errors import RunError
+from cosim.learning.memory_network import GROWN
 from cosim.learning.network import (
     CRUISE_MPS,
     HEIGHT_PX,
@@ -146,6 +147,9 @@ def load_parameters(path: Path, wanted: Parameters) -> dict[str, torch.Tensor]:
         raise RunError(f"{path}: no ONNX graph: {error}") from error
     found: dict[str, torch.Tensor] = {}
     for name, like in wanted.items():
+        if name not in arrays and name.split(".")[0] in GROWN:
+            found[name] = torch.zeros_like(like)
+            continue
         shape = arrays[name].shape if name in arrays else None
         if shape != tuple(like.shape):
             problem = "is not there" if shape is None else f"has the shape {shape}"

@@ -82,12 +82,17 @@ SPEEDS_INPUT: Final[Mapping[str, Any]] = MappingProxyType(
 )
 
 
-def pictures_input(frames: int, every: int) -> dict[str, Any]:
-    """Return the manifest's input of the last pictures, the newest last."""
+def pictures_input(
+    frames: int, every: int, size_px: tuple[int, int] = (WIDTH_PX, HEIGHT_PX)
+) -> dict[str, Any]:
+    """Return the manifest's input of the last pictures, the newest last.
+
+    size_px: width and height
+    """
     return {
         "what": "picture",
         "frames": frames,
         "every": every,
-        "size": [WIDTH_PX, HEIGHT_PX],
+        "size": [*size_px],
         "layout": "N(TC)HW",
     }

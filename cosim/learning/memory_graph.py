@@ -10,7 +10,10 @@ from cosim.core.packed_demos import FREE_RAYS
 from cosim.learning.graph import PLAN, GraphWriter
 from cosim.learning.memory_network import (
     AUXILIARY,
+    DETAIL,
     EVENTS,
+    HALVED,
+    HEIGHT_PX,
     MEMORY,
     NEAR,
     NEAR_VALUES,
@@ -18,9 +21,10 @@ from cosim.learning.memory_network import (
     SIGNALS,
     STAGES,
     STRIDES,
+    WIDTH_PX,
     is_block,
 )
-from cosim.learning.network import HEIGHT_PX, WAYPOINTS, WIDTH_PX, Parameters
+from cosim.learning.network import WAYPOINTS, Parameters
 
 MEMORY_INPUTS: Final = {
     "pictures": (1, 3 * PICTURES, HEIGHT_PX, WIDTH_PX),
@@ -47,14 +51,18 @@ def build_memory_graph(parameters: Parameters, carries: bool = True) -> bytes:
     """
     g = GraphWriter(parameters, STRIDES)
     grey, contrast = g.constant("grey", 0.5), g.constant("contrast", 4.0)
-    x = g.add("Mul", [g.add("Sub", ["pictures", grey]), contrast])
-    for stage in STAGES:
-        if is_block(stage):
-            x = g.relu(g.add("Add", [x, g.conv(g.relu(g.conv(x, stage[0])), stage[1])]))
-        else:
-            for name in stage:
-                x = g.relu(g.conv(x, name, {"stem": 5, "narrow": 1}.get(name, 3)))
-    image = g.relu(g.linear(g.add("Flatten", [x]), "seen"))
+    shown = g.add("Mul", [g.add("Sub", ["pictures", grey]), contrast])
+    sides = [HALVED, HALVED]
+    whole = g.add("AveragePool", [shown], kernel_shape=sides, strides=sides)
+    starts = g.constant("detail.starts", [one.start for one in DETAIL], np.int64)
+    stops = g.constant("detail.stops", [one.stop for one in DETAIL], np.int64)
+    axes = g.constant("detail.axes", [2, 3], np.int64)
+    detail = g.add("Slice", [shown, starts, stops, axes])
+    seen = [
+        g.linear(g.add("Flatten", [_convolved(g, x)]), name)
+        for name, x in (("seen", whole), ("detail", detail))
+    ]
+    image = g.relu(g.add("Add", seen))
     inputs = g.relu(g.linear(g.add("Concat", ["goal", "speeds"], axis=1), "inputs"))
     joined = g.relu(g.linear(g.add("Concat", [image, inputs], axis=1), "joined"))
     after = _remembered(g, joined)
@@ -65,6 +73,16 @@ def build_memory_graph(parameters: Parameters, carries: bool = True) -> bytes:
         shape = g.constant(f"{name}.shape", MEMORY_OUTPUTS[name], np.int64)
         g.add("Reshape", [g.linear(known, name), shape], name)
     return g.finished("sidewalk", MEMORY_INPUTS, MEMORY_OUTPUTS)
+
+
+def _convolved(g: GraphWriter, x: str) -> str:
+    for stage in STAGES:
+        if is_block(stage):
+            x = g.relu(g.add("Add", [x, g.conv(g.relu(g.conv(x, stage[0])), stage[1])]))
+        else:
+            for name in stage:
+                x = g.relu(g.conv(x, name, {"stem": 5, "narrow": 1}.get(name, 3)))
+    return x
 
 
 def _remembered(g: GraphWriter, joined: str) -> str:

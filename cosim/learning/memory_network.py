@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from cosim.core.packed_demos import FREE_RAYS
 from cosim.learning.network import (
@@ -28,6 +29,8 @@ from cosim.learning.network import (
     linear_layer,
 )
 
+WIDTH_PX: Final = 320
+HEIGHT_PX: Final = 180
 PICTURES: Final = 2
 """Number of pictures in the input, the newest last."""
 MEMORY: Final = 256
@@ -40,6 +43,11 @@ SIGNALS: Final = 3
 """Classes of signals: none, walk, wait."""
 EVENTS: Final = 9
 """Classes of events: none, and the eight kinds."""
+
+HALVED: Final = 2
+"""Pixels of a picture in a pixel of the whole view, along each side."""
+DETAIL: Final = (slice(28, 100), slice(96, 224))
+"""Rows and columns of the part that is seen at full size: ahead, where hands and lamps are."""
 
 _IMAGE: Final = 320
 _INPUTS: Final = 64
@@ -59,6 +67,7 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
     "block5b": (160, 160, 3, 3),
     "narrow": (64, 160, 1, 1),
     "seen": (_IMAGE, 64 * 6 * 10),
+    "detail": (_IMAGE, 64 * 5 * 8),
     "inputs": (_INPUTS, 4),
     "joined": (_JOINED, _IMAGE + _INPUTS),
     "arriving": (3 * MEMORY, _JOINED),
@@ -75,6 +84,8 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
 }
 """Shapes of the weights: convolutions (out, in, height, width), linear layers (out, in)."""
 HEADS: Final = ("speed", "turn", "stop", "way", "near", "free", "signal", "event")
+GROWN: Final = ("detail",)
+"""Layers that earlier bundles lack; they start at 0 there."""
 AUXILIARY: Final = ("near", "free", "signal", "event")
 """Heads of the labels, which are outputs of the graph."""
 STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3": 2}
@@ -95,6 +106,17 @@ STAGES: Final[tuple[tuple[str, ...], ...]] = (
 def is_block(stage: tuple[str, ...]) -> bool:
     """Return whether a stage is a residual block."""
     return stage[0].startswith("block")
+
+
+class Views(NamedTuple):
+    """What the network sees of pictures: (..., C, H, W) or (..., H, W, C), each with its own H, W.
+
+    whole: the picture at 1 / HALVED of its size
+    detail: the part DETAIL at full size
+    """
+
+    whole: Tensor
+    detail: Tensor
 
 
 class MemoryOutput(NamedTuple):
@@ -122,7 +144,7 @@ def new_memory_parameters(seed: int) -> dict[str, Tensor]:
     draws = torch.Generator().manual_seed(seed)
     parameters: dict[str, Tensor] = {}
     for name, shape in _SHAPES.items():
-        quiet = name.endswith("b") or name in HEADS
+        quiet = name.endswith("b") or name in (*HEADS, *GROWN)
         gates = name in ("arriving", "recurrent")
         fan = math.prod(shape[1:])
         scale = 0.02 if quiet else math.sqrt((1.0 if gates else 2.0) / fan)
@@ -133,8 +155,26 @@ def new_memory_parameters(seed: int) -> dict[str, Tensor]:
     return parameters
 
 
-def encoded(parameters: Parameters, pictures: Tensor) -> Tensor:
-    """Return (N, _IMAGE) features of pictures (N, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1."""
+def views(pictures: Tensor) -> Views:
+    """Return both views of pictures (N, C, HEIGHT_PX, WIDTH_PX)."""
+    return Views(functional.avg_pool2d(pictures, HALVED), pictures[..., *DETAIL])
+
+
+def picture_of(seen: Views) -> Tensor:
+    """Return pictures (N, C, HEIGHT_PX, WIDTH_PX) with these views, up to rounding."""
+    pictures = seen.whole.repeat_interleave(HALVED, 2).repeat_interleave(HALVED, 3)
+    pictures[..., *DETAIL] = seen.detail
+    return pictures
+
+
+def encoded(parameters: Parameters, seen: Views) -> Tensor:
+    """Return (N, _IMAGE) features of views (N, 3 PICTURES, H, W), 0 to 1."""
+    whole = linear_layer(parameters, _convolved(parameters, seen.whole), "seen")
+    detail = linear_layer(parameters, _convolved(parameters, seen.detail), "detail")
+    return (whole + detail).relu()
+
+
+def _convolved(parameters: Parameters, pictures: Tensor) -> Tensor:
     convolved = partial(convolution, parameters, STRIDES)
     x = (pictures - 0.5) * 4.0
     for stage in STAGES:
@@ -143,7 +183,7 @@ def encoded(parameters: Parameters, pictures: Tensor) -> Tensor:
         else:
             for name in stage:
                 x = convolved(x, name).relu()
-    return linear_layer(parameters, x.flatten(1), "seen").relu()
+    return x.flatten(1)
 
 
 def remembered(parameters: Parameters, joined: Tensor, memory: Tensor, carries: bool) -> Tensor:
@@ -162,7 +202,7 @@ def remembered(parameters: Parameters, joined: Tensor, memory: Tensor, carries: 
 
 def forward_steps(
     parameters: Parameters,
-    pictures: Tensor,
+    seen: Views,
     goal: Tensor,
     speeds: Tensor,
     memory: Tensor,
@@ -170,13 +210,13 @@ def forward_steps(
 ) -> MemoryOutput:
     """Compute the raw outputs of T steps.
 
-    pictures: (B, T, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first
+    seen: views (B, T, 3 PICTURES, H, W) of the pictures, 0 to 1, oldest first
     goal, speeds: (B, T, 2), see `network.forward`
     memory: (B, MEMORY) before the first step, 0 at the start of an episode
     carries: whether the memory is carried from step to step
     """
     batch, steps = goal.shape[:2]
-    image = encoded(parameters, pictures.flatten(0, 1))
+    image = encoded(parameters, Views(*(one.flatten(0, 1) for one in seen)))
     inputs = linear_layer(parameters, torch.cat([goal, speeds], 2).flatten(0, 1), "inputs").relu()
     joined = linear_layer(parameters, torch.cat([image, inputs], 1), "joined").relu()
     after = remembered(parameters, joined.unflatten(0, (batch, steps)), memory, carries)

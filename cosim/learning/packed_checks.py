@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.packed_demos import Packed
-from cosim.learning.network import HEIGHT_PX, WAYPOINTS, WIDTH_PX
+from cosim.learning.network import WAYPOINTS
 
 _LISTED: Final = ("policy", "learner", "explorer")
 """Metadata with a value for each data set."""
@@ -51,11 +51,14 @@ def check_rows(path: Path, packed: Packed) -> None:
         )
 
 
-def check_pictures(path: Path, frames: NDArray[np.uint8]) -> None:
-    """Raise RunError if pictures (N, H, W, 3) have another size than the networks' inputs."""
+def check_pictures(path: Path, frames: NDArray[np.uint8], size_px: tuple[int, int]) -> None:
+    """Raise RunError if pictures (N, H, W, 3) have another size than the network's input.
+
+    size_px: width and height
+    """
     high, wide = frames.shape[1:3]
-    if (high, wide) != (HEIGHT_PX, WIDTH_PX):
+    if (wide, high) != size_px:
         raise RunError(
-            f"{path}: pictures of {wide} x {high} pixels, wanted are {WIDTH_PX} x {HEIGHT_PX}: "
-            f"cosim collect --camera {WIDTH_PX}x{HEIGHT_PX}"
+            f"{path}: pictures of {wide} x {high} pixels, wanted are {size_px[0]} x {size_px[1]}: "
+            f"cosim collect --camera {size_px[0]}x{size_px[1]}"
         )

@@ -18,12 +18,16 @@ from cosim.learning.kind import GOAL_INPUT, SPEEDS_INPUT, Arrays, Network, pictu
 from cosim.learning.memory_graph import MEMORY_INPUTS, NEXT, build_memory_graph
 from cosim.learning.memory_network import (
     AUXILIARY,
+    HEIGHT_PX,
     MEMORY,
     NEAR,
     PICTURES,
+    WIDTH_PX,
     MemoryOutput,
+    Views,
     forward_steps,
     new_memory_parameters,
+    views,
 )
 from cosim.learning.network import NetworkOutput, Parameters, plan
 from cosim.learning.objective import PLAN_WEIGHTS, PlanErrors, mean, plan_losses
@@ -53,7 +57,7 @@ def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOu
     on_gpu = batch.goal.device.type == "cuda"
     with torch.autocast("cuda", dtype=torch.bfloat16, enabled=on_gpu):
         output = forward_steps(
-            parameters, batch.pictures, batch.goal, batch.speeds, memory, training.memory
+            parameters, batch.seen, batch.goal, batch.speeds, memory, training.memory
         )
     valid = batch.places
     return MemoryOutput(
@@ -209,8 +213,9 @@ def _answers(
 ) -> dict[str, NDArray[np.float32]]:
     """Return the outputs of one step."""
     pictures, goal, speeds, memory = (torch.from_numpy(inputs[name]) for name in MEMORY_INPUTS)
+    seen = Views(*(one[:, None] for one in views(pictures)))
     output = forward_steps(
-        parameters, pictures[:, None], goal[:, None], speeds[:, None], memory, training.memory
+        parameters, seen, goal[:, None], speeds[:, None], memory, training.memory
     )
     labels = {name: getattr(output, name).numpy() for name in AUXILIARY}
     return {PLAN: plan(output.plan).numpy(), NEXT: output.memory.numpy(), **labels}
@@ -225,7 +230,7 @@ SIDEWALK: Final = Network(
     graph=_graph,
     answers=_answers,
     inputs={
-        "pictures": pictures_input(PICTURES, 1),
+        "pictures": pictures_input(PICTURES, 1, (WIDTH_PX, HEIGHT_PX)),
         "goal": GOAL_INPUT,
         "speeds": SPEEDS_INPUT,
         "memory": {"what": "state", "output": NEXT},

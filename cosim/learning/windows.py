@@ -35,14 +35,18 @@ from cosim.learning.examples import (
     scaled_goal,
     scaled_speeds,
 )
-from cosim.learning.memory_network import EVENTS, MEMORY, SIGNALS
-from cosim.learning.network import (
-    CRUISE_MPS,
+from cosim.learning.memory_network import (
+    DETAIL,
+    EVENTS,
+    HALVED,
     HEIGHT_PX,
-    TURN_UNIT_RADPS,
-    WAYPOINTS,
+    MEMORY,
+    SIGNALS,
     WIDTH_PX,
+    Views,
+    picture_of,
 )
+from cosim.learning.network import CRUISE_MPS, TURN_UNIT_RADPS, WAYPOINTS
 from cosim.learning.packed_checks import check_pictures, check_rows, common_meta
 from cosim.learning.settings import Training
 from cosim.learning.values import discounted_returns
@@ -66,6 +70,11 @@ _FROM_START: Final = 0.15
 _ROOM: Final = 0.75
 """Largest share of a GPU's free memory for pictures; more stay in the host's memory."""
 _READERS: Final = 8
+_MARGIN: Final = HALVED * SHIFT_PX
+"""Pixels around the detail that are stored, too, so that it can be shifted."""
+_STORED: Final = tuple(slice(one.start - _MARGIN, one.stop + _MARGIN) for one in DETAIL)
+_AT_ONCE: Final = 256
+"""Pictures that are halved at once."""
 _SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal")
 
 
@@ -73,7 +82,7 @@ _SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal")
 class Windows:
     """Batch of windows, with rows (N,) of all valid steps, N <= B T.
 
-    pictures: (B, T, 3 PICTURES, HEIGHT_PX, WIDTH_PX), 0 to 1
+    seen: views (B, T, 3 PICTURES, H, W), 0 to 1
     goal, speeds: (B, T, 2) inputs
     valid: (B, T) whether a step belongs to the episode; of the fields below only such rows exist
     places: (N,) their indices in the B T steps
@@ -83,7 +92,7 @@ class Windows:
         auxiliary heads are trained
     """
 
-    pictures: Tensor
+    seen: Views
     goal: Tensor
     speeds: Tensor
     valid: Tensor
@@ -115,7 +124,7 @@ class WindowExamples:
             packed = list(readers.map(lambda path: _checked(path, training), paths))
         self.meta = common_meta(paths, packed, _SAME_META)
         self._device = device
-        self._frames = _pictures(paths, [len(one) for one in packed], device)
+        self._stored = _stored(paths, [len(one) for one in packed], device)
         firsts = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         episode = np.concatenate([one.episode + n for one, n in zip(packed, firsts, strict=False)])
         frame = np.concatenate([one.frame for one in packed])
@@ -189,19 +198,15 @@ class WindowExamples:
         valid = rows <= self._last[start][:, None]
         rows = np.minimum(rows, self._last[start][:, None])
         before = np.maximum(start - 1, self._first[start])[:, None]
-        shown = torch.from_numpy(np.concatenate([before, rows], 1)).to(self._frames.device)
-        frames = _pictures_of(self._frames[shown].to(self._device), changes)
-        earlier, newest = frames[:, :-1], frames[:, 1:]
-        if changes is not None:
-            frozen = torch.from_numpy(changes.frozen).to(self._device)
-            earlier = torch.where(_shaped(frozen, earlier), newest, earlier)
+        shown = torch.from_numpy(np.concatenate([before, rows], 1)).to(self._stored.whole.device)
+        frames = Views(*(one[shown].to(self._device) for one in self._stored))
         at = torch.from_numpy(rows).to(self._device)
         here = torch.from_numpy(rows[valid]).to(self._device)
         command = self._rows["command"][here]
         driven = self._rows["driven"][here]
         nothing = torch.zeros((len(here), 0), device=self._device)
         batch = Windows(
-            pictures=torch.cat([earlier, newest], 4).permute(0, 1, 4, 2, 3),
+            seen=Views(*(_paired(one, changes) for one in _seen_of(frames, changes))),
             goal=scaled_goal(self._rows["goal"][at]),
             speeds=scaled_speeds(self._rows["state"][at]),
             valid=torch.from_numpy(valid).to(self._device),
@@ -234,11 +239,10 @@ class WindowExamples:
     def first_inputs(self) -> dict[str, NDArray[np.float32]]:
         """Return the inputs of the graph at the start of the first held-out episode."""
         batch = self.windows(self.held_out[:1], 1)
-        inputs = {
-            name: getattr(batch, name)[:, 0].cpu().numpy().astype(np.float32)
-            for name in ("pictures", "goal", "speeds")
-        }
-        return inputs | {"memory": np.linspace(-0.5, 0.5, MEMORY, dtype=np.float32)[None]}
+        pictures = picture_of(Views(*(one[:, 0] for one in batch.seen)))
+        inputs = {"pictures": pictures, "goal": batch.goal[:, 0], "speeds": batch.speeds[:, 0]}
+        arrays = {name: one.cpu().numpy().astype(np.float32) for name, one in inputs.items()}
+        return arrays | {"memory": np.linspace(-0.5, 0.5, MEMORY, dtype=np.float32)[None]}
 
 
 @dataclass(frozen=True)
@@ -247,7 +251,7 @@ class _Changes:
 
     light: (B, 3) factors of red, green and blue
     visible: (B,) whether speeds are shown
-    off_px: (2, B, 1) shift of the pictures down and right, from 0 to 2 SHIFT_PX
+    off_px: (2, B, 1) shift of the whole view down and right, from 0 to 2 SHIFT_PX
     mirrored: (B,) whether left and right are exchanged
     frozen: (B,) whether the picture before each one is replaced by it
     """
@@ -259,26 +263,50 @@ class _Changes:
     frozen: NDArray[np.bool_]
 
 
-def _pictures_of(frames: Tensor, changes: _Changes | None) -> Tensor:
-    """Return pictures (B, T, H, W, 3), 0 to 1, shifted, mirrored and lit.
+def _seen_of(frames: Views, changes: _Changes | None) -> Views:
+    """Return views (B, T, H, W, 3), 0 to 1, shifted, mirrored and lit.
 
     The channels stay last: GPUs convolve such pictures faster.
 
-    frames: (B, T, H, W, 3) uint8
+    frames: (B, T, H, W, 3) uint8; the detail with its margin
     """
     if changes is None:
-        return frames.float() / 255.0
-    down, right = changes.off_px - SHIFT_PX
-    high, wide = frames.shape[2:4]
-    row = (np.arange(high) + down).clip(0, high - 1)
-    column = (np.arange(wide) + right).clip(0, wide - 1)
+        inner = slice(_MARGIN, -_MARGIN)
+        return Views(
+            frames.whole.float() / 255.0, frames.detail[:, :, inner, inner].float() / 255.0
+        )
+    shifts = changes.off_px - SHIFT_PX
+    high, wide = frames.whole.shape[2:4]
+    down, right = shifts
+    row, column = (np.arange(high) + down).clip(0, high - 1), np.arange(wide) + right
+    whole = _taken(frames.whole, row, column.clip(0, wide - 1), changes)
+    high, wide = (one.stop - one.start for one in DETAIL)
+    down, right = HALVED * shifts + _MARGIN
+    detail = _taken(frames.detail, np.arange(high) + down, np.arange(wide) + right, changes)
+    return Views(whole, detail)
+
+
+def _taken(
+    frames: Tensor, row: NDArray[np.int64], column: NDArray[np.int64], changes: _Changes
+) -> Tensor:
+    """Return the pixels of some rows (B, H) and columns (B, W), mirrored and lit, 0 to 1."""
     column = np.where(changes.mirrored[:, None], column[:, ::-1], column)
-    there = (row[:, :, None] * wide + column[:, None, :]).reshape(len(row), -1)
+    there = (row[:, :, None] * frames.shape[3] + column[:, None, :]).reshape(len(row), -1)
     index = torch.from_numpy(there).to(frames.device)[:, None, :, None]
     pixels = frames.flatten(2, 3)
-    seen = pixels.gather(2, index.expand(-1, pixels.shape[1], -1, 3)).view(frames.shape)
+    seen = pixels.gather(2, index.expand(-1, pixels.shape[1], -1, 3))
     gain = torch.from_numpy(changes.light.astype(np.float32)).to(frames.device)
-    return (seen.float() / 255.0 * gain[:, None, None, None]).clamp(max=1.0)
+    lit = (seen.float() / 255.0 * gain[:, None, None]).clamp(max=1.0)
+    return lit.view(*frames.shape[:2], row.shape[1], column.shape[1], 3)
+
+
+def _paired(frames: Tensor, changes: _Changes | None) -> Tensor:
+    """Return each picture with the one before it, (B, T, 6, H, W), of T + 1 pictures."""
+    earlier, newest = frames[:, :-1], frames[:, 1:]
+    if changes is not None:
+        frozen = torch.from_numpy(changes.frozen).to(frames.device)
+        earlier = torch.where(_shaped(frozen, earlier), newest, earlier)
+    return torch.cat([earlier, newest], 4).permute(0, 1, 4, 2, 3)
 
 
 def _changed(batch: Windows, changes: _Changes, window: NDArray[np.int64]) -> Windows:
@@ -289,7 +317,7 @@ def _changed(batch: Windows, changes: _Changes, window: NDArray[np.int64]) -> Wi
     device = batch.goal.device
     seen = torch.from_numpy(changes.visible.astype(np.float32)).to(device)
     batch = replace(batch, speeds=batch.speeds * seen[:, None, None])
-    other = mirror_windows(replace(batch, pictures=batch.pictures[:, :0]))
+    other = mirror_windows(replace(batch, seen=Views(*(one[:, :0] for one in batch.seen))))
     mirrored = torch.from_numpy(changes.mirrored).to(device)
     which = torch.from_numpy(changes.mirrored[window]).to(device)
     chosen = {
@@ -305,7 +333,7 @@ def _changed(batch: Windows, changes: _Changes, window: NDArray[np.int64]) -> Wi
 
 
 _PER_WINDOW: Final = ("goal", "speeds")
-_UNCHANGED: Final = ("pictures", "valid", "places", "weight")
+_UNCHANGED: Final = ("seen", "valid", "places", "weight")
 
 
 def mirror_windows(batch: Windows) -> Windows:
@@ -313,7 +341,7 @@ def mirror_windows(batch: Windows) -> Windows:
     side = torch.tensor([1.0, -1.0], device=batch.goal.device)
     values = {one.name: getattr(batch, one.name) for one in fields(batch)}
     values |= {
-        "pictures": batch.pictures.flip(4),
+        "seen": Views(*(one.flip(4) for one in batch.seen)),
         "goal": batch.goal * side,
         "speeds": batch.speeds * side,
         "turn": -batch.turn,
@@ -355,23 +383,33 @@ def _shaped(which: Tensor, like: Tensor) -> Tensor:
     return which.view(-1, *[1] * (like.ndim - 1))
 
 
-def _pictures(paths: Sequence[Path], counts: Sequence[int], device: torch.device) -> Tensor:
-    """Load the pictures of all files, on the device if they fit."""
-    size = (sum(counts), HEIGHT_PX, WIDTH_PX, 3)
-    if device.type == "cuda" and np.prod(size) > _ROOM * torch.cuda.mem_get_info(device)[0]:
+def _stored(paths: Sequence[Path], counts: Sequence[int], device: torch.device) -> Views:
+    """Load the views (N, H, W, 3) of all files, uint8, on the device if they fit."""
+    count = sum(counts)
+    sizes = (
+        (count, HEIGHT_PX // HALVED, WIDTH_PX // HALVED, 3),
+        (count, *(one.stop - one.start for one in _STORED), 3),
+    )
+    bytes_needed = sum(np.prod(size) for size in sizes)
+    if device.type == "cuda" and bytes_needed > _ROOM * torch.cuda.mem_get_info(device)[0]:
         device = torch.device("cpu")
-    whole = torch.empty(size, dtype=torch.uint8, device=device)
-    places = torch.split(whole, list(counts))
+    stored = Views(*(torch.empty(size, dtype=torch.uint8, device=device) for size in sizes))
+    places = zip(*(torch.split(one, list(counts)) for one in stored), strict=True)
     with ThreadPoolExecutor(_READERS) as readers:
-        list(readers.map(_fill, places, paths))
-    return whole
+        list(readers.map(_fill, (Views(*place) for place in places), paths))
+    return stored
 
 
-def _fill(place: Tensor, path: Path) -> None:
-    """Load the pictures of a file into a tensor. Raises RunError for another size."""
+def _fill(place: Views, path: Path) -> None:
+    """Load the views of a file's pictures. Raises RunError for another size."""
     frames = read_frames(path)
-    check_pictures(path, frames)
-    place.copy_(torch.from_numpy(frames))
+    check_pictures(path, frames, (WIDTH_PX, HEIGHT_PX))
+    for first in range(0, len(frames), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        pictures = torch.from_numpy(frames[some]).to(place.whole.device)
+        squares = pictures.unflatten(1, (-1, HALVED)).unflatten(3, (-1, HALVED))
+        place.whole[some] = squares.float().mean((2, 4)).round().to(torch.uint8)
+        place.detail[some] = pictures[:, *_STORED]
 
 
 def _rewards(packed: Packed) -> NDArray[np.float32]:

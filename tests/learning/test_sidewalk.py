@@ -35,15 +35,25 @@ from cosim.learning.bundle import manifest_of, source_of, write_bundle  # noqa: 
 from cosim.learning.memory_graph import MEMORY_INPUTS, build_memory_graph  # noqa: E402
 from cosim.learning.memory_network import (  # noqa: E402
     EVENTS,
+    HEIGHT_PX,
     MEMORY,
+    WIDTH_PX,
+    Views,
     forward_steps,
     new_memory_parameters,
+    picture_of,
+    views,
 )
-from cosim.learning.network import CRUISE_MPS, HEIGHT_PX, WAYPOINTS, WIDTH_PX, plan  # noqa: E402
+from cosim.learning.network import CRUISE_MPS, WAYPOINTS, plan  # noqa: E402
 from cosim.learning.settings import Training  # noqa: E402
 from cosim.learning.sidewalk import FREE_UNIT_M, HAND, SIDEWALK, near_loss  # noqa: E402
 from cosim.learning.training import _batches, train  # noqa: E402
-from cosim.learning.windows import WindowExamples, mirror_windows, split_episodes  # noqa: E402
+from cosim.learning.windows import (  # noqa: E402
+    WindowExamples,
+    Windows,
+    mirror_windows,
+    split_episodes,
+)
 
 CPU = torch.device("cpu")
 BRISK = Training(network="sidewalk", steps=2, batch=2, device="cpu")
@@ -97,6 +107,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def equal(first: Windows, second: Windows) -> bool:
+    """Compare all tensors of two batches."""
+    tensors = ([*seen, *values] for seen, *values in (vars(first).values(), vars(second).values()))
+    return all(torch.equal(one, other) for one, other in zip(*tensors, strict=True))
+
+
 def session_of(graph: bytes) -> object:
     return ort.InferenceSession(graph, providers=["CPUExecutionProvider"])
 
@@ -108,17 +124,20 @@ def test_a_step_by_step_memory_equals_that_of_the_whole_window(data: Path, keeps
     parameters = new_memory_parameters(7)
     examples = WindowExamples([data], BRISK, CPU)
     batch = examples.windows(examples.held_out[:1], 6)
+    pictures = picture_of(Views(*(one[0] for one in batch.seen)))
+    seen = Views(*(one[None] for one in views(pictures)))
+    for rounded, exact in zip(batch.seen, seen, strict=True):
+        torch.testing.assert_close(rounded, exact, rtol=0.0, atol=0.51 / 255.0)
     with torch.no_grad():
         window = forward_steps(
-            parameters, batch.pictures, batch.goal, batch.speeds, torch.zeros(1, MEMORY), keeps
+            parameters, seen, batch.goal, batch.speeds, torch.zeros(1, MEMORY), keeps
         )
     wanted = plan(window.plan).numpy()
     session = session_of(build_memory_graph(parameters, keeps))
     memory = np.zeros((1, MEMORY), np.float32)
     for step in range(6):
-        inputs = {
-            name: getattr(batch, name)[:, step].numpy() for name in ("pictures", "goal", "speeds")
-        }
+        inputs = {name: getattr(batch, name)[:, step].numpy() for name in ("goal", "speeds")}
+        inputs["pictures"] = pictures[step : step + 1].numpy()
         found, memory, near = session.run(  # type: ignore[attr-defined]
             ["plan", "memory_next", "near"], inputs | {"memory": memory}
         )
@@ -197,15 +216,15 @@ def test_windows_stay_in_their_episode(data: Path) -> None:
     np.testing.assert_array_equal(
         batch.turn.numpy(), packed.command[[6, 7, 8, 9, 10, 9, 10, 11], 1].clip(-0.65, 0.65)
     )
-    first, second = batch.pictures[0, 0, :3], batch.pictures[0, 0, 3:]
-    assert torch.equal(first, second)
-    assert torch.equal(batch.pictures[1, 0, :3], batch.pictures[0, 2, 3:])
+    for seen in batch.seen:
+        assert torch.equal(seen[0, 0, :3], seen[0, 0, 3:])
+        assert torch.equal(seen[1, 0, :3], seen[0, 2, 3:])
 
 
 def test_a_share_of_the_windows_shows_each_picture_twice(data: Path) -> None:
     """In these, all pairs of pictures are equal; in the others only the first one may be."""
     batch = WindowExamples([data], BRISK, CPU).drawn(0, 0, 40)
-    earlier, newest = batch.pictures[:, 1:, :3], batch.pictures[:, 1:, 3:]
+    earlier, newest = batch.seen.whole[:, 1:, :3], batch.seen.whole[:, 1:, 3:]
     equal = (earlier == newest).flatten(2).all(2)
     valid = batch.valid[:, 1:]
     frozen = torch.stack([row[there].all() for row, there in zip(equal, valid, strict=True)])
@@ -229,7 +248,7 @@ def test_the_mirror_exchanges_left_and_right_in_labels_too(data: Path) -> None:
     batch = examples.windows(np.array([0, 6]), 4)
     mirrored = mirror_windows(batch)
     back = mirror_windows(mirrored)
-    assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
+    assert equal(batch, back)
     torch.testing.assert_close(mirrored.near[..., 2], -batch.near[..., 2])
     torch.testing.assert_close(mirrored.free[:, 0], batch.free[:, -1])
     torch.testing.assert_close(mirrored.near[..., 1], batch.near[..., 1])
@@ -239,9 +258,10 @@ def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
     """The same step gives the same windows, and another step gives others."""
     examples = WindowExamples([data], BRISK, CPU)
     third, other, again = (examples.drawn(0, step, 3) for step in (3, 4, 3))
-    assert all(torch.equal(value, getattr(again, name)) for name, value in vars(third).items())
-    assert not torch.equal(third.pictures, other.pictures)
-    assert float(third.pictures.min()) >= 0.0 and float(third.pictures.max()) <= 1.0
+    assert equal(third, again)
+    for ours, others in zip(third.seen, other.seen, strict=True):
+        assert not torch.equal(ours, others)
+        assert float(ours.min()) >= 0.0 and float(ours.max()) <= 1.0
 
 
 def test_ablations_remove_only_training_episodes() -> None:
@@ -337,7 +357,7 @@ def test_prefetched_batches_are_the_same(data: Path) -> None:
     for ahead, alone in zip(
         _batches(examples, BRISK, 2, 5, True), _batches(examples, BRISK, 2, 5, False), strict=True
     ):
-        assert all(torch.equal(value, getattr(alone, name)) for name, value in vars(ahead).items())
+        assert equal(ahead, alone)
 
 
 @pytest.mark.engine
@@ -345,7 +365,17 @@ def test_from_the_simulator_to_a_drive(tmp_path: Path, cosim: Cosim) -> None:
     """Demonstrations with labels are collected in two pieces, packed and trained on; the bundle
     drives and teaches in DAgger."""
     words = ("collect", "unit", "--event", "crosswalk", "--cities", "900:901", "--city-size", "500")
-    words += ("--labels", "--format", "raw", "--fov", "60", "--astray", "0.5", "--episodes", "2")
+    words += (
+        "--labels",
+        "--format",
+        "raw",
+        "--camera",
+        "320x180",
+        "--astray",
+        "0.5",
+        "--episodes",
+        "2",
+    )
     begun = cosim(*words, "--out", "demos", "--minutes", "1e-9", cwd=tmp_path)
     assert begun.returncode == 4 and "The time is up after 0 episodes" in begun.stderr
     done = cosim(*words, "--out", "demos", "--resume", cwd=tmp_path)
