@@ -46,7 +46,7 @@ gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes
       rm -f "$USED"; echo "no episode in COLLECT minutes: continuing"; exit 1
     fi
     echo $(($(cat "$USED" 2> /dev/null || echo 0) + SECONDS)) > "$USED"; [ $LAST = 1 ]' - \
-    $COSIM collect "$@" --policy "$EXPERT" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --fov "$FOV" --labels --format raw \
+    $COSIM collect "$@" --policy "$EXPERT" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --camera 320x180 --fov "$FOV" --labels --format raw \
     --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
 )
 packed() { # names...: packs their collections, when all are done

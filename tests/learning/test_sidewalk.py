@@ -29,9 +29,10 @@ from tests.conftest import Cosim
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: see `cosim train --help`")
 ort = pytest.importorskip("onnxruntime")
-pytest.importorskip("onnx")
+onnx = pytest.importorskip("onnx")
 
 from cosim.learning.bundle import manifest_of, source_of, write_bundle  # noqa: E402
+from cosim.learning.graph import load_parameters  # noqa: E402
 from cosim.learning.memory_graph import MEMORY_INPUTS, build_memory_graph  # noqa: E402
 from cosim.learning.memory_network import (  # noqa: E402
     EVENTS,
@@ -166,8 +167,12 @@ def test_a_run_feeds_the_graph_the_windows_of_training(data: Path) -> None:
         fed = feeder.feed(
             Observation(row, 0.0, rgb, v_mps, w_radps, COURIER, goal=PointGoal(x_m, y_m))
         )
-        for name in ("pictures", "goal", "speeds"):
+        for name in ("goal", "speeds"):
             np.testing.assert_allclose(fed[name][0], getattr(batch, name)[0, row], atol=1e-6)
+        for shown, trained in zip(
+            views(torch.from_numpy(fed["pictures"])), batch.seen, strict=True
+        ):
+            torch.testing.assert_close(shown[0], trained[0, row], rtol=0.0, atol=0.51 / 255.0)
         assert fed["memory"].any() == (row > 0)
         feeder.remember({"memory_next": np.ones((1, MEMORY), np.float32)})
     feeder.clear()
@@ -358,6 +363,20 @@ def test_prefetched_batches_are_the_same(data: Path) -> None:
         _batches(examples, BRISK, 2, 5, True), _batches(examples, BRISK, 2, 5, False), strict=True
     ):
         assert equal(ahead, alone)
+
+
+def test_a_bundle_without_the_detail_begins_as_it_was(data: Path, tmp_path: Path) -> None:
+    """Parameters of an earlier `sidewalk` lack the part at full size: it is 0, and all others are
+    those of the file."""
+    parameters = new_memory_parameters(7)
+    graph = onnx.load_from_string(build_memory_graph(parameters))
+    kept = [one for one in graph.graph.initializer if one.name != "detail.weight"]
+    del graph.graph.initializer[:]
+    graph.graph.initializer.extend(kept)
+    onnx.save(graph, tmp_path / "model.onnx")
+    found = load_parameters(tmp_path / "model.onnx", new_memory_parameters(0))
+    assert not found.pop("detail.weight").any() and found.keys() < parameters.keys()
+    assert all(torch.equal(value, parameters[name]) for name, value in found.items())
 
 
 @pytest.mark.engine
