@@ -31,11 +31,15 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed: see `cosi
 ort = pytest.importorskip("onnxruntime")
 onnx = pytest.importorskip("onnx")
 
+from torch.nn import functional  # noqa: E402
+
 from cosim.learning.bundle import manifest_of, source_of, write_bundle  # noqa: E402
 from cosim.learning.graph import load_parameters  # noqa: E402
 from cosim.learning.memory_graph import MEMORY_INPUTS, build_memory_graph  # noqa: E402
 from cosim.learning.memory_network import (  # noqa: E402
+    DETAIL,
     EVENTS,
+    HALVED,
     HEIGHT_PX,
     MEMORY,
     WIDTH_PX,
@@ -224,6 +228,18 @@ def test_windows_stay_in_their_episode(data: Path) -> None:
     for seen in batch.seen:
         assert torch.equal(seen[0, 0, :3], seen[0, 0, 3:])
         assert torch.equal(seen[1, 0, :3], seen[0, 2, 3:])
+
+
+def test_both_views_are_shifted_mirrored_and_lit_alike(data: Path) -> None:
+    """The detail, halved, is that part of the whole in each augmented window."""
+    seen = WindowExamples([data], BRISK, CPU).drawn(0, 0, 40).seen
+    rows, columns = (slice(one.start // HALVED, one.stop // HALVED) for one in DETAIL)
+    whole = seen.whole[..., rows, columns].flatten(0, 1)
+    detail = seen.detail.flatten(0, 1)
+    halved = functional.avg_pool2d(detail, HALVED)
+    unclipped = functional.max_pool2d(detail, HALVED) < 1.0
+    assert unclipped.float().mean() > 0.5
+    torch.testing.assert_close(halved[unclipped], whole[unclipped], rtol=0.0, atol=0.01)
 
 
 def test_a_share_of_the_windows_shows_each_picture_twice(data: Path) -> None:
