@@ -11,8 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
+from cosim import policies
 from cosim.episode.interfaces import Observation
 from cosim.policies.load import load_policy
+from cosim.policies.onnx.policy import OnnxPolicy, example_differences
 from cosim.results.run_folder import read_records
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import PointGoal
@@ -26,6 +28,7 @@ from tests.support.graphs import bundle, graph_bytes, port, tiny_graph
 
 BLIND = tiny_graph(bright=np.zeros((6 * 4 * 8, 1), np.float32))
 SEED = ("--seed", "5")
+LEARNED = Path(policies.__file__).parent / "learned"
 
 
 class Twin:
@@ -64,6 +67,23 @@ def test_a_bundle_drives_like_the_same_policy_as_a_class(tmp_path: Path) -> None
         "route_point",
         twin.manifest.waypoints,
     )
+
+
+@pytest.mark.parametrize("name", ["small", "small-reactive", "sidewalk"])
+def test_networks_that_ship_answer_as_in_training(name: str) -> None:
+    """The answers to the example of each bundle are PyTorch's, up to rounding."""
+    differences = example_differences(OnnxPolicy(LEARNED / name))
+    assert differences and max(differences.values()) < 1e-3
+
+
+@pytest.mark.engine
+def test_sidewalk_passes_an_obstacle(tmp_path: Path, cosim: Cosim) -> None:
+    """The shipped network, which needs no PyTorch, solves a way on which `straight` fails."""
+    for policy in ("sidewalk", "straight"):
+        words = ("run", "unit", "--scenario", "straight-7015", "--policy", policy)
+        ran = cosim(*words, "--out", policy, cwd=tmp_path)
+        (record,) = read_records(tmp_path / policy)
+        assert record.measures["success"] == (policy == "sidewalk"), ran.stderr
 
 
 @pytest.mark.engine
