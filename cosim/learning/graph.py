@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from cosim.core.errors import RunError
-from cosim.learning.memory_network import GROWN
 from cosim.learning.network import (
     CRUISE_MPS,
     HEIGHT_PX,
@@ -132,10 +131,13 @@ def build_graph(parameters: Parameters) -> bytes:
     return g.finished("small", INPUTS, {PLAN: (1, WAYPOINTS, 4)})
 
 
-def load_parameters(path: Path, wanted: Parameters) -> dict[str, torch.Tensor]:
+def load_parameters(
+    path: Path, wanted: Parameters, grown: Sequence[str] = ()
+) -> dict[str, torch.Tensor]:
     """Load the parameters from the graph of a bundle.
 
     wanted: parameters of these names and shapes
+    grown: layers that earlier bundles lack; they are 0 then
 
     Raises RunError for a graph without them.
     """
@@ -145,11 +147,12 @@ def load_parameters(path: Path, wanted: Parameters) -> dict[str, torch.Tensor]:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from error
     except Exception as error:
         raise RunError(f"{path}: no ONNX graph: {error}") from error
+    for layer in grown:
+        names = [name for name in wanted if name.startswith(f"{layer}.")]
+        if not arrays.keys() & set(names):
+            arrays |= {name: wanted[name].numpy() * 0.0 for name in names}
     found: dict[str, torch.Tensor] = {}
     for name, like in wanted.items():
-        if name not in arrays and name.split(".")[0] in GROWN:
-            found[name] = torch.zeros_like(like)
-            continue
         shape = arrays[name].shape if name in arrays else None
         if shape != tuple(like.shape):
             problem = "is not there" if shape is None else f"has the shape {shape}"

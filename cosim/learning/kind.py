@@ -16,11 +16,9 @@ from torch import Tensor
 from cosim.learning.network import (
     GOAL_MOST_M,
     GOAL_UNIT_M,
-    HEIGHT_PX,
     SPEED_MEAN_MPS,
     SPEED_UNIT_MPS,
     TURN_UNIT_RADPS,
-    WIDTH_PX,
     Parameters,
 )
 from cosim.learning.settings import Training
@@ -52,6 +50,7 @@ class Network:
     graph: ONNX graph of the parameters.
     answers: outputs of the network for inputs of the graph, by name.
     inputs: inputs of a bundle's manifest.
+    grown: layers that earlier bundles lack, and that begin at 0 from them.
     """
 
     examples: Callable[[Sequence[Path], Training, torch.device], Any]
@@ -62,6 +61,7 @@ class Network:
     graph: Callable[[Parameters, Training], bytes]
     answers: Callable[[Parameters, Arrays, Training], dict[str, NDArray[np.float32]]]
     inputs: Mapping[str, Any]
+    grown: Sequence[str] = ()
 
 
 GOAL_INPUT: Final[Mapping[str, Any]] = MappingProxyType(
@@ -82,9 +82,7 @@ SPEEDS_INPUT: Final[Mapping[str, Any]] = MappingProxyType(
 )
 
 
-def pictures_input(
-    frames: int, every: int, size_px: tuple[int, int] = (WIDTH_PX, HEIGHT_PX)
-) -> dict[str, Any]:
+def pictures_input(frames: int, every: int, size_px: tuple[int, int]) -> dict[str, Any]:
     """Return the manifest's input of the last pictures, the newest last.
 
     size_px: width and height

@@ -13,21 +13,20 @@ from cosim.learning.memory_network import (
     DETAIL,
     EVENTS,
     HALVED,
-    HEIGHT_PX,
     MEMORY,
     NEAR,
     NEAR_VALUES,
     PICTURES,
     SIGNALS,
+    SIZE_PX,
     STAGES,
     STRIDES,
-    WIDTH_PX,
     is_block,
 )
 from cosim.learning.network import WAYPOINTS, Parameters
 
 MEMORY_INPUTS: Final = {
-    "pictures": (1, 3 * PICTURES, HEIGHT_PX, WIDTH_PX),
+    "pictures": (1, 3 * PICTURES, *reversed(SIZE_PX)),
     "goal": (1, 2),
     "speeds": (1, 2),
     "memory": (1, MEMORY),

@@ -11,7 +11,7 @@ and are outputs of the graph.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -29,8 +29,8 @@ from cosim.learning.network import (
     linear_layer,
 )
 
-WIDTH_PX: Final = 320
-HEIGHT_PX: Final = 180
+SIZE_PX: Final = (320, 180)
+"""Width and height of a picture."""
 PICTURES: Final = 2
 """Number of pictures in the input, the newest last."""
 MEMORY: Final = 256
@@ -118,6 +118,10 @@ class Views(NamedTuple):
     whole: Tensor
     detail: Tensor
 
+    def each(self, change: Callable[[Tensor], Tensor]) -> Views:
+        """Return both views changed alike."""
+        return Views(change(self.whole), change(self.detail))
+
 
 class MemoryOutput(NamedTuple):
     """Raw outputs at N = B T steps, see `network.NetworkOutput` for the plan.
@@ -144,7 +148,7 @@ def new_memory_parameters(seed: int) -> dict[str, Tensor]:
     draws = torch.Generator().manual_seed(seed)
     parameters: dict[str, Tensor] = {}
     for name, shape in _SHAPES.items():
-        quiet = name.endswith("b") or name in (*HEADS, *GROWN)
+        quiet = name.endswith("b") or name in HEADS
         gates = name in ("arriving", "recurrent")
         fan = math.prod(shape[1:])
         scale = 0.02 if quiet else math.sqrt((1.0 if gates else 2.0) / fan)
@@ -156,12 +160,15 @@ def new_memory_parameters(seed: int) -> dict[str, Tensor]:
 
 
 def views(pictures: Tensor) -> Views:
-    """Return both views of pictures (N, C, HEIGHT_PX, WIDTH_PX)."""
+    """Return both views of pictures (N, C, 180, 320)."""
     return Views(functional.avg_pool2d(pictures, HALVED), pictures[..., *DETAIL])
 
 
 def picture_of(seen: Views) -> Tensor:
-    """Return pictures (N, C, HEIGHT_PX, WIDTH_PX) with these views, up to rounding."""
+    """Return pictures (N, C, 180, 320) with these views.
+
+    Outside the detail, each pixel of the whole is repeated.
+    """
     pictures = seen.whole.repeat_interleave(HALVED, 2).repeat_interleave(HALVED, 3)
     pictures[..., *DETAIL] = seen.detail
     return pictures
@@ -216,7 +223,7 @@ def forward_steps(
     carries: whether the memory is carried from step to step
     """
     batch, steps = goal.shape[:2]
-    image = encoded(parameters, Views(*(one.flatten(0, 1) for one in seen)))
+    image = encoded(parameters, seen.each(lambda one: one.flatten(0, 1)))
     inputs = linear_layer(parameters, torch.cat([goal, speeds], 2).flatten(0, 1), "inputs").relu()
     joined = linear_layer(parameters, torch.cat([image, inputs], 1), "joined").relu()
     after = remembered(parameters, joined.unflatten(0, (batch, steps)), memory, carries)

@@ -18,13 +18,12 @@ from cosim.learning.kind import GOAL_INPUT, SPEEDS_INPUT, Arrays, Network, pictu
 from cosim.learning.memory_graph import MEMORY_INPUTS, NEXT, build_memory_graph
 from cosim.learning.memory_network import (
     AUXILIARY,
-    HEIGHT_PX,
+    GROWN,
     MEMORY,
     NEAR,
     PICTURES,
-    WIDTH_PX,
+    SIZE_PX,
     MemoryOutput,
-    Views,
     forward_steps,
     new_memory_parameters,
     views,
@@ -165,7 +164,7 @@ _CLASSES: Final = ("signals_right", "events_right")
 def _examples(paths: Sequence[Path], training: Training, device: torch.device) -> WindowExamples:
     examples = WindowExamples(paths, training, device)
     if training.values and training.begin:
-        begin = load_parameters(training.begin / MODEL, new_memory_parameters(0))
+        begin = load_parameters(training.begin / MODEL, new_memory_parameters(0), GROWN)
         parameters = {name: value.to(device) for name, value in begin.items()}
         _weigh(parameters, examples, training, paths[0])
     return examples
@@ -213,7 +212,7 @@ def _answers(
 ) -> dict[str, NDArray[np.float32]]:
     """Return the outputs of one step."""
     pictures, goal, speeds, memory = (torch.from_numpy(inputs[name]) for name in MEMORY_INPUTS)
-    seen = Views(*(one[:, None] for one in views(pictures)))
+    seen = views(pictures).each(lambda one: one[:, None])
     output = forward_steps(
         parameters, seen, goal[:, None], speeds[:, None], memory, training.memory
     )
@@ -228,9 +227,10 @@ SIDEWALK: Final = Network(
     weights=_WEIGHTS,
     errors=_errors,
     graph=_graph,
+    grown=GROWN,
     answers=_answers,
     inputs={
-        "pictures": pictures_input(PICTURES, 1, (WIDTH_PX, HEIGHT_PX)),
+        "pictures": pictures_input(PICTURES, 1, SIZE_PX),
         "goal": GOAL_INPUT,
         "speeds": SPEEDS_INPUT,
         "memory": {"what": "state", "output": NEXT},

@@ -14,7 +14,15 @@ from torch import Tensor
 from cosim.learning.examples import Batch, Examples
 from cosim.learning.graph import INPUTS, PLAN, build_graph
 from cosim.learning.kind import GOAL_INPUT, SPEEDS_INPUT, Arrays, Network, pictures_input
-from cosim.learning.network import HISTORY, PICTURE_INTERVAL, Parameters, forward, new_parameters
+from cosim.learning.network import (
+    HEIGHT_PX,
+    HISTORY,
+    PICTURE_INTERVAL,
+    WIDTH_PX,
+    Parameters,
+    forward,
+    new_parameters,
+)
 from cosim.learning.network import plan as planned
 from cosim.learning.objective import PLAN_WEIGHTS, PlanErrors, plan_losses
 from cosim.learning.settings import Training
@@ -65,7 +73,7 @@ SMALL: Final = Network(
     graph=_graph,
     answers=_answers,
     inputs={
-        "pictures": pictures_input(HISTORY, PICTURE_INTERVAL),
+        "pictures": pictures_input(HISTORY, PICTURE_INTERVAL, (WIDTH_PX, HEIGHT_PX)),
         "goal": GOAL_INPUT,
         "speeds": SPEEDS_INPUT,
     },

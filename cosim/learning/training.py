@@ -103,7 +103,7 @@ def _train(
     begin = (
         None
         if training.begin is None or checkpoint.exists()
-        else load_parameters(training.begin / MODEL, network.new_parameters(0))
+        else load_parameters(training.begin / MODEL, network.new_parameters(0), network.grown)
     )
     base = None if training.begin is None else bundle_facts(training.begin)
     examples = network.examples(paths, training, device)

@@ -39,10 +39,9 @@ from cosim.learning.memory_network import (
     DETAIL,
     EVENTS,
     HALVED,
-    HEIGHT_PX,
     MEMORY,
     SIGNALS,
-    WIDTH_PX,
+    SIZE_PX,
     Views,
     picture_of,
 )
@@ -72,7 +71,7 @@ _ROOM: Final = 0.75
 _READERS: Final = 8
 _MARGIN: Final = HALVED * SHIFT_PX
 """Pixels around the detail that are stored, too, so that it can be shifted."""
-_STORED: Final = tuple(slice(one.start - _MARGIN, one.stop + _MARGIN) for one in DETAIL)
+_WITH_MARGIN: Final = tuple(slice(one.start - _MARGIN, one.stop + _MARGIN) for one in DETAIL)
 _AT_ONCE: Final = 256
 """Pictures that are halved at once."""
 _SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal")
@@ -124,7 +123,7 @@ class WindowExamples:
             packed = list(readers.map(lambda path: _checked(path, training), paths))
         self.meta = common_meta(paths, packed, _SAME_META)
         self._device = device
-        self._stored = _stored(paths, [len(one) for one in packed], device)
+        self._views = _load_views(paths, [len(one) for one in packed], device)
         firsts = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         episode = np.concatenate([one.episode + n for one, n in zip(packed, firsts, strict=False)])
         frame = np.concatenate([one.frame for one in packed])
@@ -198,15 +197,15 @@ class WindowExamples:
         valid = rows <= self._last[start][:, None]
         rows = np.minimum(rows, self._last[start][:, None])
         before = np.maximum(start - 1, self._first[start])[:, None]
-        shown = torch.from_numpy(np.concatenate([before, rows], 1)).to(self._stored.whole.device)
-        frames = Views(*(one[shown].to(self._device) for one in self._stored))
+        shown = torch.from_numpy(np.concatenate([before, rows], 1)).to(self._views.whole.device)
+        frames = self._views.each(lambda one: one[shown].to(self._device))
         at = torch.from_numpy(rows).to(self._device)
         here = torch.from_numpy(rows[valid]).to(self._device)
         command = self._rows["command"][here]
         driven = self._rows["driven"][here]
         nothing = torch.zeros((len(here), 0), device=self._device)
         batch = Windows(
-            seen=Views(*(_paired(one, changes) for one in _seen_of(frames, changes))),
+            seen=_seen_of(frames, changes).each(lambda one: _paired(one, changes)),
             goal=scaled_goal(self._rows["goal"][at]),
             speeds=scaled_speeds(self._rows["state"][at]),
             valid=torch.from_numpy(valid).to(self._device),
@@ -239,7 +238,7 @@ class WindowExamples:
     def first_inputs(self) -> dict[str, NDArray[np.float32]]:
         """Return the inputs of the graph at the start of the first held-out episode."""
         batch = self.windows(self.held_out[:1], 1)
-        pictures = picture_of(Views(*(one[:, 0] for one in batch.seen)))
+        pictures = picture_of(batch.seen.each(lambda one: one[:, 0]))
         inputs = {"pictures": pictures, "goal": batch.goal[:, 0], "speeds": batch.speeds[:, 0]}
         arrays = {name: one.cpu().numpy().astype(np.float32) for name, one in inputs.items()}
         return arrays | {"memory": np.linspace(-0.5, 0.5, MEMORY, dtype=np.float32)[None]}
@@ -280,7 +279,7 @@ def _seen_of(frames: Views, changes: _Changes | None) -> Views:
     down, right = shifts
     row, column = (np.arange(high) + down).clip(0, high - 1), np.arange(wide) + right
     whole = _taken(frames.whole, row, column.clip(0, wide - 1), changes)
-    high, wide = (one.stop - one.start for one in DETAIL)
+    high, wide = _sides(DETAIL)
     down, right = HALVED * shifts + _MARGIN
     detail = _taken(frames.detail, np.arange(high) + down, np.arange(wide) + right, changes)
     return Views(whole, detail)
@@ -294,9 +293,9 @@ def _taken(
     there = (row[:, :, None] * frames.shape[3] + column[:, None, :]).reshape(len(row), -1)
     index = torch.from_numpy(there).to(frames.device)[:, None, :, None]
     pixels = frames.flatten(2, 3)
-    seen = pixels.gather(2, index.expand(-1, pixels.shape[1], -1, 3))
+    taken = pixels.gather(2, index.expand(-1, pixels.shape[1], -1, 3))
     gain = torch.from_numpy(changes.light.astype(np.float32)).to(frames.device)
-    lit = (seen.float() / 255.0 * gain[:, None, None]).clamp(max=1.0)
+    lit = (taken.float() / 255.0 * gain[:, None, None]).clamp(max=1.0)
     return lit.view(*frames.shape[:2], row.shape[1], column.shape[1], 3)
 
 
@@ -315,9 +314,9 @@ def _changed(batch: Windows, changes: _Changes, window: NDArray[np.int64]) -> Wi
     window: (N,) window of each valid step
     """
     device = batch.goal.device
-    seen = torch.from_numpy(changes.visible.astype(np.float32)).to(device)
-    batch = replace(batch, speeds=batch.speeds * seen[:, None, None])
-    other = mirror_windows(replace(batch, seen=Views(*(one[:, :0] for one in batch.seen))))
+    visible = torch.from_numpy(changes.visible.astype(np.float32)).to(device)
+    batch = replace(batch, speeds=batch.speeds * visible[:, None, None])
+    other = mirror_windows(replace(batch, seen=batch.seen.each(lambda one: one[:, :0])))
     mirrored = torch.from_numpy(changes.mirrored).to(device)
     which = torch.from_numpy(changes.mirrored[window]).to(device)
     chosen = {
@@ -341,7 +340,7 @@ def mirror_windows(batch: Windows) -> Windows:
     side = torch.tensor([1.0, -1.0], device=batch.goal.device)
     values = {one.name: getattr(batch, one.name) for one in fields(batch)}
     values |= {
-        "seen": Views(*(one.flip(4) for one in batch.seen)),
+        "seen": batch.seen.each(lambda one: one.flip(4)),
         "goal": batch.goal * side,
         "speeds": batch.speeds * side,
         "turn": -batch.turn,
@@ -383,33 +382,38 @@ def _shaped(which: Tensor, like: Tensor) -> Tensor:
     return which.view(-1, *[1] * (like.ndim - 1))
 
 
-def _stored(paths: Sequence[Path], counts: Sequence[int], device: torch.device) -> Views:
+def _load_views(paths: Sequence[Path], counts: Sequence[int], device: torch.device) -> Views:
     """Load the views (N, H, W, 3) of all files, uint8, on the device if they fit."""
-    count = sum(counts)
+    wide, high = SIZE_PX
     sizes = (
-        (count, HEIGHT_PX // HALVED, WIDTH_PX // HALVED, 3),
-        (count, *(one.stop - one.start for one in _STORED), 3),
+        (sum(counts), high // HALVED, wide // HALVED, 3),
+        (sum(counts), *_sides(_WITH_MARGIN), 3),
     )
     bytes_needed = sum(np.prod(size) for size in sizes)
     if device.type == "cuda" and bytes_needed > _ROOM * torch.cuda.mem_get_info(device)[0]:
         device = torch.device("cpu")
-    stored = Views(*(torch.empty(size, dtype=torch.uint8, device=device) for size in sizes))
-    places = zip(*(torch.split(one, list(counts)) for one in stored), strict=True)
+    whole = Views(*(torch.empty(size, dtype=torch.uint8, device=device) for size in sizes))
+    places = zip(*(torch.split(one, list(counts)) for one in whole), strict=True)
     with ThreadPoolExecutor(_READERS) as readers:
         list(readers.map(_fill, (Views(*place) for place in places), paths))
-    return stored
+    return whole
 
 
 def _fill(place: Views, path: Path) -> None:
     """Load the views of a file's pictures. Raises RunError for another size."""
     frames = read_frames(path)
-    check_pictures(path, frames, (WIDTH_PX, HEIGHT_PX))
+    check_pictures(path, frames, SIZE_PX)
     for first in range(0, len(frames), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
         pictures = torch.from_numpy(frames[some]).to(place.whole.device)
         squares = pictures.unflatten(1, (-1, HALVED)).unflatten(3, (-1, HALVED))
         place.whole[some] = squares.float().mean((2, 4)).round().to(torch.uint8)
-        place.detail[some] = pictures[:, *_STORED]
+        place.detail[some] = pictures[:, *_WITH_MARGIN]
+
+
+def _sides(part: Sequence[slice]) -> tuple[int, ...]:
+    """Return the numbers of rows and columns of a part of a picture."""
+    return tuple(one.stop - one.start for one in part)
 
 
 def _rewards(packed: Packed) -> NDArray[np.float32]:
