@@ -99,9 +99,14 @@ class DemoConfig:
     city_size: Annotated[
         float, Option("Metres; of the cities of --cities.", least=300.0, most=5000.0)
     ] = 2000.0
-    size: Annotated[str, Option("Pixels of the pictures.", flag="--camera", metavar="WxH")] = (
-        "160x90"
-    )
+    size: Annotated[
+        str,
+        Option(
+            "Pixels of the pictures; the network sidewalk needs 320x180.",
+            flag="--camera",
+            metavar="WxH",
+        ),
+    ] = "160x90"
     fov: Annotated[
         float, Option("Degrees from its lower to its upper edge.", least=1.0, most=170.0)
     ] = 75.0

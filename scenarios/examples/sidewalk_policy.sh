@@ -15,10 +15,10 @@
 # scores the first seed's policy with random goals in place of route goals. SPLIT, SUITES: what is scored (val; all three). RUN: more words for cosim run.
 # Tables are WORK/NAME.md, their pictures WORK/NAME.png; each compares with its first row. SUITE has all policies, SUITE-ablations the changes
 # against seed 0 from new parameters, reactive-black the policy that is kept with and without pictures.
-# To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner.
+# To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner, with pictures of 320 x 180.
 # MOST: most episodes of a collection (100000); small ones are drawn faster, which matters on few cores.
-# EXPERT: whose commands are stored (orca-hasty, which at rest does not wait out of caution). EXPERT=orca continues older folders.
-# FOV: degrees of the camera from its lower to its upper edge (75; older folders have 60). A learner sees the same camera.
+# EXPERT: whose commands are stored (orca-hasty, which at rest does not wait out of caution).
+# FOV: degrees of the camera from its lower to its upper edge (75). A learner sees the same camera.
 # ROBOTS: further robots that collect, besides the courier ("scout dog"). WEATHERS: names from which each episode's is drawn.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
