@@ -88,7 +88,7 @@ def _missed_at(record: Record, log: Log) -> int:
     It is the one at which people were passed against a rule; else the last one.
     """
     broken = [
-        log.tick_at(one.passed_at_s)
+        log.tick_at(one.passed_at_s) - 1  # the window ends before that tick
         for one in record.events
         if one.rule_met is False and one.passed_at_s is not None
     ]

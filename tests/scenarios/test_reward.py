@@ -59,7 +59,7 @@ def test_only_new_ground_counts_and_failures_cost_more_than_they_save() -> None:
                     ),
                 ),
             },
-            3,
+            2,
             -20.0,
         ),
     ],
