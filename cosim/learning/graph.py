@@ -150,7 +150,7 @@ def load_parameters(
     for layer in grown:
         names = [name for name in wanted if name.startswith(f"{layer}.")]
         if not arrays.keys() & set(names):
-            arrays |= {name: wanted[name].numpy() * 0.0 for name in names}
+            arrays |= {name: np.zeros(wanted[name].shape, np.float32) for name in names}
     found: dict[str, torch.Tensor] = {}
     for name, like in wanted.items():
         shape = arrays[name].shape if name in arrays else None

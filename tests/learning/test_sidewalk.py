@@ -61,6 +61,10 @@ from cosim.learning.windows import (  # noqa: E402
 CPU = torch.device("cpu")
 WIDTH_PX, HEIGHT_PX = SIZE_PX
 BRISK = Training(network="sidewalk", steps=2, batch=2, device="cpu")
+COLLECT = (
+    "collect unit --event crosswalk --cities 900:901 --city-size 500 --episodes 2 "
+    "--labels --format raw --camera 320x180 --astray 0.5"
+)
 NAMES = ("a", "b", "c", "d", "d-decoy", "e", "f", "g", "h", "i", "j", "k", "l", "m", "n", "o")
 
 
@@ -403,25 +407,7 @@ def test_a_bundle_without_the_detail_begins_as_it_was(tmp_path: Path) -> None:
 def test_from_the_simulator_to_a_drive(tmp_path: Path, cosim: Cosim) -> None:
     """Demonstrations with labels are collected in two pieces, packed and trained on; the bundle
     drives and teaches in DAgger."""
-    words = [
-        "collect",
-        "unit",
-        "--event",
-        "crosswalk",
-        "--cities",
-        "900:901",
-        "--city-size",
-        "500",
-        "--episodes",
-        "2",
-        "--labels",
-        "--format",
-        "raw",
-        "--camera",
-        "320x180",
-        "--astray",
-        "0.5",
-    ]
+    words = COLLECT.split()
     begun = cosim(*words, "--out", "demos", "--minutes", "1e-9", cwd=tmp_path)
     assert begun.returncode == 4 and "The time is up after 0 episodes" in begun.stderr
     done = cosim(*words, "--out", "demos", "--resume", cwd=tmp_path)
