@@ -11,6 +11,7 @@ from cosim.learning.graph import PLAN, GraphWriter
 from cosim.learning.memory_network import (
     AUXILIARY,
     DETAIL,
+    DOINGS,
     EVENTS,
     HALVED,
     MEMORY,
@@ -40,6 +41,7 @@ MEMORY_OUTPUTS: Final = {
     "free": (1, FREE_RAYS),
     "signal": (1, SIGNALS),
     "event": (1, EVENTS),
+    "doing": (1, NEAR, DOINGS),
 }
 
 
@@ -59,7 +61,7 @@ def build_memory_graph(parameters: Parameters, carries: bool = True) -> bytes:
     detail = g.add("Slice", [shown, starts, stops, axes])
     seen = [
         g.linear(g.add("Flatten", [_convolved(g, x)]), name)
-        for name, x in (("seen", whole), ("detail", detail))
+        for name, x in (("seen", whole), ("upper", detail))
     ]
     image = g.relu(g.add("Add", seen))
     inputs = g.relu(g.linear(g.add("Concat", ["goal", "speeds"], axis=1), "inputs"))

@@ -43,11 +43,16 @@ SIGNALS: Final = 3
 """Classes of signals: none, walk, wait."""
 EVENTS: Final = 9
 """Classes of events: none, and the eight kinds."""
+DOINGS: Final = 12
+"""Classes of activities of people, see `scenarios/episodes/labels.py`."""
 
 HALVED: Final = 2
 """Pixels of a picture in a pixel of the whole view, along each side."""
-DETAIL: Final = (slice(28, 100), slice(96, 224))
-"""Rows and columns of the part that is seen at full size: ahead, where hands and lamps are."""
+DETAIL: Final = (slice(8, 72), slice(80, 240))
+"""Rows and columns of the part that is seen at full size: ahead and above the horizon.
+
+There are the hands of people at 2 m and more, and lamps.
+"""
 
 _IMAGE: Final = 320
 _INPUTS: Final = 64
@@ -67,7 +72,7 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
     "block5b": (160, 160, 3, 3),
     "narrow": (64, 160, 1, 1),
     "seen": (_IMAGE, 64 * 6 * 10),
-    "detail": (_IMAGE, 64 * 5 * 8),
+    "upper": (_IMAGE, 64 * 4 * 10),
     "inputs": (_INPUTS, 4),
     "joined": (_JOINED, _IMAGE + _INPUTS),
     "arriving": (3 * MEMORY, _JOINED),
@@ -81,12 +86,13 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
     "free": (FREE_RAYS, _JOINED),
     "signal": (SIGNALS, _JOINED),
     "event": (EVENTS, _JOINED),
+    "doing": (NEAR * DOINGS, _JOINED),
 }
 """Shapes of the weights: convolutions (out, in, height, width), linear layers (out, in)."""
-HEADS: Final = ("speed", "turn", "stop", "way", "near", "free", "signal", "event")
-GROWN: Final = ("detail",)
+HEADS: Final = ("speed", "turn", "stop", "way", "near", "free", "signal", "event", "doing")
+GROWN: Final = ("upper", "doing")
 """Layers that earlier bundles lack; they start at 0 there."""
-AUXILIARY: Final = ("near", "free", "signal", "event")
+AUXILIARY: Final = ("near", "free", "signal", "event", "doing")
 """Heads of the labels, which are outputs of the graph."""
 STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3": 2}
 """Strides of the convolutions; 1 if missing."""
@@ -130,6 +136,7 @@ class MemoryOutput(NamedTuple):
     free: (N, FREE_RAYS) in units of the labels' range
     signal: (N, SIGNALS) log odds
     event: (N, EVENTS) log odds
+    doing: (N, NEAR, DOINGS) log odds of the activity of each person
     memory: (B, MEMORY) after the last step
     known: (N, _JOINED) features that all heads get
     """
@@ -139,6 +146,7 @@ class MemoryOutput(NamedTuple):
     free: Tensor
     signal: Tensor
     event: Tensor
+    doing: Tensor
     memory: Tensor
     known: Tensor
 
@@ -177,7 +185,7 @@ def picture_of(seen: Views) -> Tensor:
 def encoded(parameters: Parameters, seen: Views) -> Tensor:
     """Return (N, _IMAGE) features of views (N, 3 PICTURES, H, W), 0 to 1."""
     whole = linear_layer(parameters, _convolved(parameters, seen.whole), "seen")
-    detail = linear_layer(parameters, _convolved(parameters, seen.detail), "detail")
+    detail = linear_layer(parameters, _convolved(parameters, seen.detail), "upper")
     return (whole + detail).relu()
 
 
@@ -241,6 +249,7 @@ def forward_steps(
         raw["free"],
         raw["signal"],
         raw["event"],
+        raw["doing"].unflatten(1, (NEAR, DOINGS)),
         after[:, -1] if carries else torch.zeros_like(memory),
         known,
     )

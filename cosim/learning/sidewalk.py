@@ -42,7 +42,14 @@ FREE_UNIT_M: Final = 10.0
 """Unit of the predicted free distances."""
 HAND: Final = 6
 """Label of the activity of a person who holds out a hand, see `scenarios/episodes/labels.py`."""
-_WEIGHTS: Final = {**PLAN_WEIGHTS, "near": 0.5, "free": 1.0, "signal": 0.2, "event": 0.2}
+_WEIGHTS: Final = {
+    **PLAN_WEIGHTS,
+    "near": 0.5,
+    "free": 1.0,
+    "signal": 0.2,
+    "event": 0.2,
+    "doing": 0.5,
+}
 _MAX_WINDOWS: Final = 96
 """Largest number of held-out windows of an evaluation."""
 _AT_ONCE: Final = 16
@@ -65,6 +72,7 @@ def _run(parameters: Parameters, batch: Windows, training: Training) -> MemoryOu
         free=output.free[valid],
         signal=output.signal[valid],
         event=output.event[valid],
+        doing=output.doing[valid],
         memory=output.memory,
         known=output.known[valid],
     )
@@ -87,6 +95,7 @@ def _parts(output: MemoryOutput, batch: Windows, training: Training) -> dict[str
         "free": functional.smooth_l1_loss(output.free, free, beta=0.1),
         "signal": functional.cross_entropy(output.signal, classes[:, 0]),
         "event": functional.cross_entropy(output.event, classes[:, 1]),
+        "doing": doing_loss(output.doing, batch.near),
     }
 
 
@@ -109,6 +118,19 @@ def near_loss(near: Tensor, labels: Tensor) -> Tensor:
     people = present.sum().clamp(min=1.0)
     seen = functional.binary_cross_entropy_with_logits(near[:, :, 0], present)
     return seen + ((off + shown) * present).sum() / people
+
+
+def doing_loss(doing: Tensor, labels: Tensor) -> Tensor:
+    """Return the loss of the activities of the nearest people; 0 without people.
+
+    doing: (N, NEAR, DOINGS) log odds
+    labels: (N, LABELLED_PEOPLE, 6) of `cosim collect --labels`
+    """
+    labels = labels[:, :NEAR]
+    present = labels[:, :, 0]
+    numbers = (labels[:, :, 5].long() - 1).clamp(min=0)
+    off = functional.cross_entropy(doing.flatten(0, 1), numbers.flatten(), reduction="none")
+    return (off * present.flatten()).sum() / present.sum().clamp(min=1.0)
 
 
 def _errors(

@@ -57,17 +57,25 @@ packed() { # names...: packs their collections, when all are done
     step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --part 32 --jobs "$JOBS"
   done
 }
+signals() { # first city, seeds: prints user scenarios over crossings with signals, on other ones in each city
+  printf 'name = "signals"\nseeds = %s\n[place]\ncity = [%s]\nsize_m = 1000\n[way]\nkind = "crosswalk"\nsignals = "with"\n' \
+    "$2" "$(seq -s ', ' "$1" $(($1 + CITIES - 1)))"
+  printf '[crowd]\npersons = 15\nvehicles = 10\n[limits]\ntime_s = 120\n'
+}
 round() { # name, number, words of the driver...: collects in parallel, then packs
-  local k=$1 number=$2 first=$((900 + 100 * $2)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long") gpu=0 limit; shift 2
+  local k=$1 number=$2 first=$((900 + 100 * $2)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long" "$1-signals" "$1-gesturing") gpu=0 limit; shift 2
   limit=$(awk "BEGIN { print int(3 * $JOBS * $COLLECT) + 3 }")  # an upper limit: drawing more would take long
-  local common=(--city-size 1000 --seed "$number" --astray 0.3 --unsolved "$@")
-  local all=(--cities $first:$((first + CITIES)) "${common[@]}")
-  gather "$k-unit" 0.08 0 "$limit" unit "${all[@]}" &
-  gather "$k-long" 0.22 $((GPUS - 1)) "$((limit / 3))" long-horizon "${all[@]}" &
+  local common=(--seed "$number" --astray 0.3 --unsolved "$@")
+  local all=(--cities $first:$((first + CITIES)) --city-size 1000 "${common[@]}")
+  gather "$k-unit" 0.05 0 "$limit" unit "${all[@]}" &
+  gather "$k-long" 0.14 $((GPUS - 1)) "$((limit / 3))" long-horizon "${all[@]}" &
+  signals "$first" $((limit / CITIES / 3 + 1)) > "$W/signals-$k.toml"
+  gather "$k-signals" 0.08 $((GPUS / 2)) "$MOST" "$W/signals-$k.toml" "${common[@]}" &
+  gather "$k-gesturing" 0.17 $((GPUS / 2)) "$limit" reactive --decoys --event gesturing "${all[@]}" &
   while [ $gpu -lt "$GPUS" ]; do
     names+=("$k-reactive-$gpu")
-    gather "$k-reactive-$gpu" "0.56 / $GPUS" $gpu "$MOST" reactive --decoys \
-      --cities $((first + gpu * each)):$((first + (gpu + 1) * each)) "${common[@]}" &
+    gather "$k-reactive-$gpu" "0.42 / $GPUS" $gpu "$MOST" reactive --decoys \
+      --cities $((first + gpu * each)):$((first + (gpu + 1) * each)) --city-size 1000 "${common[@]}" &
     gpu=$((gpu + 1))
   done
   for robot in $ROBOTS; do

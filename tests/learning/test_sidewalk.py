@@ -33,12 +33,14 @@ onnx = pytest.importorskip("onnx")
 
 from torch.nn import functional  # noqa: E402
 
+from cosim.learning import memory_network  # noqa: E402
 from cosim.learning.bundle import manifest_of, source_of, write_bundle  # noqa: E402
 from cosim.learning.graph import load_parameters  # noqa: E402
 from cosim.learning.memory_graph import MEMORY_INPUTS, build_memory_graph  # noqa: E402
 from cosim.learning.memory_network import (  # noqa: E402
     DETAIL,
     EVENTS,
+    GROWN,
     HALVED,
     MEMORY,
     SIZE_PX,
@@ -49,7 +51,7 @@ from cosim.learning.memory_network import (  # noqa: E402
 )
 from cosim.learning.network import CRUISE_MPS, WAYPOINTS, plan  # noqa: E402
 from cosim.learning.settings import Training  # noqa: E402
-from cosim.learning.sidewalk import FREE_UNIT_M, HAND, SIDEWALK, near_loss  # noqa: E402
+from cosim.learning.sidewalk import FREE_UNIT_M, HAND, SIDEWALK, doing_loss, near_loss  # noqa: E402
 from cosim.learning.training import _batches, train  # noqa: E402
 from cosim.learning.windows import (  # noqa: E402
     WindowExamples,
@@ -317,9 +319,10 @@ def test_ablations_remove_only_training_episodes() -> None:
 
 
 def test_numbers_of_labels_are_those_of_the_simulator() -> None:
-    """A raised hand, the classes of events and the unit of free distances have the simulator's
+    """A raised hand, the classes of activities and events, and the unit of free distances have the simulator's
     values."""
     assert 1 + DOINGS.index("stop") == HAND and Doing.__args__ == DOINGS  # type: ignore[attr-defined]
+    assert len(DOINGS) == memory_network.DOINGS
     assert max(EVENT_NUMBERS.values()) + 1 == EVENTS and FREE_UNIT_M == FREE_RANGE_M
 
 
@@ -333,6 +336,17 @@ def test_missing_people_do_not_contribute_to_the_loss() -> None:
     near.grad = None
     near_loss(near, labels).backward()
     assert near.grad[0, 0, 1:4].all() and not near.grad[0, 1:, 1:].any()
+
+
+def test_the_activity_of_each_person_is_learned() -> None:
+    """Without a person the loss is 0; with one it falls with the odds of the right activity."""
+    labels = torch.zeros(1, LABELLED_PEOPLE, 6)
+    doing = torch.zeros(1, 4, len(DOINGS), requires_grad=True)
+    assert float(doing_loss(doing, labels)) == 0.0
+    labels[0, 1] = torch.tensor([1.0, 5.0, 1.0, 0.0, 0.0, 1.0 + DOINGS.index("wave")])
+    doing_loss(doing, labels).backward()
+    assert doing.grad is not None and not doing.grad[0, [0, 2, 3]].any()
+    assert (doing.grad[0, 1] < 0.0).nonzero().flatten().tolist() == [DOINGS.index("wave")]
 
 
 def test_settings_of_ablations_are_checked(data: Path, tmp_path: Path) -> None:
@@ -388,18 +402,17 @@ def test_prefetched_batches_are_the_same(data: Path) -> None:
         assert same(ahead, alone)
 
 
-def test_a_bundle_without_the_detail_begins_as_it_was(tmp_path: Path) -> None:
-    """Parameters of an earlier `sidewalk` lack the part at full size: it is 0, and all others are
-    those of the file."""
+def test_a_bundle_of_an_earlier_version_begins_as_it_was(tmp_path: Path) -> None:
+    """Layers that an earlier `sidewalk` lacks are 0, and all others are those of the file."""
     parameters = new_memory_parameters(7)
     graph = onnx.load_from_string(build_memory_graph(parameters))
-    kept = [one for one in graph.graph.initializer if not one.name.startswith("detail.")]
+    kept = [one for one in graph.graph.initializer if one.name.split(".")[0] not in GROWN]
     del graph.graph.initializer[:]
     graph.graph.initializer.extend(kept)
     onnx.save(graph, tmp_path / "model.onnx")
     found = load_parameters(tmp_path / "model.onnx", new_memory_parameters(0), SIDEWALK.grown)
     for name, value in parameters.items():
-        begun = torch.zeros_like(value) if name.startswith("detail.") else value
+        begun = torch.zeros_like(value) if name.split(".")[0] in GROWN else value
         assert torch.equal(found[name], begun)
 
 

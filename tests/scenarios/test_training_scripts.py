@@ -11,6 +11,7 @@ import pytest
 
 from cosim.core.errors import UsageError
 from scenarios.examples.black_pictures import Blinded
+from scenarios.suites.user_scenarios.read import read_own
 from tests.conftest import wait_until
 
 SCRIPT = Path(__file__).parents[2] / "scenarios/examples/sidewalk_policy.sh"
@@ -93,7 +94,7 @@ def test_a_killed_script_leaves_no_second_training_in_its_folder(
     refused, until they have ended."""
     pids = tmp_path / "calls.txt.pids"
     with begin_script(tmp_path, NAP="600") as process:
-        wait_until(lambda: pids.exists() and len(pids.read_text().splitlines()) == 3)
+        wait_until(lambda: pids.exists() and len(pids.read_text().splitlines()) == 5)
         process.send_signal(sent)
         assert process.wait() == code
         if sent == signal.SIGKILL:
@@ -117,6 +118,19 @@ def test_a_collection_that_crashed_is_not_done(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.glob("work/log/*.done")] == ["collect-0-unit.done"]
     minutes = {call.split()[2]: float(call.split("--minutes ")[1].split()[0]) for call in calls}
     assert minutes["unit"] < 0.1 and 3.0 < minutes["long-horizon"] <= 3.5
+
+
+def test_a_round_has_gestures_and_ways_over_signals(tmp_path: Path) -> None:
+    """Each round collects `gesturing` with its decoys, and short ways over crossings with signals
+    in each of its cities."""
+    _, calls = run_script(tmp_path, code=1, CITIES="2")
+    ways = tmp_path / "work/signals-0.toml"
+    assert sum("--event gesturing" in call and "--decoys" in call for call in calls) == 1
+    assert sum(f"collect {ways}" in call for call in calls) == 1
+    variants = read_own(ways).variants
+    cities = [city for one in variants if (city := one.own.place.city) is not None]
+    assert sorted({*cities}) == [900, 901] and len(cities) > 2
+    assert all(one.own.way.signals == "with" for one in variants)
 
 
 def test_a_collection_without_episodes_is_not_done(tmp_path: Path) -> None:
@@ -199,12 +213,12 @@ def test_fine_tuning_is_kept_if_val_improves(tmp_path: Path, rows: str, kept: st
     assert done.returncode == 0 and f"kept: {kept}\n" in done.stdout, done
     net = tmp_path / "work/nets/sidewalk-0"
     explored = [call for call in calls if f"--learner onnx:{net} --explore 0.3" in call]
-    assert len(explored) == 3 and not any("--noise" in call for call in explored)
+    assert len(explored) == 5 and not any("--noise" in call for call in explored)
     (tuned,) = [call for call in calls if "--values 0.5" in call]
     assert f"--from {net}" in tuned and "values-reactive-0-000.npz" in tuned
     assert sum("--split val" in call for call in calls) == 2
-    (one,) = [call for call in calls if "--event gesturing" in call]
-    assert f"--learner onnx:{net}" in one and "--decoys" in one
+    one = next(call for call in calls if call.startswith("cosim collect") and "demos/event" in call)
+    assert f"--learner onnx:{net}" in one and "--decoys" in one and "--event gesturing" in one
     (run,) = [call for call in calls if "--goal random_point" in call]
     assert "--split test" in run and f"--policy onnx:{net} " in run
     names = [call.split("--name ")[1].split()[0] for call in calls if "--name" in call]
