@@ -342,7 +342,7 @@ def test_the_activity_of_each_person_is_learned() -> None:
     """Without a person the loss is 0; with one it falls with the odds of the right activity."""
     labels = torch.zeros(1, LABELLED_PEOPLE, 6)
     doing = torch.zeros(1, 4, len(DOINGS), requires_grad=True)
-    assert float(doing_loss(doing, labels)) == 0.0
+    assert doing_loss(doing, labels).item() == 0.0
     labels[0, 1] = torch.tensor([1.0, 5.0, 1.0, 0.0, 0.0, 1.0 + DOINGS.index("wave")])
     doing_loss(doing, labels).backward()
     assert doing.grad is not None and not doing.grad[0, [0, 2, 3]].any()
