@@ -91,7 +91,11 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
 """Shapes of the weights: convolutions (out, in, height, width), linear layers (out, in)."""
 HEADS: Final = ("speed", "turn", "stop", "way", "near", "free", "signal", "event", "doing")
 GROWN: Final = ("upper", "doing")
-"""Layers that earlier bundles lack; they start at 0 there."""
+"""Layers that earlier bundles lack; they start at 0 there.
+
+In version 3, a layer `detail` of the shape of `upper` saw another part of the picture. It is not
+continued.
+"""
 AUXILIARY: Final = ("near", "free", "signal", "event", "doing")
 """Heads of the labels, which are outputs of the graph."""
 STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3": 2}

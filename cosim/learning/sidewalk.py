@@ -138,8 +138,9 @@ def _errors(
 ) -> dict[str, float]:
     """Return errors on held-out windows: of the plan, and of auxiliary heads if they are trained.
 
-    These are the mean error of the place of the nearest person, of free distances, and the share of
-    right signals where there is one, and of right events where there is one.
+    These are the mean errors of the place of the nearest person and of free distances, and the
+    shares of right activities of that person, of right signals, and of right events, where there
+    are such.
     """
     found, labels = PlanErrors(), _LabelErrors()
     starts = examples.held_out_starts(_MAX_WINDOWS)
@@ -159,12 +160,15 @@ class _LabelErrors:
     """Sums and counts of the errors of auxiliary heads."""
 
     def __init__(self) -> None:
-        self._sums = dict.fromkeys(("near_error_m", "free_error_m", *_CLASSES), (0.0, 0))
+        names = ("near_error_m", "doings_right", "free_error_m", *_CLASSES)
+        self._sums = dict.fromkeys(names, (0.0, 0))
 
     def add(self, output: MemoryOutput, batch: Windows) -> None:
         there = batch.near[:, 0, 0] > 0.0
         off = output.near[:, 0, 2:4] * NEAR_UNIT_M - batch.near[:, 0, 1:3]
         self._add("near_error_m", off[there].norm(dim=1))
+        right = output.doing[:, 0].argmax(1) + 1 == batch.near[:, 0, 5].long()
+        self._add("doings_right", right[there].float())
         free = (output.free * FREE_UNIT_M).clamp(0.0, FREE_UNIT_M)
         self._add("free_error_m", (free - batch.free).abs().mean(1))
         for name, odds, label in zip(

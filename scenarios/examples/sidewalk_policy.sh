@@ -6,7 +6,7 @@
 # Works in pieces: stops after MINUTES (9 by default), and continues when called again, until it prints "all done".
 # In round 0 the expert drives, disturbed; in later rounds the learner drives, and the expert's answers are stored. A round collects
 # for COLLECT minutes (7, less than MINUTES) in all, with JOBS processes (16), in CITIES new cities (48), a multiple of GPUS.
-# Shares of JOBS: reactive 0.42, gesturing alone 0.17, long routes 0.14, ways over signals 0.08, unit 0.05, and 0.07 for each of ROBOTS.
+# Shares of JOBS: reactive 0.42, gesturing alone 0.17, long routes 0.14, short ways over crossings with signals 0.08, unit 0.05, and 0.07 for each of ROBOTS.
 # COSIM, PYTHON: see small_policy.sh.
 # ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
 # SEEDS: trained on all rounds at the end ("0 1 2"; "" for none). GPUS: number of GPUs (1); each trains PER_GPU networks at a time (1).
@@ -58,10 +58,10 @@ packed() { # names...: packs their collections, when all are done
     step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --part 32 --jobs "$JOBS"
   done
 }
-signals() { # first city, seeds: prints user scenarios over crossings with signals, on other ones in each city
+signals() { # first city, number: prints a scenario file: so many short ways over crossings with signals, drawn in each city
   printf 'name = "signals"\nseeds = %s\n[place]\ncity = [%s]\nsize_m = 1000\n[way]\nkind = "crosswalk"\nsignals = "with"\n' \
     "$2" "$(seq -s ', ' "$1" $(($1 + CITIES - 1)))"
-  printf '[crowd]\npersons = 15\nvehicles = 10\n[limits]\ntime_s = 120\n'
+  printf '[crowd]\npersons = 15\nvehicles = 10\n[limits]\ntime_s = 180\n'
 }
 round() { # name, number, words of the driver...: collects in parallel, then packs
   local k=$1 number=$2 first=$((900 + 100 * $2)) each=$((CITIES / GPUS)) names=("$1-unit" "$1-long" "$1-signals" "$1-gesturing") gpu=0 limit; shift 2
@@ -70,9 +70,10 @@ round() { # name, number, words of the driver...: collects in parallel, then pac
   local all=(--cities $first:$((first + CITIES)) --city-size 1000 "${common[@]}")
   gather "$k-unit" 0.05 0 "$limit" unit "${all[@]}" &
   gather "$k-long" 0.14 $((GPUS - 1)) "$((limit / 3))" long-horizon "${all[@]}" &
-  signals "$first" $((limit / CITIES / 3 + 1)) > "$W/signals-$k.toml"
+  signals "$first" $((limit / CITIES / 10 + 1)) > "$W/signals-$k.toml"
   gather "$k-signals" 0.08 $((GPUS / 2)) "$MOST" "$W/signals-$k.toml" "${common[@]}" &
-  gather "$k-gesturing" 0.17 $((GPUS / 2)) "$limit" reactive --decoys --event gesturing "${all[@]}" &
+  gather "$k-gesturing" 0.17 $((GPUS / 2)) "$limit" reactive --decoys --event gesturing \
+    --cities $((first + CITIES)):$((first + 2 * CITIES)) --city-size 1000 "${common[@]}" &
   while [ $gpu -lt "$GPUS" ]; do
     names+=("$k-reactive-$gpu")
     gather "$k-reactive-$gpu" "0.42 / $GPUS" $gpu "$MOST" reactive --decoys \

@@ -402,7 +402,7 @@ def test_prefetched_batches_are_the_same(data: Path) -> None:
         assert same(ahead, alone)
 
 
-def test_a_bundle_of_an_earlier_version_begins_as_it_was(tmp_path: Path) -> None:
+def test_layers_that_an_earlier_bundle_lacks_begin_at_0(tmp_path: Path) -> None:
     """Layers that an earlier `sidewalk` lacks are 0, and all others are those of the file."""
     parameters = new_memory_parameters(7)
     graph = onnx.load_from_string(build_memory_graph(parameters))
