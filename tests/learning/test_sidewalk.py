@@ -319,8 +319,8 @@ def test_ablations_remove_only_training_episodes() -> None:
 
 
 def test_numbers_of_labels_are_those_of_the_simulator() -> None:
-    """A raised hand, the classes of activities and events, and the unit of free distances have the simulator's
-    values."""
+    """A raised hand, the classes of activities and events, and the unit of free distances have the
+    simulator's values."""
     assert 1 + DOINGS.index("stop") == HAND and Doing.__args__ == DOINGS  # type: ignore[attr-defined]
     assert len(DOINGS) == memory_network.DOINGS
     assert max(EVENT_NUMBERS.values()) + 1 == EVENTS and FREE_UNIT_M == FREE_RANGE_M
