@@ -115,9 +115,8 @@ def near_loss(near: Tensor, labels: Tensor) -> Tensor:
         near[:, :, 2:], labels[:, :, 1:5] / units, reduction="none", beta=0.1
     ).sum(2)
     shown = functional.binary_cross_entropy_with_logits(near[:, :, 1], hand, reduction="none")
-    people = present.sum().clamp(min=1.0)
     seen = functional.binary_cross_entropy_with_logits(near[:, :, 0], present)
-    return seen + ((off + shown) * present).sum() / people
+    return seen + _over_people(off + shown, present)
 
 
 def doing_loss(doing: Tensor, labels: Tensor) -> Tensor:
@@ -129,8 +128,13 @@ def doing_loss(doing: Tensor, labels: Tensor) -> Tensor:
     labels = labels[:, :NEAR]
     present = labels[:, :, 0]
     numbers = (labels[:, :, 5].long() - 1).clamp(min=0)
-    off = functional.cross_entropy(doing.flatten(0, 1), numbers.flatten(), reduction="none")
-    return (off * present.flatten()).sum() / present.sum().clamp(min=1.0)
+    off = functional.cross_entropy(doing.transpose(1, 2), numbers, reduction="none")
+    return _over_people(off, present)
+
+
+def _over_people(losses: Tensor, present: Tensor) -> Tensor:
+    """Return the mean of losses (N, NEAR) over the people that are present; 0 without any."""
+    return (losses * present).sum() / present.sum().clamp(min=1.0)
 
 
 def _errors(
