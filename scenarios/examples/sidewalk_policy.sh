@@ -5,7 +5,7 @@
 #
 # Works in pieces: stops after MINUTES (9 by default), and continues when called again, until it prints "all done".
 # In round 0 the expert drives, disturbed; in later rounds the learner drives, and the expert's answers are stored. A round collects
-# for COLLECT minutes (7, less than MINUTES) in all, with JOBS processes (16), in CITIES new cities (48), a multiple of GPUS.
+# for COLLECT minutes (7, less than MINUTES) in all, with JOBS processes (16), in CITIES new cities (48; at most 50), a multiple of GPUS, and gestures in as many others.
 # Shares of JOBS: reactive 0.42, gesturing alone 0.17, long routes 0.14, short ways over crossings with signals 0.08, unit 0.05, and 0.07 for each of ROBOTS.
 # COSIM, PYTHON: see small_policy.sh.
 # ROUNDS: number of rounds (3). STEPS: steps of each training (6000). BATCH: windows of 8 s in a step (48).
