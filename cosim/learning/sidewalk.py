@@ -40,12 +40,14 @@ NEAR_UNIT_MPS: Final = 1.5
 """Unit of the predicted velocities of people."""
 FREE_UNIT_M: Final = 10.0
 """Unit of the predicted free distances."""
+_NEARLY_M: Final = 1.0
+"""Distance that is added to a free one, so that errors next to things do not count without end."""
 HAND: Final = 6
 """Label of the activity of a person who holds out a hand, see `scenarios/episodes/labels.py`."""
 _WEIGHTS: Final = {
     **PLAN_WEIGHTS,
     "near": 0.5,
-    "free": 1.0,
+    "free": 2.0,
     "signal": 0.2,
     "event": 0.2,
     "doing": 0.5,
@@ -89,14 +91,26 @@ def _parts(output: MemoryOutput, batch: Windows, training: Training) -> dict[str
     if not training.auxiliary:
         return parts
     classes = batch.scene.long()
-    free = (batch.free / FREE_UNIT_M).clamp(max=1.0)
     return parts | {
         "near": near_loss(output.near, batch.near),
-        "free": functional.smooth_l1_loss(output.free, free, beta=0.1),
+        "free": free_loss(output.free, batch.free),
         "signal": functional.cross_entropy(output.signal, classes[:, 0]),
         "event": functional.cross_entropy(output.event, classes[:, 1]),
         "doing": doing_loss(output.doing, batch.near),
     }
+
+
+def free_loss(free: Tensor, labels: Tensor) -> Tensor:
+    """Return the loss of free distances. An error counts relative to the distance plus a metre.
+
+    So what is near counts most: it is seen in few rows, and an error of a metre is small far away.
+
+    free: (N, FREE_RAYS) predicted
+    labels: (N, FREE_RAYS) of `cosim collect --labels`
+    """
+    true = (labels / FREE_UNIT_M).clamp(max=1.0)
+    off = (free - true) / (true + _NEARLY_M / FREE_UNIT_M)
+    return functional.smooth_l1_loss(off, torch.zeros_like(off), beta=0.1)
 
 
 def near_loss(near: Tensor, labels: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """Training windows of consecutive pictures from packed demonstrations.
 
-Windows that contain a moment in which the expert stops or starts are oversampled. A window is
-augmented as a whole: half are mirrored, brightness and tint vary, pictures are shifted, and speeds
-and motion between two pictures are hidden.
+Windows that contain a moment in which the expert stops or starts are oversampled, and such in which
+the robot drives at something near. A window is augmented as a whole: half are mirrored, brightness
+and tint vary, pictures are shifted, and speeds and motion between two pictures are hidden.
 
 The held-out episodes depend on the names of their scenarios alone. An event and its decoy are on
 the same side, and a later round of DAgger never trains on what an earlier one held out.
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cosim.core.errors import RunError
-from cosim.core.packed_demos import LABELS, Packed, read_frames, read_packed
+from cosim.core.packed_demos import FREE_RAYS, LABELS, Packed, read_frames, read_packed
 from cosim.learning.examples import (
     BRIGHT,
     CHANGE_SHARE,
@@ -56,6 +56,14 @@ DECOY: Final = "-decoy"
 """End of the id of a decoy."""
 WAITS_MPS: Final = 0.005
 """Command in m/s below which the expert waits. Turns almost on the spot are faster."""
+_CLOSE_SHARE: Final = 0.25
+"""Share of windows with a row at which the robot drives at something near."""
+_CLOSE_S: Final = 1.5
+"""Seconds to the end of the free ground ahead below which it is near."""
+_DRIVES_MPS: Final = 0.5
+"""Least speed of such rows in m/s."""
+_STRAIGHT_AHEAD: Final = slice(FREE_RAYS // 2 - 1, FREE_RAYS // 2 + 2)
+"""Free distances straight ahead."""
 _HIDDEN_SPEEDS: Final = 0.6
 """Share of windows whose speeds are hidden, see `examples`."""
 _FROZEN: Final = 0.4
@@ -156,20 +164,39 @@ class WindowExamples:
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
         changes = self.learned[((command < WAITS_MPS) != (state < STOPS_MPS))[self.learned]]
         self._changes = changes if len(changes) else self.learned
+        close = self.learned[self._drives_at_something()[self.learned]]
+        self._close = close if len(close) else self.learned
         rewards = [_rewards(one) for one in packed]
         self.returns = discounted_returns(
             np.concatenate(rewards), episode, 1.0 / float(self.meta["rate_hz"])
         )
         self.weight = torch.ones(len(rows), device=device)
 
+    def _drives_at_something(self) -> NDArray[np.bool_]:
+        """Return (M,) whether the robot drives at something near. False without labels.
+
+        Rows outside of the free ground do not count.
+        """
+        speed = self._rows["state"][:, 0].cpu().numpy()
+        if "free" not in self._rows:
+            return np.zeros(len(speed), bool)
+        free_m = self._rows["free"][:, _STRAIGHT_AHEAD].amin(1).cpu().numpy()
+        close: NDArray[np.bool_] = (
+            (speed > _DRIVES_MPS) & (free_m > 0.0) & (free_m < _CLOSE_S * speed)
+        )
+        return close
+
     def drawn(self, seed: int, step: int, size: int) -> Windows:
         """Draw the augmented batch of a step: a function of seed and step."""
         draws = np.random.default_rng([seed, 0x51DE, step])
+        what = draws.random(size)
         row = np.where(
-            draws.random(size) < CHANGE_SHARE,
+            what < CHANGE_SHARE,
             draws.choice(self._changes, size),
             draws.choice(self.learned, size),
         )
+        close = what > 1.0 - _CLOSE_SHARE
+        row = np.where(close, draws.choice(self._close, size), row)
         start = np.maximum(row - draws.integers(0, STEPS, size), self._first[row])
         start = np.where(draws.random(size) < _FROM_START, self._first[row], start)
         light = draws.uniform(np.log(DARK), np.log(BRIGHT), (size, 1)) + draws.uniform(

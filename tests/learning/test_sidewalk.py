@@ -51,7 +51,14 @@ from cosim.learning.memory_network import (  # noqa: E402
 )
 from cosim.learning.network import CRUISE_MPS, WAYPOINTS, plan  # noqa: E402
 from cosim.learning.settings import Training  # noqa: E402
-from cosim.learning.sidewalk import FREE_UNIT_M, HAND, SIDEWALK, doing_loss, near_loss  # noqa: E402
+from cosim.learning.sidewalk import (  # noqa: E402
+    FREE_UNIT_M,
+    HAND,
+    SIDEWALK,
+    doing_loss,
+    free_loss,
+    near_loss,
+)
 from cosim.learning.training import _batches, train  # noqa: E402
 from cosim.learning.windows import (  # noqa: E402
     WindowExamples,
@@ -68,6 +75,12 @@ COLLECT = (
     "--labels --format raw --camera 320x180 --astray 0.5"
 )
 NAMES = ("a", "b", "c", "d", "d-decoy", "e", "f", "g", "h", "i", "j", "k", "l", "m", "n", "o")
+
+
+def saved_examples(demos: Packed, path: Path) -> WindowExamples:
+    """Windows of demonstrations, by way of a file."""
+    demos.save(path)
+    return WindowExamples([path], BRISK, CPU)
 
 
 def street(length: int = 6, labels: bool = True) -> Packed:
@@ -292,6 +305,38 @@ def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
     for ours, others in zip(third.seen, other.seen, strict=True):
         assert not torch.equal(ours, others)
         assert float(ours.min()) >= 0.0 and float(ours.max()) <= 1.0
+
+
+def test_windows_in_which_the_robot_drives_at_something_near_are_oversampled(
+    tmp_path: Path,
+) -> None:
+    """One of 12 training episodes has such a row: a twelfth of all windows and over a quarter of
+    the drawn ones show it. A wall beside the robot does not count."""
+    demos = street(length=4)
+    demos.state[:, 0] = demos.command[:, 0] = 1.4
+    demos.free[:] = 10.0
+    demos.free[:, 0] = 0.2
+    examples = saved_examples(demos, tmp_path / "free.npz")
+    learned = np.unique(examples.episode[examples.learned])
+    chosen = demos.episode == learned[0]
+    demos.goal[chosen] = 5.0
+    demos.free[chosen & (demos.frame == 2), FREE_RAYS // 2] = 1.9
+    close = saved_examples(demos, tmp_path / "close.npz")
+    before, after = (
+        float((one.drawn(0, 0, 200).goal[:, 0].abs() == 0.5).all(1).float().mean())
+        for one in (examples, close)
+    )
+    assert before == 0.0 and 0.22 < after < 0.42
+
+
+def test_an_error_of_a_free_distance_counts_relative_to_it() -> None:
+    """A metre too much costs nine times more at 1 m than at 9 m."""
+    true = torch.full((1, FREE_RAYS), 1.0)
+    far = torch.full((1, FREE_RAYS), 9.0)
+    near_cost, far_cost = (float(free_loss((one + 1.0) / FREE_UNIT_M, one)) for one in (true, far))
+    assert near_cost == pytest.approx(0.5 - 0.05)
+    assert far_cost == pytest.approx(0.5 * 0.1**2 / 0.1)
+    assert float(free_loss(far / FREE_UNIT_M, far)) == 0.0
 
 
 def test_ablations_remove_only_training_episodes() -> None:
