@@ -40,8 +40,8 @@ NEAR_UNIT_MPS: Final = 1.5
 """Unit of the predicted velocities of people."""
 FREE_UNIT_M: Final = 10.0
 """Unit of the predicted free distances."""
-_NEARLY_M: Final = 1.0
-"""Distance that is added to a free one, so that errors next to things do not count without end."""
+_ADDED_M: Final = 1.0
+"""Distance added to the true one, so that a relative error stays finite at 0 m."""
 HAND: Final = 6
 """Label of the activity of a person who holds out a hand, see `scenarios/episodes/labels.py`."""
 _WEIGHTS: Final = {
@@ -103,13 +103,14 @@ def _parts(output: MemoryOutput, batch: Windows, training: Training) -> dict[str
 def free_loss(free: Tensor, labels: Tensor) -> Tensor:
     """Return the loss of free distances. An error counts relative to the distance plus a metre.
 
-    So what is near counts most: it is seen in few rows, and an error of a metre is small far away.
+    So what is near counts most: it is in few rows, and an error of a metre is small far away.
+    Rows outside of the free ground, with labels of 0, count like all others.
 
     free: (N, FREE_RAYS) predicted
     labels: (N, FREE_RAYS) of `cosim collect --labels`
     """
     true = (labels / FREE_UNIT_M).clamp(max=1.0)
-    off = (free - true) / (true + _NEARLY_M / FREE_UNIT_M)
+    off = (free - true) / (true + _ADDED_M / FREE_UNIT_M)
     return functional.smooth_l1_loss(off, torch.zeros_like(off), beta=0.1)
 
 

@@ -1,8 +1,8 @@
 """Training windows of consecutive pictures from packed demonstrations.
 
-Windows that contain a moment in which the expert stops or starts are oversampled, and such in which
-the robot drives at something near. A window is augmented as a whole: half are mirrored, brightness
-and tint vary, pictures are shifted, and speeds and motion between two pictures are hidden.
+Windows in which the expert stops or starts, or the robot drives at something near, are oversampled.
+A window is augmented as a whole: half are mirrored, brightness and tint vary, pictures are shifted,
+and speeds and motion between two pictures are hidden.
 
 The held-out episodes depend on the names of their scenarios alone. An event and its decoy are on
 the same side, and a later round of DAgger never trains on what an earlier one held out.
@@ -57,13 +57,13 @@ DECOY: Final = "-decoy"
 WAITS_MPS: Final = 0.005
 """Command in m/s below which the expert waits. Turns almost on the spot are faster."""
 _CLOSE_SHARE: Final = 0.25
-"""Share of windows with a row at which the robot drives at something near."""
+"""Share of windows drawn around a row at which the robot drives at something near."""
 _CLOSE_S: Final = 1.5
-"""Seconds to the end of the free ground ahead below which it is near."""
+"""Something is near if the robot reaches it at its speed in less than this time, in seconds."""
 _DRIVES_MPS: Final = 0.5
 """Least speed of such rows in m/s."""
 _STRAIGHT_AHEAD: Final = slice(FREE_RAYS // 2 - 1, FREE_RAYS // 2 + 2)
-"""Free distances straight ahead."""
+"""Indices of the free distances within 7.5 degrees of straight ahead."""
 _HIDDEN_SPEEDS: Final = 0.6
 """Share of windows whose speeds are hidden, see `examples`."""
 _FROZEN: Final = 0.4
@@ -164,27 +164,15 @@ class WindowExamples:
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
         changes = self.learned[((command < WAITS_MPS) != (state < STOPS_MPS))[self.learned]]
         self._changes = changes if len(changes) else self.learned
-        close = self.learned[self._drives_at_something()[self.learned]]
-        self._close = close if len(close) else self.learned
         rewards = [_rewards(one) for one in packed]
         self.returns = discounted_returns(
             np.concatenate(rewards), episode, 1.0 / float(self.meta["rate_hz"])
         )
+        # A row with a reward has the learner's own command, which may be its fault.
+        at_something = np.concatenate([_drives_at_something(one) for one in packed])
+        close = self.learned[(at_something & ~np.isfinite(self.returns))[self.learned]]
+        self._close = close if len(close) else self.learned
         self.weight = torch.ones(len(rows), device=device)
-
-    def _drives_at_something(self) -> NDArray[np.bool_]:
-        """Return (M,) whether the robot drives at something near. False without labels.
-
-        Rows outside of the free ground do not count.
-        """
-        speed = self._rows["state"][:, 0].cpu().numpy()
-        if "free" not in self._rows:
-            return np.zeros(len(speed), bool)
-        free_m = self._rows["free"][:, _STRAIGHT_AHEAD].amin(1).cpu().numpy()
-        close: NDArray[np.bool_] = (
-            (speed > _DRIVES_MPS) & (free_m > 0.0) & (free_m < _CLOSE_S * speed)
-        )
-        return close
 
     def drawn(self, seed: int, step: int, size: int) -> Windows:
         """Draw the augmented batch of a step: a function of seed and step."""
@@ -441,6 +429,21 @@ def _fill(place: Views, path: Path) -> None:
 def _sides(part: Sequence[slice]) -> tuple[int, ...]:
     """Return the numbers of rows and columns of a part of a picture."""
     return tuple(one.stop - one.start for one in part)
+
+
+def _drives_at_something(packed: Packed) -> NDArray[np.bool_]:
+    """Return (N,) whether the robot drives at something near. False without labels.
+
+    Rows without free ground do not count: the robot is outside of it, or touches something.
+    """
+    if not packed.free.size:
+        return np.zeros(len(packed), bool)
+    speed_mps = packed.state[:, 0]
+    free_m = packed.free[:, _STRAIGHT_AHEAD].min(axis=1)
+    close: NDArray[np.bool_] = (
+        (speed_mps > _DRIVES_MPS) & (free_m > 0.0) & (free_m < _CLOSE_S * speed_mps)
+    )
+    return close
 
 
 def _rewards(packed: Packed) -> NDArray[np.float32]:
