@@ -162,29 +162,29 @@ class WindowExamples:
         arrays = ("state", "goal", "command", "waypoints", "driven", *labels)
         self._rows = {name: joined(name) for name in arrays}
         command, state = (self._rows[name][:, 0].cpu().numpy() for name in ("command", "state"))
-        changes = self.learned[((command < WAITS_MPS) != (state < STOPS_MPS))[self.learned]]
-        self._changes = changes if len(changes) else self.learned
+        self._changes = self._learned_where((command < WAITS_MPS) != (state < STOPS_MPS))
         rewards = [_rewards(one) for one in packed]
         self.returns = discounted_returns(
             np.concatenate(rewards), episode, 1.0 / float(self.meta["rate_hz"])
         )
-        # A row with a reward has the learner's own command, which may be its fault.
+        # A row with a reward has the learner's own command, which may be wrong.
         at_something = np.concatenate([_drives_at_something(one) for one in packed])
-        close = self.learned[(at_something & ~np.isfinite(self.returns))[self.learned]]
-        self._close = close if len(close) else self.learned
+        self._close = self._learned_where(at_something & ~np.isfinite(self.returns))
         self.weight = torch.ones(len(rows), device=device)
+
+    def _learned_where(self, which: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the training rows among those of a mask (M,); all training rows if none is."""
+        found: NDArray[np.int64] = self.learned[which[self.learned]]
+        return found if len(found) else self.learned
 
     def drawn(self, seed: int, step: int, size: int) -> Windows:
         """Draw the augmented batch of a step: a function of seed and step."""
         draws = np.random.default_rng([seed, 0x51DE, step])
         what = draws.random(size)
-        row = np.where(
-            what < CHANGE_SHARE,
-            draws.choice(self._changes, size),
-            draws.choice(self.learned, size),
+        change, any_row, close = (
+            draws.choice(rows, size) for rows in (self._changes, self.learned, self._close)
         )
-        close = what > 1.0 - _CLOSE_SHARE
-        row = np.where(close, draws.choice(self._close, size), row)
+        row = np.select([what < CHANGE_SHARE, what > 1.0 - _CLOSE_SHARE], [change, close], any_row)
         start = np.maximum(row - draws.integers(0, STEPS, size), self._first[row])
         start = np.where(draws.random(size) < _FROM_START, self._first[row], start)
         light = draws.uniform(np.log(DARK), np.log(BRIGHT), (size, 1)) + draws.uniform(

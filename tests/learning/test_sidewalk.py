@@ -311,8 +311,8 @@ def test_a_batch_depends_on_seed_and_step_alone(data: Path) -> None:
 def test_windows_in_which_the_robot_drives_at_something_near_are_oversampled(
     tmp_path: Path,
 ) -> None:
-    """One of 15 training episodes has such a row: at most a tenth of windows show this episode, and
-    over a quarter if they are drawn around the row."""
+    """Without such a row, an episode of 15 has about a fifteenth of the windows; with the only one,
+    it has over a quarter."""
     demos = street(length=4)
     demos.state[:, 0] = demos.command[:, 0] = 1.4
     demos.free[:] = 10.0
@@ -343,7 +343,8 @@ def test_windows_in_which_the_robot_drives_at_something_near_are_oversampled(
 def test_something_is_near_if_it_is_reached_straight_ahead_within_one_and_a_half_seconds(
     speed_mps: float, ray: int, free_m: float, counts: bool
 ) -> None:
-    """Things beside the way do not count, nor slow robots, nor rows without free ground."""
+    """It must be at most 7.5 degrees to the side. The robot must be on free ground, and faster than
+    0.5 m/s."""
     demos = street(length=2)
     demos.state[:, 0] = 0.0
     demos.free[:] = 10.0
@@ -352,8 +353,8 @@ def test_something_is_near_if_it_is_reached_straight_ahead_within_one_and_a_half
 
 
 def test_windows_are_not_drawn_around_a_learners_own_faults(tmp_path: Path) -> None:
-    """Rows with rewards have the command that was driven; other episodes count without labels being
-    learned, too."""
+    """Rows with rewards have the command that was driven. Other rows count, also with
+    `--no-auxiliary`."""
     demos = street(length=4)
     demos.state[:, 0] = 1.4
     demos.free[:] = 1.0
