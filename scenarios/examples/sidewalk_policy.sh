@@ -14,6 +14,7 @@
 # weighted by values, for MORE steps (2000). WORK/kept.txt has the better one of both on val.
 # ABLATIONS=1: trains seed 0 again with each change of docs/learning.md. QUESTIONS=1: fine-tunes on one EVENT (gesturing) alone, and
 # scores the first seed's policy with random goals in place of route goals. SPLIT, SUITES: what is scored (val; all three). RUN: more words for cosim run.
+# AT_ONCE: networks that are scored at a time (1), each with its share of JOBS.
 # Tables are WORK/NAME.md, their pictures WORK/NAME.png; each compares with its first row. SUITE has all policies, SUITE-ablations the changes
 # against seed 0 from new parameters, reactive-black the policy that is kept with and without pictures.
 # To continue from a bundle of another machine, without its data: FIRST=1 FROM=FOLDER, the first round and its learner, with pictures of 320 x 180.
@@ -27,7 +28,7 @@ W=${1:?a folder to work in}
 . "$here/scenarios/examples/pieces.sh"
 VALUES=${VALUES-1} MORE=${MORE:-2000} EVENT=${EVENT:-gesturing} RUN=${RUN:-}
 ROUNDS=${ROUNDS:-3} COLLECT=${COLLECT:-7} CITIES=${CITIES:-48} STEPS=${STEPS:-6000} BATCH=${BATCH:-48}
-SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} PER_GPU=${PER_GPU:-1} FIRST=${FIRST:-0} FROM=${FROM:-} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
+SEEDS=${SEEDS-"0 1 2"} GPUS=${GPUS:-1} PER_GPU=${PER_GPU:-1} FIRST=${FIRST:-0} FROM=${FROM:-} AT_ONCE=${AT_ONCE:-1} SPLIT=${SPLIT:-val} SUITES=${SUITES-"unit reactive long-horizon"}
 MOST=${MOST:-100000} EXPERT=${EXPERT:-orca-hasty} ROBOTS=${ROBOTS-"scout dog"} FOV=${FOV:-75} WEATHERS=${WEATHERS:-clear,clear,clear,overcast,rain,heavy_rain,fog,low_sun,snow,night}
 mkdir -p "$W/demos" "$W/nets" "$W/runs"
 
@@ -98,14 +99,18 @@ sidewalk() { # name, last round, words...
   local name=$1 last=$2; shift 2
   network "$name" $(parts "$last") --steps "$STEPS" --rate 5e-4 "$@"
 }
-together() { # what, names...: trains in parallel, PER_GPU networks on each GPU
-  local what=$1 number=0 name; shift
+together() { # how many, step, what, names...: calls `what NAME` for each name, so many at a time, spread over the GPUs
+  local most=$1 step=$2 what=$3 number=0 name; shift 3
   for name in "$@"; do
-    CUDA_VISIBLE_DEVICES=$((number % GPUS)) "$what" "$name" &
-    number=$((number + 1)); [ $((number % (GPUS * PER_GPU))) = 0 ] && wait
+    CUDA_VISIBLE_DEVICES=$((number % GPUS)) GLCONTEXT_DEVICE_INDEX=$((number % GPUS)) "$what" "$name" &
+    number=$((number + 1)); [ $((number % most)) = 0 ] && wait
   done
   wait
-  for name in "$@"; do [ -e "$W/log/train-$name.done" ] || exit 1; done
+  for name in "$@"; do [ -e "$W/log/$step-$name.done" ] || exit 1; done
+}
+trained() { # what, names...: trains in parallel, PER_GPU networks on each GPU
+  local what=$1; shift
+  together $((GPUS * PER_GPU)) train "$what" "$@"
 }
 seed() { sidewalk "$1" $((FIRST + ROUNDS - 1)) --seed "${1##*-}" ${FROM:+--from "$FROM"}; }
 ablation() {
@@ -115,7 +120,10 @@ ablation() {
 score() { # name, suite, policy, split, words...
   local name=$1 suite=$2 policy=$3 split=${4:-$SPLIT}; shift "$(($# < 4 ? $# : 4))"
   local more=(); [ -e "$W/runs/$name/run.json" ] && more=(--resume)
-  step "run-$name" $COSIM run "$suite" --split "$split" --seed 1 --jobs "$JOBS" --policy "$policy" --out "$W/runs/$name" $RUN "$@" "${more[@]}"
+  step "run-$name" $COSIM run "$suite" --split "$split" --seed 1 --jobs "${RUN_JOBS:-$JOBS}" --policy "$policy" --out "$W/runs/$name" $RUN "$@" "${more[@]}"
+}
+driven() { # name: drives `suite` with a network, one of AT_ONCE that share the processes
+  RUN_JOBS=$((JOBS > AT_ONCE ? JOBS / AT_ONCE : 1)) score "$suite-$1" "$suite" "onnx:$W/nets/$1"
 }
 compared() { # name, words...: compares runs, and shows the end of the output if that fails
   local name=$1; shift
@@ -164,7 +172,7 @@ for k in $(seq "$FIRST" $((FIRST + ROUNDS - 1))); do
 done
 names=() changes=() control=
 for number in $SEEDS; do names+=("sidewalk-$number"); done
-together seed "${names[@]}"
+trained seed "${names[@]}"
 first=${names[0]:-} kept=${names[0]:-}
 if [ -n "$first" ] && [ -n "$VALUES" ]; then
   values "$first"
@@ -179,11 +187,11 @@ if [ "${ABLATIONS:-0}" = 1 ]; then
   changes=(share-0.01 share-0.1 share-0.3 share-0.5 no-memory no-auxiliary no-decoys no-weather)
   control=sidewalk-0  # seed 0, trained from new parameters on everything
   if [ -n "$FROM" ] || [[ " $SEEDS " != *" 0 "* ]]; then changes+=(whole) control=whole; fi
-  together ablation "${changes[@]}"
+  trained ablation "${changes[@]}"
   names+=("${changes[@]}")
 fi
 for suite in $SUITES; do
-  for name in "${names[@]}"; do score "$suite-$name" "$suite" "onnx:$W/nets/$name"; done
+  together "$AT_ONCE" "run-$suite" driven "${names[@]}"
   if [ -n "$first" ] && [ "${QUESTIONS:-0}" = 1 ]; then
     score "$suite-random-goals" "$suite" "onnx:$W/nets/$first" "$SPLIT" --goal random_point
   fi

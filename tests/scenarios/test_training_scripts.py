@@ -193,6 +193,15 @@ def test_networks_share_gpus(tmp_path: Path) -> None:
     assert trained == [f"sidewalk-{seed}" for seed in range(5)]
 
 
+def test_networks_that_are_scored_at_a_time_share_the_processes(tmp_path: Path) -> None:
+    """With three at a time, each of five networks is scored once, with a third of the processes."""
+    done, calls = run_script(tmp_path, SEEDS="0 1 2 3 4", JOBS="7", AT_ONCE="3")
+    assert done.returncode == 0 and done.stdout.endswith("all done\n"), done
+    scored = sorted(call for call in calls if call.startswith("cosim run unit"))
+    assert len(scored) == 5 and all("--jobs 2 " in call for call in scored)
+    assert all(f"nets/sidewalk-{seed} " in " ".join(scored) for seed in range(5))
+
+
 HEAD = "by,metric,value_before,value_after,verdict\n"
 
 
