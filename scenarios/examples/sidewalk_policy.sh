@@ -51,13 +51,15 @@ gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes
     $COSIM collect "$@" --policy "$EXPERT" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --camera 320x180 --fov "$FOV" --labels --format raw \
     --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
 )
-packed() { # names...: packs their collections, when all are done
-  local name
+packed() { # names...: packs their collections at the same time, when all are done
+  local name jobs=$((JOBS > $# ? JOBS / $# : 1))
   mkdir -p "$W/packed"
   for name in "$@"; do [ -e "$W/log/collect-$name.done" ] || exit 1; done
   for name in "$@"; do
-    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --part 32 --jobs "$JOBS"
+    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --part 16 --jobs "$jobs" &
   done
+  wait
+  for name in "$@"; do [ -e "$W/log/pack-$name.done" ] || exit 1; done
 }
 signals() { # first city, number: prints a scenario file: so many short ways over crossings with signals, drawn in each city
   printf 'name = "signals"\nseeds = %s\n[place]\ncity = [%s]\nsize_m = 1000\n[way]\nkind = "crosswalk"\nsignals = "with"\n' \
@@ -129,9 +131,11 @@ compared() { # name, words...: compares runs, and shows the end of the output if
   local name=$1; shift
   $COSIM compare "$@" > "$W/log/compare-$name.txt" 2>&1 || { tail -n 3 "$W/log/compare-$name.txt"; exit 1; }
 }
-table() { # name, runs...: compares the others with the first one
+table() { # name, runs...: compares the others with the first one; without a picture if that fails, as it does without matplotlib
   local name=$1; shift
-  compared "$name" "$@" -o "$W/$name.md" -o "$W/$name.png" --by policy
+  (compared "$name" "$@" -o "$W/$name.md" -o "$W/$name.png" --by policy) || {
+    echo "no picture $W/$name.png"; compared "$name" "$@" -o "$W/$name.md" --by policy
+  }
   echo "$name:"; cat "$W/$name.md"
 }
 values() { # learner: fine-tunes it on rewards; writes the better one of both on val to WORK/kept.txt

@@ -30,7 +30,7 @@ case ${command:-} in
   collect) [ -n "$EMPTY" ] || { mkdir -p "$out/runs/00/episodes/a"; touch "$out/runs/00/episodes/a/demonstration.npz"; }
     exit "$CODE" ;;
   compare) for out in "${outs[@]}"; do
-      case $out in *.csv) echo "$TABLE" > "$out" ;; *) echo "a table" > "$out" ;; esac
+      case $out in *.csv) echo "$TABLE" > "$out" ;; *.png) [ -z "${NO_PICTURE:-}" ] || exit 2 ;; *) echo "a table" > "$out" ;; esac
     done ;;
   *) case $out in *.npz) touch "${out%.npz}-000.npz" ;; *) mkdir -p "$out"; touch "$out/run.json" ;; esac ;;
 esac
@@ -183,6 +183,14 @@ def test_ablations_are_compared_with_seed_0_from_new_parameters(
     named = f"--name sidewalk-{control.removeprefix('sidewalk-')} "
     (trained,) = [call for call in calls if named in call]
     assert "--from" not in trained and "--seed 0" in trained
+
+
+def test_without_a_picture_there_is_a_table(tmp_path: Path) -> None:
+    """If `cosim compare` cannot draw, as without matplotlib, the script ends with its table."""
+    done, calls = run_script(tmp_path, SEEDS="0 1", NO_PICTURE="1")
+    assert done.returncode == 0 and done.stdout.endswith("all done\n"), done
+    assert f"no picture {tmp_path}/work/unit.png\nunit:\na table\n" in done.stdout
+    assert [call.count(" -o ") for call in calls if "compare" in call] == [2, 1]
 
 
 def test_networks_share_gpus(tmp_path: Path) -> None:
