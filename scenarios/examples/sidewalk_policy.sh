@@ -51,15 +51,24 @@ gather() ( # name, share of JOBS, GPU, most episodes, words...: as many episodes
     $COSIM collect "$@" --policy "$EXPERT" --minutes "$(awk "BEGIN { print $now / 60 }")" --episodes "$most" --camera 320x180 --fov "$FOV" --labels --format raw \
     --weathers "$WEATHERS" --jobs "$jobs" --out "$W/demos/$name" --resume
 )
-packed() { # names...: packs their collections at the same time, when all are done
-  local name jobs=$((JOBS > $# ? JOBS / $# : 1))
-  mkdir -p "$W/packed"
-  for name in "$@"; do [ -e "$W/log/collect-$name.done" ] || exit 1; done
+finished() { # step, names...: ends the script unless this step is done for all of them
+  local step=$1 name; shift
+  for name in "$@"; do [ -e "$W/log/$step-$name.done" ] || exit 1; done
+}
+together() { # how many, step, what, names...: calls `what NAME` for each name, so many at a time, spread over the GPUs, with `share` of JOBS each
+  local most=$1 step=$2 what=$3 number=0 name share=$((JOBS > $1 ? JOBS / $1 : 1)); shift 3
   for name in "$@"; do
-    step "pack-$name" $COSIM dataset pack "$W/demos/$name" -o "$W/packed/$name.npz" --part 16 --jobs "$jobs" &
+    CUDA_VISIBLE_DEVICES=$((number % GPUS)) GLCONTEXT_DEVICE_INDEX=$((number % GPUS)) "$what" "$name" &
+    number=$((number + 1)); [ $((number % most)) = 0 ] && wait
   done
   wait
-  for name in "$@"; do [ -e "$W/log/pack-$name.done" ] || exit 1; done
+  finished "$step" "$@"
+}
+pack() { step "pack-$1" $COSIM dataset pack "$W/demos/$1" -o "$W/packed/$1.npz" --part 16 --jobs "$share"; }
+packed() { # names...: packs their collections at the same time, when all are done
+  mkdir -p "$W/packed"
+  finished collect "$@"
+  together $# pack pack "$@"
 }
 signals() { # first city, number: prints a scenario file: so many short ways over crossings with signals, drawn in each city
   printf 'name = "signals"\nseeds = %s\n[place]\ncity = [%s]\nsize_m = 1000\n[way]\nkind = "crosswalk"\nsignals = "with"\n' \
@@ -101,15 +110,6 @@ sidewalk() { # name, last round, words...
   local name=$1 last=$2; shift 2
   network "$name" $(parts "$last") --steps "$STEPS" --rate 5e-4 "$@"
 }
-together() { # how many, step, what, names...: calls `what NAME` for each name, so many at a time, spread over the GPUs
-  local most=$1 step=$2 what=$3 number=0 name; shift 3
-  for name in "$@"; do
-    CUDA_VISIBLE_DEVICES=$((number % GPUS)) GLCONTEXT_DEVICE_INDEX=$((number % GPUS)) "$what" "$name" &
-    number=$((number + 1)); [ $((number % most)) = 0 ] && wait
-  done
-  wait
-  for name in "$@"; do [ -e "$W/log/$step-$name.done" ] || exit 1; done
-}
 trained() { # what, names...: trains in parallel, PER_GPU networks on each GPU
   local what=$1; shift
   together $((GPUS * PER_GPU)) train "$what" "$@"
@@ -122,10 +122,10 @@ ablation() {
 score() { # name, suite, policy, split, words...
   local name=$1 suite=$2 policy=$3 split=${4:-$SPLIT}; shift "$(($# < 4 ? $# : 4))"
   local more=(); [ -e "$W/runs/$name/run.json" ] && more=(--resume)
-  step "run-$name" $COSIM run "$suite" --split "$split" --seed 1 --jobs "${RUN_JOBS:-$JOBS}" --policy "$policy" --out "$W/runs/$name" $RUN "$@" "${more[@]}"
+  step "run-$name" $COSIM run "$suite" --split "$split" --seed 1 --jobs "${share:-$JOBS}" --policy "$policy" --out "$W/runs/$name" $RUN "$@" "${more[@]}"
 }
-driven() { # name: drives `suite` with a network, one of AT_ONCE that share the processes
-  RUN_JOBS=$((JOBS > AT_ONCE ? JOBS / AT_ONCE : 1)) score "$suite-$1" "$suite" "onnx:$W/nets/$1"
+driven() { # name: drives `suite` with a network
+  score "$suite-$1" "$suite" "onnx:$W/nets/$1"
 }
 compared() { # name, words...: compares runs, and shows the end of the output if that fails
   local name=$1; shift
